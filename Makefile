@@ -1,0 +1,66 @@
+# make demo   the estimator live on a shipped bag, over DDS
+# make test   format, lint, types and tests; PYTEST_ARGS="-k robot" passes options on
+# make lint   format, lint and types alone
+# make format writes the format
+# make clean  removes the environment and what was built
+# Needs Python 3.10 to 3.12 with venv; PYTHON=/path/to/python chooses one.
+
+VENV ?= .venv
+PYTEST_ARGS ?=
+BIN := $(VENV)/bin
+
+export NUMBA_CACHE_DIR := $(abspath $(VENV))/numba-cache
+export MPLBACKEND := Agg
+export PIP_DISABLE_PIP_VERSION_CHECK := 1
+# The environment brings its own ROS 2 libraries; those of a sourced ROS 2 belong to another Python.
+unexport PYTHONPATH PYTHONHOME AMENT_PREFIX_PATH COLCON_PREFIX_PATH RMW_IMPLEMENTATION VIRTUAL_ENV
+ifdef ROS_DISTRO
+unexport LD_LIBRARY_PATH
+endif
+
+.PHONY: demo test lint format check-docs clean install
+.DELETE_ON_ERROR:
+
+demo: install
+	$(BIN)/ctr-dynamics demo
+
+test: lint
+	$(BIN)/python -m pytest $(PYTEST_ARGS)
+
+lint: install
+	$(BIN)/ruff format --check .
+	$(BIN)/ruff check .
+	$(BIN)/mypy
+
+format: install
+	$(BIN)/ruff format .
+	$(BIN)/ruff check --fix .
+	$(BIN)/python -m ctr_dynamics.tables --write
+
+install: $(VENV)/.package
+
+$(VENV)/.package: $(VENV)/.requirements setup.py setup.cfg pyproject.toml ctr_dynamics/__init__.py
+	$(BIN)/python -m pip install --quiet --no-deps --no-build-isolation --editable .
+	@touch $@
+
+$(VENV)/.requirements: requirements.txt
+	@set -e; \
+	ok='import sys, venv, ensurepip; sys.exit(not (3, 10) <= sys.version_info[:2] <= (3, 12))'; \
+	if ! $(BIN)/python -c "$$ok" >/dev/null 2>&1; then \
+	  found=; \
+	  for candidate in $(PYTHON) python3.11 python3.12 python3.10 python3 python; do \
+	    if "$$candidate" -c "$$ok" >/dev/null 2>&1; then found="$$candidate"; break; fi; \
+	  done; \
+	  if [ -z "$$found" ]; then \
+	    echo "make: error: no Python 3.10 to 3.12 with venv was found; install one, or give PYTHON=/path/to/python" >&2; \
+	    exit 1; \
+	  fi; \
+	  echo "creating $(VENV) with $$("$$found" --version)"; \
+	  "$$found" -m venv --clear $(VENV); \
+	fi; \
+	echo "installing requirements.txt into $(VENV) (some minutes the first time)"; \
+	$(BIN)/python -m pip install --quiet --requirement requirements.txt
+	@touch $@
+
+clean:
+	rm -rf $(VENV) build dist install log ctr_dynamics.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis

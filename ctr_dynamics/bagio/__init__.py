@@ -1,0 +1,16 @@
+"""Bags: finding and reading MCAP recordings (also cut ones), writing them, what is in them, and replay."""
+
+from ctr_dynamics.bagio.reader import Bag, InputMessage, RawMessage, open_bag, sha256_of
+from ctr_dynamics.bagio.writer import BagWriter, LiveRecorder, atomic_file, write_bag
+
+__all__ = [
+    "Bag",
+    "BagWriter",
+    "InputMessage",
+    "LiveRecorder",
+    "RawMessage",
+    "atomic_file",
+    "open_bag",
+    "sha256_of",
+    "write_bag",
+]

@@ -1,0 +1,352 @@
+"""Replay: a recorded bag through the estimator, without a ROS graph and as fast as it goes.
+
+Messages are given to the estimator in the order in which they arrived (log time, ties by topic name), all of one
+arrival time before a step is taken, so that a replay does what a node would have done, and twice the same.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import math
+import time
+from array import array
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ctr_dynamics import __version__
+from ctr_dynamics.bagio.reader import Bag, InputMessage, open_bag
+from ctr_dynamics.bagio.writer import BagWriter, atomic_file, write_bag
+from ctr_dynamics.errors import InputError
+from ctr_dynamics.messages.cdr import JointStateIn, PoseIn
+from ctr_dynamics.messages.encode import StepEncoder
+from ctr_dynamics.messages.topics import JOINT_STATES, STEP_NS
+from ctr_dynamics.parameters import Settings
+from ctr_dynamics.robot import Robot, load_robot
+
+if TYPE_CHECKING:
+    from ctr_dynamics.estimation.estimator import Estimator, StepOutput
+
+MakeEstimator = Callable[[Robot, Settings], "Estimator"]
+Progress = Callable[[float, int], None]
+_WARM_UP_NS = 300_000_000
+_MAX_STRETCHES = 100
+
+
+@dataclass
+class ReplayResult:
+    """Outcome of a replay: the content of summary.json, and what the reader of the bag had to leave out."""
+
+    summary: dict[str, Any]
+    notes: list[str] = field(default_factory=list)
+
+    @property
+    def failures(self) -> int:
+        """Steps that the solver could not take."""
+        return int(self.summary["solver"]["failures"])
+
+
+class StampClock:
+    """Time on the clock of the stamps at a message's arrival, from its log time.
+
+    Drivers may stamp by another clock than the recorder's. The smallest difference between a joint state's log
+    time and its stamp so far is taken as that of the clocks. A single stamp that is wildly off does not count;
+    three in a row do. The time given never runs backwards.
+    """
+
+    LIMIT_NS = 1_000_000_000
+
+    def __init__(self) -> None:
+        self._offset_ns: int | None = None
+        self._now_ns: int | None = None
+        self._streak = 0
+
+    def now_ns(self, item: InputMessage) -> int | None:
+        """None before the first joint state."""
+        if isinstance(item.message, JointStateIn):
+            self._update(item.log_ns - item.message.stamp_ns)
+        if self._offset_ns is None:
+            return None
+        now = item.log_ns - self._offset_ns
+        self._now_ns = now if self._now_ns is None else max(now, self._now_ns)
+        return self._now_ns
+
+    def _update(self, offset_ns: int) -> None:
+        if self._offset_ns is None:
+            self._offset_ns = offset_ns
+        elif abs(offset_ns - self._offset_ns) <= self.LIMIT_NS:
+            self._offset_ns = min(self._offset_ns, offset_ns)
+            self._streak = 0
+        else:
+            self._streak += 1
+            if self._streak >= 3:
+                self._offset_ns = offset_ns
+                self._streak = 0
+
+
+def arrivals(messages: Iterator[InputMessage]) -> Iterator[list[InputMessage]]:
+    """Messages grouped by arrival time."""
+    group: list[InputMessage] = []
+    for item in messages:
+        if group and item.log_ns != group[0].log_ns:
+            yield group
+            group = []
+        group.append(item)
+    if group:
+        yield group
+
+
+class Player:
+    """Feeds an estimator from a bag and yields its steps, one call of `advance` per step where inputs allow.
+
+    `step_s` holds the time spent on each step, roll-back included.
+    """
+
+    def __init__(self, estimator: Estimator) -> None:
+        self.estimator = estimator
+        self.step_s = array("d")
+        self.joint_names: set[str] = set()
+        self._clock = StampClock()
+        self._next_ns: int | None = None
+
+    def play(self, bag: Bag, until_ns: int | None = None) -> Iterator[StepOutput]:
+        """Steps in order, to the last joint stamp.
+
+        Args:
+            until_ns: log time at which to stop early; no closing steps then.
+        """
+        now_ns: int | None = None
+        for group in arrivals(bag.inputs()):
+            if until_ns is not None and group[0].log_ns > until_ns:
+                return
+            arrival_ns = self._clock.now_ns(group[0])
+            if arrival_ns is not None and now_ns is not None and arrival_ns - 1 > now_ns:
+                # What a live node would have done by itself before these messages came.
+                yield from self._advance(arrival_ns - 1)
+            for item in group:
+                now_ns = self._clock.now_ns(item)
+                self._add(item)
+            yield from self._advance(now_ns)
+        if until_ns is None:
+            yield from self._timed(self.estimator.finish)
+
+    def _add(self, item: InputMessage) -> None:
+        message = item.message
+        if isinstance(message, JointStateIn):
+            if len(self.joint_names) < 100:
+                self.joint_names.update(message.names[:100])
+            self.estimator.add_joint_state(message.stamp_ns, message.names, message.positions)
+        elif isinstance(message, PoseIn):
+            self.estimator.add_tracker_pose(
+                message.stamp_ns, message.position, message.quaternion_xyzw, message.frame_id
+            )
+        else:
+            self.estimator.add_tip_load(message.stamp_ns, message.force, message.torque, message.frame_id)
+
+    def _advance(self, now_ns: int | None) -> Iterator[StepOutput]:
+        if now_ns is None:
+            return
+        # One step a call, so that its time is its own; what is due for other reasons comes with the last call.
+        while self._next_ns is not None and self._next_ns < now_ns:
+            before = self._next_ns
+            yield from self._timed(partial(self.estimator.advance, before))
+            if self._next_ns == before:
+                break
+        yield from self._timed(partial(self.estimator.advance, now_ns))
+
+    def _timed(self, call: Callable[[], list[StepOutput]]) -> Iterator[StepOutput]:
+        begin = time.perf_counter()
+        steps = call()
+        if steps:
+            spent = (time.perf_counter() - begin) / len(steps)
+            self.step_s.extend([spent] * len(steps))
+            self._next_ns = steps[-1].stamp_ns + STEP_NS
+            yield from steps
+
+
+class _Invalid:
+    """Stretches of invalid steps, for the summary."""
+
+    def __init__(self) -> None:
+        self.steps = 0
+        self.stretches: list[dict[str, Any]] = []
+        self._previous = -2
+
+    def add(self, out: StepOutput, first_ns: int) -> None:
+        if out.valid:
+            return
+        self.steps += 1
+        now = (out.stamp_ns - first_ns) * 1e-9
+        last = self.stretches[-1] if self.stretches else None
+        if last is not None and out.k == self._previous + 1 and last["reason"] == out.reason:
+            last["to_s"] = now
+        elif len(self.stretches) < _MAX_STRETCHES:
+            self.stretches.append({"from_s": now, "to_s": now, "reason": out.reason})
+        self._previous = out.k
+
+
+def plain(value: Any) -> Any:
+    """The value for JSON: NumPy numbers as plain ones, and null for what is not finite."""
+    if isinstance(value, dict):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple, np.ndarray)):
+        return [plain(item) for item in value]
+    if isinstance(value, np.generic):
+        value = value.item()
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
+
+
+def replay(
+    bag: str | Path,
+    robot: Robot | str | Path,
+    settings: Settings,
+    output: str | Path | None = None,
+    summary: str | Path | None = None,
+    progress: Progress | None = None,
+    make_estimator: MakeEstimator | None = None,
+) -> ReplayResult:
+    """Run a bag through the estimator.
+
+    Args:
+        bag: an ``.mcap`` file, a rosbag2 folder, or a folder that holds exactly one ``.mcap``.
+        robot: a robot, the name of a shipped one, or a robot file.
+        settings: parameters; ``output.policy`` counts as given (the command takes ``wait`` by default).
+        output: MCAP file to write every output topic to; None for none. Files appear only when the replay ends
+            well.
+        summary: JSON file for the summary; None for none.
+        progress: called now and then with the fraction done and the number of steps.
+        make_estimator: another estimator with the same interface.
+
+    Raises:
+        InputError: an input that cannot be used, or no step at all.
+    """
+    opened = open_bag(bag)
+    opened.check_inputs()
+    if not isinstance(robot, Robot):
+        robot = load_robot(robot)
+    settings = settings.replace({"robot": robot.source or robot.name})
+    _check_targets(opened, output, summary)
+    inputs = opened.sha256()
+    provenance = {
+        "version": __version__,
+        "robot": {"name": robot.name, "source": robot.source, "sha256": robot.sha256},
+        "inputs": [{"name": name, "sha256": digest} for name, digest in inputs.items()],
+        "parameters": settings.as_dict(),
+    }
+    make = make_estimator or _default_estimator()
+    _warm_up(opened, make(robot, settings))
+    with contextlib.ExitStack() as stack:
+        writer: BagWriter | None = None
+        if output is not None:
+            writer = stack.enter_context(write_bag(Path(output), _metadata(provenance)))
+        summary_part = stack.enter_context(atomic_file(Path(summary))) if summary is not None else None
+        numbers = _run(opened, make(robot, settings), robot, settings, writer, progress)
+        content = plain({**numbers, **provenance, "notes": opened.notes})
+        if summary_part is not None:
+            text = json.dumps(content, indent=1, allow_nan=False, ensure_ascii=False)
+            summary_part.write_text(text + "\n", encoding="utf-8")
+    return ReplayResult(content, opened.notes)
+
+
+def _default_estimator() -> MakeEstimator:
+    # Imported late: it brings the compiled model, which reading and checking a bag do not need.
+    from ctr_dynamics.estimation.estimator import Estimator
+
+    return Estimator
+
+
+def _run(
+    bag: Bag,
+    estimator: Estimator,
+    robot: Robot,
+    settings: Settings,
+    writer: BagWriter | None,
+    progress: Progress | None,
+) -> dict[str, Any]:
+    """The replay itself; returns the numbers of the summary."""
+    encoder = StepEncoder(settings["output.frame_id"], robot.name, settings["output.backbone_every"])
+    player = Player(estimator)
+    invalid = _Invalid()
+    steps = 0
+    first_ns = last_ns = 0
+    blocks = [block for file in bag.files for block in file.blocks]
+    span_ns = max((b.end_ns for b in blocks), default=0) - min((b.start_ns for b in blocks), default=0)
+    begin = time.perf_counter()
+    for out in player.play(bag):
+        if steps == 0:
+            first_ns = out.stamp_ns
+        last_ns = out.stamp_ns
+        steps += 1
+        invalid.add(out, first_ns)
+        if writer is not None:
+            for message in encoder.encode(out, estimator.health.statuses):
+                writer.write(message.topic, message.stamp_ns, message.data)
+        if progress is not None and steps % 50 == 0:
+            progress(min(1.0, (last_ns - first_ns) / span_ns) if span_ns > 0 else 1.0, steps)
+    wall_s = time.perf_counter() - begin
+    if steps == 0:
+        raise _no_step(bag, robot, player.joint_names)
+    duration_s = (last_ns - first_ns) * 1e-9
+    p50, p99, worst = np.percentile(np.array(player.step_s) * 1e3, (50, 99, 100))
+    return {
+        **estimator.summary(),
+        "steps": steps,
+        "duration_s": duration_s,
+        "wall_s": wall_s,
+        "realtime_ratio": duration_s / wall_s,
+        "step_ms": {"p50": p50, "p99": p99, "max": worst},
+        "invalid": {"steps": invalid.steps, "stretches": invalid.stretches},
+        "malformed": dict(bag.malformed),
+    }
+
+
+def _warm_up(bag: Bag, estimator: Estimator) -> None:
+    """Run the bag's first moments through another estimator: whatever has to be compiled is, before the clock
+    starts."""
+    starts = [block.start_ns for file in bag.files for block in file.blocks]
+    if starts:
+        for _ in Player(estimator).play(bag, until_ns=min(starts) + _WARM_UP_NS):
+            pass
+
+
+def _metadata(provenance: dict[str, Any]) -> dict[str, str]:
+    """Provenance as the text entries of an MCAP metadata record."""
+    return {
+        key: value if isinstance(value, str) else json.dumps(plain(value), sort_keys=True)
+        for key, value in provenance.items()
+    }
+
+
+def _check_targets(bag: Bag, output: str | Path | None, summary: str | Path | None) -> None:
+    """No output may be an input, nor the other output: said before the work, not after it."""
+    taken = {file.path.resolve(): "the bag that is read" for file in bag.files}
+    for what, path in (("output", output), ("summary", summary)):
+        if path is None:
+            continue
+        target = Path(path).resolve()
+        if target in taken:
+            raise InputError(f"{what} is {taken[target]}", where=str(path), do="give another name")
+        taken[target] = f"the same file as the {what}"
+
+
+def _no_step(bag: Bag, robot: Robot, names: set[str]) -> InputError:
+    expected = ", ".join(f"tube{i}_rotation, tube{i}_translation" for i in range(1, robot.n_tubes + 1))
+    found = ", ".join(sorted(names)[:12]) or "none"
+    return InputError(
+        f"no step was possible: no usable joint state of robot '{robot.name}' on {JOINT_STATES} (joints found: "
+        f"{found}; needed: {expected}; readable messages: {_readable(bag)})",
+        where=str(bag.path),
+        do="check joint names, units and robot with `ctr-dynamics info`",
+    )
+
+
+def _readable(bag: Bag) -> int:
+    topic = bag.topics.get(JOINT_STATES)
+    return (topic.messages if topic else 0) - bag.malformed.get(JOINT_STATES, 0)

@@ -1,0 +1,132 @@
+"""The `ctr-dynamics` command: finds the command's file, runs it and turns its outcome into an exit code."""
+
+from __future__ import annotations
+
+import functools
+import inspect
+import os
+import sys
+from collections.abc import Callable
+from importlib import import_module
+from importlib.util import find_spec
+from typing import Annotated, Any
+
+import typer
+
+from ctr_dynamics import __version__
+from ctr_dynamics.errors import InputError
+
+# Shown by --help without importing the command's file.
+COMMANDS = {
+    "replay": "Run a recorded bag through the estimator, without a ROS graph.",
+    "diagnose": "Find what the simulation gets wrong about the recorded robot.",
+    "simulate": "Write a bag of a simulated scenario.",
+    "statics": "Solve the static model for a table of actuator positions.",
+    "snap": "Snap-through by the finite-difference solver.",
+    "bench": "Measure cost per step, real-time ratios and tick times.",
+    "info": "Say what is in a bag: topics, rates, gaps, clock and unit problems.",
+    "warmup": "Compile every kernel into the cache.",
+    "demo": "Estimator node and driver live over DDS on a shipped bag.",
+}
+
+FINISHED, PARTLY_FAILED, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
+
+
+def available() -> list[str]:
+    """Commands whose file exists, in the order of COMMANDS."""
+    return [name for name in COMMANDS if find_spec(f"ctr_dynamics.cli.{name}") is not None]
+
+
+def fail(message: str) -> None:
+    """One line on stderr."""
+    print(f"ctr-dynamics: error: {' '.join(message.split())}", file=sys.stderr)
+
+
+def _with_exit_code(command: Callable[..., Any]) -> Callable[..., None]:
+    @functools.wraps(command)
+    def run(*args: Any, **kwargs: Any) -> None:
+        try:
+            code = command(*args, **kwargs)
+        except InputError as error:
+            fail(str(error))
+            raise typer.Exit(BAD_INPUT) from None
+        except KeyboardInterrupt:
+            fail("interrupted")
+            raise typer.Exit(INTERRUPTED) from None
+        except BrokenPipeError:
+            # The reader of our output is gone; nothing more can be written, not even at exit.
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            raise typer.Exit(FINISHED) from None
+        except OSError as error:
+            fail(f"{error.filename}: {error.strerror}" if error.filename else str(error))
+            raise typer.Exit(BAD_INPUT) from None
+        if code:
+            raise typer.Exit(int(code))
+
+    # typer reads annotations through the signature, and strings in them need the command's own module.
+    run.__signature__ = inspect.signature(command, eval_str=True)  # type: ignore[attr-defined]
+    run.__annotations__ = inspect.get_annotations(command, eval_str=True)
+    return run
+
+
+def _not_imported() -> None:
+    raise AssertionError("a command was run whose file was not imported")
+
+
+def _show_version(wanted: bool) -> None:
+    if wanted:
+        print(f"ctr-dynamics {__version__}")
+        raise typer.Exit
+
+
+def build_app(requested: str | None) -> typer.Typer:
+    """The application with the file of `requested` imported and the other commands listed by name only."""
+    app = typer.Typer(
+        name="ctr-dynamics",
+        help="Dynamics and state estimation of concentric tube robots.",
+        no_args_is_help=True,
+        add_completion=False,
+        pretty_exceptions_enable=False,
+        rich_markup_mode=None,
+    )
+
+    @app.callback()
+    def options(
+        version: Annotated[
+            bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Print the version.")
+        ] = False,
+    ) -> None:
+        pass
+
+    for name in available():
+        if name == requested:
+            module = import_module(f"ctr_dynamics.cli.{name}")
+            app.command(name)(_with_exit_code(getattr(module, name)))
+        else:
+            app.command(name, help=COMMANDS[name])(_not_imported)
+    return app
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the command line.
+
+    Args:
+        argv: arguments without the program's name; None takes the process's.
+
+    Returns:
+        0 finished, 1 finished but some rows or steps failed, 2 bad arguments or input, 130 interrupted.
+    """
+    arguments = sys.argv[1:] if argv is None else argv
+    requested = next((a for a in arguments if not a.startswith("-")), None)
+    try:
+        build_app(requested)(args=arguments, prog_name="ctr-dynamics")
+    except SystemExit as end:
+        return end.code if isinstance(end.code, int) else (FINISHED if end.code is None else BAD_INPUT)
+    except KeyboardInterrupt:
+        fail("interrupted")
+        return INTERRUPTED
+    return FINISHED
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,25 @@
+"""The errors that a user can cause and mend: one line each, with what, value, limit, unit and what to do."""
+
+from __future__ import annotations
+
+
+class InputError(ValueError):
+    """An argument, file or parameter that cannot be used.
+
+    The message is one line and says what is wrong, the value, the limit with its unit, and what to do.
+    Commands print it on stderr and end with exit code 2; the node refuses to start or to take the value.
+
+    Args:
+        what: what is wrong, in one sentence without a full stop at its end; line breaks become blanks.
+        do: what the reader can do about it; appended after a semicolon.
+        where: file, key path or parameter name, put in front.
+    """
+
+    def __init__(self, what: str, *, do: str = "", where: str = "") -> None:
+        self.what = " ".join(str(what).split())
+        self.do = " ".join(do.split())
+        self.where = where
+        text = f"{where}: {self.what}" if where else self.what
+        if self.do:
+            text += f"; {self.do}"
+        super().__init__(text)

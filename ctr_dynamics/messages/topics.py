@@ -1,0 +1,372 @@
+"""The one table of topics: what the estimator hears and says, with types, rates and the meaning of every field.
+
+The node, replay, the recorder and the pages in ``msg_docs/`` all follow this table. SI units and radians; poses
+and vectors in the base frame ``ctr_base`` (origin at the hole of the base plate, +z along the robot at the base,
++y against gravity). The tip is the end of tube 1, the innermost, and its frame is that of tube 1.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+STEP_NS = 3_000_000  # model step and output grid
+BACKBONE_EVERY = 11  # steps between two messages of the display topic (30 Hz)
+DIAGNOSTICS_EVERY = 333  # steps between two /diagnostics messages without news (1 Hz)
+
+JOINT_STATES = "/ctr/joint_states"
+TRACKER_TIP = "/ctr/tracker/tip"
+TIP_LOAD = "/ctr/tip_load"
+TIP_POSE = "/ctr/estimator/tip_pose"
+TIP_TWIST = "/ctr/estimator/tip_twist"
+TIP_POSE_PREDICTED = "/ctr/estimator/tip_pose_predicted"
+BACKBONE = "/ctr/estimator/backbone"
+BACKBONE_STATE = "/ctr/estimator/backbone_state"
+MODES = "/ctr/estimator/modes"
+INNOVATION = "/ctr/estimator/innovation"
+DISTURBANCE = "/ctr/estimator/disturbance"
+DISTURBANCE_SIGMA = "/ctr/estimator/disturbance_sigma"
+VALID = "/ctr/estimator/valid"
+DIAGNOSTICS = "/diagnostics"
+
+BACKBONE_FIELDS = ("s", "x", "y", "z", "qx", "qy", "qz", "qw", "vx", "vy", "vz", "ux", "uy", "uz", "sd")
+AXES = ("x", "y", "z", "rx", "ry", "rz")  # order of every six-vector and covariance
+
+PER_STEP = "every model step (3 ms, 333.3 Hz)"
+
+
+@dataclass(frozen=True)
+class Field:
+    """Meaning of one field; `path` also covers everything below it (``pose.position`` covers x, y and z)."""
+
+    path: str
+    text: str
+    unit: str = "-"
+
+
+@dataclass(frozen=True)
+class Qos:
+    """Quality of service that a topic is opened with, unless parameters say otherwise."""
+
+    reliability: Literal["best_effort", "reliable"]
+    depth: int
+    history: str = "keep last"
+    durability: str = "volatile"
+
+
+INPUT_QOS = Qos("best_effort", 50)
+OUTPUT_QOS = Qos("reliable", 10)
+
+
+@dataclass(frozen=True)
+class Topic:
+    """One topic: name, ROS type, direction seen from the estimator, QoS, rate, meaning and fields."""
+
+    name: str
+    ros_type: str
+    direction: Literal["in", "out"]
+    qos: Qos
+    rate: str
+    meaning: str
+    fields: tuple[Field, ...]
+    notes: tuple[str, ...] = ()
+
+    @property
+    def has_header(self) -> bool:
+        """Whether the message begins with a std_msgs/Header."""
+        return any(field.path == "header.stamp" for field in self.fields)
+
+    @property
+    def page(self) -> str:
+        """File name of the topic's page in msg_docs/."""
+        return self.name.strip("/").replace("/", "_") + ".md"
+
+
+_STAMP = Field("header.stamp", "model time t_k = stamp of the first complete joint state + k * 3,000,000 ns", "s, ns")
+_FRAME = Field("header.frame_id", "`ctr_base` (parameter `output.frame_id`)")
+_POSITION = "position of the tip in the base frame"
+_ORIENTATION = "orientation of the tip frame in the base frame, unit quaternion in ROS order x, y, z, w"
+_NOT_INVALID = "Not published for a step whose `/ctr/estimator/valid` is false."
+
+TOPICS: tuple[Topic, ...] = (
+    Topic(
+        JOINT_STATES,
+        "sensor_msgs/msg/JointState",
+        "in",
+        INPUT_QOS,
+        "50 Hz or more (100 Hz in the shipped bags)",
+        "Actuator angles and positions of all tubes.",
+        (
+            Field("header.stamp", "time at which the encoders were read", "s, ns"),
+            Field("header.frame_id", "not used"),
+            Field("name", "`tubeN_rotation` and `tubeN_translation` for every tube N = 1.. (1 innermost), any order"),
+            Field(
+                "position",
+                "`tubeN_rotation`: actuator angle alpha_N in rad; `tubeN_translation`: beta_N in m, the position of "
+                "the tube's base, zero or negative (behind the base plate)",
+                "rad, m",
+            ),
+            Field("velocity", "not used; may be empty"),
+            Field("effort", "not used; may be empty"),
+        ),
+        (
+            "Joints are matched by name, never by place. Other names in the message are ignored; a message in which "
+            "a tube's rotation or translation is missing is not used and is counted in `/diagnostics`.",
+            "Values are linear between two stamps.",
+        ),
+    ),
+    Topic(
+        TRACKER_TIP,
+        "geometry_msgs/msg/PoseStamped",
+        "in",
+        INPUT_QOS,
+        "the tracker's (40 Hz in the shipped bags)",
+        "Measured pose of the tip sensor.",
+        (
+            Field("header.stamp", "acquisition time (parameter `tracker.delay_s` corrects a known delay)", "s, ns"),
+            Field("header.frame_id", "`ctr_base`; a pose in another frame is rejected"),
+            Field("pose.position", "position of the sensor", "m"),
+            Field("pose.orientation", "orientation of the sensor, unit quaternion in ROS order x, y, z, w"),
+        ),
+        (
+            "Samples up to 0.2 s late and out of order are fused at their own stamp. Samples with numbers that are "
+            "not finite, or with a quaternion whose norm is far from one, are rejected and counted.",
+        ),
+    ),
+    Topic(
+        TIP_LOAD,
+        "geometry_msgs/msg/WrenchStamped",
+        "in",
+        INPUT_QOS,
+        "any; optional",
+        "Known wrench on the tip (a hung weight, a force sensor). Without this topic the known load is zero.",
+        (
+            Field("header.stamp", "time of the value; linear between stamps, held after the last", "s, ns"),
+            Field("header.frame_id", "`ctr_base`; the wrench is in base axes"),
+            Field("wrench.force", "force on the tip, base axes", "N"),
+            Field("wrench.torque", "torque about the tip point, base axes", "N m"),
+        ),
+        (
+            "Before the first stamp the load is that first one if it comes within 0.1 s of the first joint state, "
+            "else zero.",
+        ),
+    ),
+    Topic(
+        TIP_POSE,
+        "geometry_msgs/msg/PoseWithCovarianceStamped",
+        "out",
+        OUTPUT_QOS,
+        PER_STEP,
+        "Fused tip pose.",
+        (
+            _STAMP,
+            _FRAME,
+            Field("pose.pose.position", _POSITION, "m"),
+            Field("pose.pose.orientation", _ORIENTATION),
+            Field(
+                "pose.covariance",
+                "6 x 6 row by row, order x, y, z, rx, ry, rz; rotations about the base axes",
+                "m^2, m rad, rad^2",
+            ),
+        ),
+        (_NOT_INVALID,),
+    ),
+    Topic(
+        TIP_TWIST,
+        "geometry_msgs/msg/TwistWithCovarianceStamped",
+        "out",
+        OUTPUT_QOS,
+        PER_STEP,
+        "Fused tip velocity.",
+        (
+            _STAMP,
+            _FRAME,
+            Field("twist.twist.linear", "rate of change of the tip point, insertion included, base axes", "m/s"),
+            Field("twist.twist.angular", "angular velocity of the tip frame, base axes", "rad/s"),
+            Field(
+                "twist.covariance",
+                "6 x 6 row by row, order x, y, z, rx, ry, rz, base axes",
+                "m^2/s^2, m rad/s^2, rad^2/s^2",
+            ),
+        ),
+        (
+            "Both parts are in base axes, unlike the common convention of a twist in the moving frame.",
+            _NOT_INVALID,
+        ),
+    ),
+    Topic(
+        TIP_POSE_PREDICTED,
+        "geometry_msgs/msg/PoseStamped",
+        "out",
+        OUTPUT_QOS,
+        PER_STEP,
+        "Tip pose of the model alone: a second, open-loop run that the tracker never corrects.",
+        (
+            _STAMP,
+            _FRAME,
+            Field("pose.position", _POSITION, "m"),
+            Field("pose.orientation", _ORIENTATION),
+        ),
+        ("It is not the filter's prior. Its distance from the tracker shows what the simulation gets wrong.",),
+    ),
+    Topic(
+        BACKBONE,
+        "nav_msgs/msg/Path",
+        "out",
+        OUTPUT_QOS,
+        "every 11th step (30.3 Hz)",
+        "Fused backbone for display (RViz, Foxglove).",
+        (
+            _STAMP,
+            _FRAME,
+            Field("poses[].header.stamp", "the same stamp", "s, ns"),
+            Field("poses[].header.frame_id", "the same frame"),
+            Field("poses[].pose.position", "point of the backbone, from the base to the tip", "m"),
+            Field("poses[].pose.orientation", "orientation of tube 1's frame there, x, y, z, w"),
+        ),
+        (_NOT_INVALID, "Controllers read `/ctr/estimator/backbone_state`, which holds more and costs less."),
+    ),
+    Topic(
+        BACKBONE_STATE,
+        "sensor_msgs/msg/PointCloud2",
+        "out",
+        OUTPUT_QOS,
+        PER_STEP,
+        "Fused backbone with velocity, curvature and deviation, base to tip.",
+        (
+            _STAMP,
+            _FRAME,
+            Field("height", "1"),
+            Field("width", "number of points"),
+            Field("fields", "15 fields of type FLOAT32 (7), count 1, offsets 0, 4, ... 56, named as in the layout"),
+            Field("is_bigendian", "false"),
+            Field("point_step", "60", "byte"),
+            Field("row_step", "60 times width", "byte"),
+            Field("data", "the points, one after the other"),
+            Field("is_dense", "true: every number is finite"),
+        ),
+        (
+            "Layout of a point: `s` arc length from the base plate (m); `x`, `y`, `z` position (m); `qx`, `qy`, `qz`, "
+            "`qw` orientation of tube 1's frame; `vx`, `vy`, `vz` velocity, base axes (m/s); `ux`, `uy`, `uz` "
+            "curvature and twist of tube 1 in its own frame (1/m); `sd` deviation (1 sigma) of the position, root of the "
+            "trace of its covariance (m).",
+            "Read it with `numpy.frombuffer(msg.data, numpy.float32).reshape(msg.width, 15)`.",
+            _NOT_INVALID,
+        ),
+    ),
+    Topic(
+        MODES,
+        "sensor_msgs/msg/JointState",
+        "out",
+        OUTPUT_QOS,
+        PER_STEP,
+        "The slowest vibration modes, for a controller that damps vibration.",
+        (
+            _STAMP,
+            _FRAME,
+            Field("name", "`mode1`..`modeM`, then `mode1.frequency_hz`.., then `mode1.damping_ratio`.. (3 M names)"),
+            Field(
+                "position",
+                "first M: amplitude of the mode, its present contribution to the tip's displacement; next M: "
+                "frequency; last M: damping ratio (1 = critical)",
+                "m, Hz, -",
+            ),
+            Field("velocity", "first M: rate of the amplitude; the other 2 M are zero", "m/s"),
+            Field("effort", "empty"),
+        ),
+        (
+            "Modes are ordered by frequency, the slowest first. With M = len(name) / 3 the controller's state is "
+            "`position[:M]` and `velocity[:M]`.",
+            _NOT_INVALID,
+        ),
+    ),
+    Topic(
+        INNOVATION,
+        "sensor_msgs/msg/JointState",
+        "out",
+        OUTPUT_QOS,
+        "once for every tracker sample, accepted or not",
+        "What the filter made of a tracker sample: innovation, its variance, NIS, degrees of freedom, verdict, delay.",
+        (
+            Field("header.stamp", "stamp of the tracker sample", "s, ns"),
+            _FRAME,
+            Field("name", "names of the numbers, see the layout"),
+            Field("position", "the numbers", "see the layout"),
+            Field("velocity", "empty"),
+            Field("effort", "empty"),
+        ),
+        (
+            "Layout, found by name: `residual.x`, `.y`, `.z` measured minus expected position (m), `residual.rx`, "
+            "`.ry`, `.rz` the rotation from the expected to the measured orientation about the base axes (rad); "
+            "`variance.x` .. `variance.rz` variances of these (m^2, rad^2); `nis` the normalised innovation squared "
+            "and `dof` its degrees of freedom; `accepted` 1 or 0; `delay_s` how long after its stamp the sample was "
+            "taken in (s); for a sample that was not used `reason.WORDS` with value 1.",
+            "A number that does not exist (a masked axis, a sample with a NaN) is left out: no NaN is published.",
+        ),
+    ),
+    Topic(
+        DISTURBANCE,
+        "geometry_msgs/msg/WrenchStamped",
+        "out",
+        OUTPUT_QOS,
+        PER_STEP,
+        "Estimated unknown force on the tip, beside the known one of `/ctr/tip_load`.",
+        (
+            _STAMP,
+            _FRAME,
+            Field("wrench.force", "estimated force, base axes; its deviation is in `/ctr/estimator/disturbance_sigma`", "N"),
+            Field("wrench.torque", "zero: the unknown load is modelled as a force at the tip point", "N m"),
+        ),
+        (_NOT_INVALID,),
+    ),
+    Topic(
+        DISTURBANCE_SIGMA,
+        "geometry_msgs/msg/Vector3Stamped",
+        "out",
+        OUTPUT_QOS,
+        PER_STEP,
+        "Deviation of the force in `/ctr/estimator/disturbance`.",
+        (
+            _STAMP,
+            _FRAME,
+            Field("vector", "1-sigma deviation of the estimated force, per base axis", "N"),
+        ),
+        (_NOT_INVALID,),
+    ),
+    Topic(
+        VALID,
+        "std_msgs/msg/Bool",
+        "out",
+        OUTPUT_QOS,
+        PER_STEP,
+        "Whether the outputs of this step can be used.",
+        (Field("data", "true: the step's outputs are published; false: they are not, `/diagnostics` says why"),),
+        ("It has no header. It is published after the other topics of its step.",),
+    ),
+    Topic(
+        DIAGNOSTICS,
+        "diagnostic_msgs/msg/DiagnosticArray",
+        "out",
+        OUTPUT_QOS,
+        "about 1 Hz, and at once when validity changes",
+        "Health of solver, timing, tracker, joints and consistency.",
+        (
+            Field("header.stamp", "model time of the step it belongs to", "s, ns"),
+            Field("header.frame_id", "empty"),
+            Field("status[].level", "0 ok, 1 warning, 2 error, 3 stale"),
+            Field("status[].name", "`ctr_estimator: ` and the subject"),
+            Field("status[].message", "what is the matter, with value, limit and unit"),
+            Field("status[].hardware_id", "name of the robot"),
+            Field("status[].values[].key", "name of a number, with its unit"),
+            Field("status[].values[].value", "the number as text"),
+        ),
+        (
+            "`ctr_estimator: output` is ERROR with the reason while `/ctr/estimator/valid` is false.",
+            "In a replay no value depends on the wall clock.",
+        ),
+    ),
+)
+
+TOPIC: dict[str, Topic] = {topic.name: topic for topic in TOPICS}
+INPUTS: tuple[Topic, ...] = tuple(topic for topic in TOPICS if topic.direction == "in")
+OUTPUTS: tuple[Topic, ...] = tuple(topic for topic in TOPICS if topic.direction == "out")

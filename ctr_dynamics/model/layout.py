@@ -1,0 +1,42 @@
+"""Rows of the parameter block that the kernels read, and its making from a robot."""
+
+from __future__ import annotations
+
+import numpy as np
+
+
+class Layout:
+    """Row numbers of the parameters of ``n`` tubes: one number a tube for the first fourteen groups, then g, the tip wrench and friction.
+
+    SI units; ``precurvature`` is a factor on u*, ``gravity``, ``force`` and ``torque`` are in ``ctr_base``.
+    """
+
+    def __init__(self, n: int) -> None:
+        self.n = n
+        groups = (
+            "bending_stiffness torsional_stiffness mass_per_length inertia_per_length bending_damping torsion_damping precurvature "
+            "body_mass body_inertia_x body_inertia_y body_inertia_z alpha alpha_rate beta"
+        ).split()
+        self._rows = {name: slice(k * n, (k + 1) * n) for k, name in enumerate(groups)}
+        base = 14 * n
+        for name, size in (("gravity", 3), ("force", 3), ("torque", 3)):
+            self._rows[name] = slice(base, base + size)
+            base += size
+        for name in ("tube_coulomb", "tube_viscous", "epsilon", "base_coulomb", "base_viscous"):
+            self._rows[name] = slice(base, base + 1)
+            base += 1
+        self.size = base
+
+    def __getitem__(self, name: str) -> slice:
+        return self._rows[name]
+
+    def rows(self, name: str) -> np.ndarray:
+        """Row numbers of ``name``."""
+        return np.arange(self.size)[self._rows[name]]
+
+    def pack(self, **values: object) -> np.ndarray:
+        """Parameter block (size,) from values by name; those not given are 0."""
+        block = np.zeros(self.size)
+        for name, value in values.items():
+            block[self._rows[name]] = value
+        return block

@@ -1,0 +1,176 @@
+"""Sections of the robot between curvature changes and tube ends, and the cells that carry the fields on them.
+
+Every section keeps its own reference coordinate in [0, 1] with a fixed number of cells, so that fields are never interpolated across a
+jump of curvature while the actuators move; only the section lengths follow the translations. When a breakpoint passes another one
+or the base plate, the set of sections changes and :func:`remap` carries the fields over once.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+from ctr_dynamics.errors import InputError
+
+STAGES = 4  # Runge-Kutta stages a cell, each with its own history
+_STAGE_XI = (0.0, 0.5, 0.5, 1.0)
+
+
+class Mesh(NamedTuple):
+    """Arrays that describe one set of sections; the kernels read them, nothing writes them.
+
+    ``sec_cells``, ``sec_tubes`` (sections,): cells of a section and tubes present in it. ``bp_tube``, ``bp_offset`` (sections,): the
+    section ends at s = beta[bp_tube] + bp_offset. ``ust`` (points * 3N,), ``ust0`` (3N,), ``ust_base`` (N * base points,):
+    precurvature in each tube's own frame, 1/m, at the points of the main part, just behind the plate, and (z only) behind the base.
+    """
+
+    sec_cells: np.ndarray
+    sec_tubes: np.ndarray
+    bp_tube: np.ndarray
+    bp_offset: np.ndarray
+    ust: np.ndarray
+    ust0: np.ndarray
+    ust_base: np.ndarray
+    base_cells: int
+
+
+class Segment(NamedTuple):
+    """A length of tube with smooth precurvature: ``coefficients`` (3, K) of a polynomial in the arc length from ``start``, SI units."""
+
+    start: float
+    end: float
+    coefficients: np.ndarray
+
+    def curvature(self, arc_length: float) -> np.ndarray:
+        """u* (3,) in 1/m at the tube's own arc length (m), held at the segment's ends."""
+        x = min(max(arc_length, self.start), self.end) - self.start
+        return self.coefficients @ x ** np.arange(self.coefficients.shape[1])
+
+
+Tubes = tuple[tuple[Segment, ...], ...]
+
+
+def breakpoints(tubes: Tubes, beta: np.ndarray) -> list[tuple[float, int, int]]:
+    """(s, tube, segment) of every curvature change and tube end beyond the plate, base to tip; s in m.
+
+    Raises InputError where a tube's end lies behind the plate or outside the next inner tube's.
+    """
+    ends = [beta[i] + segments[-1].end for i, segments in enumerate(tubes)]
+    for i, end in enumerate(ends):
+        if end <= 0.0:
+            raise InputError(
+                f"tube {i + 1} ends {-end:.4f} m behind the base plate (beta {beta[i]:.4f} m, length {tubes[i][-1].end:.4f} m)",
+                do="insert it further: its end must lie beyond the plate",
+            )
+        if i and end > ends[i - 1] + 1e-12:
+            raise InputError(
+                f"tube {i + 1} ends at s = {end:.4f} m, beyond tube {i}, which ends at {ends[i - 1]:.4f} m",
+                do="an inner tube must reach at least as far as the tubes around it",
+            )
+    points = [
+        (beta[i] + segment.end, i, j)
+        for i, segments in enumerate(tubes)
+        for j, segment in enumerate(segments)
+        if beta[i] + segment.end > 0.0
+    ]
+    # outer tubes first among equals, so that tubes end from the outside in
+    return sorted(points, key=lambda item: (item[0], -item[1]))
+
+
+def section_key(tubes: Tubes, beta: np.ndarray) -> tuple[tuple[int, int], ...]:
+    """The order of breakpoints: two actuator positions share a mesh exactly when this is equal."""
+    return tuple((i, j) for _, i, j in breakpoints(tubes, beta))
+
+
+def build_mesh(tubes: Tubes, beta: np.ndarray, nodes: int, base_cells: int = 4) -> Mesh:
+    """Sections for the actuator translations ``beta`` (N,) m with about ``nodes`` nodes from plate to tip."""
+    n = len(tubes)
+    points = breakpoints(tubes, beta)
+    positions = np.array([0.0] + [s for s, _, _ in points])
+    lengths = np.diff(positions)
+    cells = np.maximum(1, np.round((nodes - 1) * lengths / positions[-1])).astype(np.int64)
+    cells = np.where(lengths < 1e-9, 1, cells)
+    ends = np.array([beta[i] + segments[-1].end for i, segments in enumerate(tubes)])
+    present, active = [], [next(j for j, g in enumerate(t) if beta[i] + g.end > 0.0) for i, t in enumerate(tubes)]
+    ust, remaining = [], n
+    for k, (_, i, j) in enumerate(points):
+        present.append(remaining)
+        for cell in range(cells[k]):
+            xi = [(cell + x) / cells[k] for x in _STAGE_XI] + ([1.0] if cell == cells[k] - 1 else [])
+            for x in xi:
+                s = positions[k] + x * lengths[k]
+                row = np.zeros((n, 3))
+                for tube in range(remaining):
+                    row[tube] = tubes[tube][active[tube]].curvature(s - beta[tube])
+                ust.append(row)
+        if j == len(tubes[i]) - 1:
+            remaining -= 1
+        else:
+            active[i] = j + 1
+    ust0 = np.zeros((n, 3))
+    base_points = STAGES * base_cells + 1
+    ust_base = np.zeros((n, base_points))
+    for i, segments in enumerate(tubes):
+        behind = [g for g in segments if beta[i] + g.start < 0.0]
+        if behind:
+            ust0[i] = behind[-1].curvature(-beta[i])
+            for p in range(base_points):
+                cell, stage = divmod(p, STAGES)
+                ell = -beta[i] * (cell + (_STAGE_XI[stage] if p < base_points - 1 else 0.0)) / base_cells
+                ust_base[i, p] = next(g for g in segments if ell <= g.end).curvature(ell)[2]
+    assert np.all(ends > 0)
+    return Mesh(
+        sec_cells=cells,
+        sec_tubes=np.array(present, dtype=np.int64),
+        bp_tube=np.array([i for _, i, _ in points], dtype=np.int64),
+        bp_offset=np.array([tubes[i][j].end for _, i, j in points]),
+        ust=np.array(ust).ravel(),
+        ust0=ust0.ravel(),
+        ust_base=ust_base.ravel(),
+        base_cells=base_cells,
+    )
+
+
+def point_count(mesh: Mesh) -> int:
+    """Points of the main part: four stages a cell and one at the end of every section."""
+    return int(STAGES * mesh.sec_cells.sum() + len(mesh.sec_cells))
+
+
+def node_count(mesh: Mesh) -> int:
+    """Nodes of the main part; the two sides of a breakpoint count as two."""
+    return int(mesh.sec_cells.sum() + len(mesh.sec_cells))
+
+
+@njit(cache=True)
+def section_lengths(bp_tube, bp_offset, beta, seclen):
+    """Lengths (m) of the sections at the translations ``beta`` (N,), never negative, into ``seclen`` (sections,)."""
+    start = 0.0
+    for k in range(len(bp_tube)):
+        end = max(start, beta[bp_tube[k]] + bp_offset[k])
+        seclen[k] = end - start
+        start = end
+
+
+def point_positions(mesh: Mesh, beta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(s in m, section index) of every point of the main part at ``beta``."""
+    seclen = np.zeros(len(mesh.sec_cells))
+    section_lengths(mesh.bp_tube, mesh.bp_offset, np.asarray(beta, float), seclen)
+    starts = np.concatenate([[0.0], np.cumsum(seclen)[:-1]])
+    s, section = [], []
+    for k, cells in enumerate(mesh.sec_cells):
+        xi = [(cell + x) / cells for cell in range(cells) for x in _STAGE_XI] + [1.0]
+        s.append(starts[k] + np.array(xi) * seclen[k])
+        section.append(np.full(len(xi), k))
+    return np.concatenate(s), np.concatenate(section)
+
+
+def node_positions(mesh: Mesh, beta: np.ndarray) -> np.ndarray:
+    """Arc length (m) of every node at ``beta``."""
+    seclen = np.zeros(len(mesh.sec_cells))
+    section_lengths(mesh.bp_tube, mesh.bp_offset, np.asarray(beta, float), seclen)
+    starts = np.concatenate([[0.0], np.cumsum(seclen)[:-1]])
+    return np.concatenate(
+        [starts[k] + np.linspace(0.0, 1.0, cells + 1) * seclen[k] for k, cells in enumerate(mesh.sec_cells)]
+    )

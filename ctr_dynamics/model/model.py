@@ -1,0 +1,85 @@
+"""A robot in the form that the kernels use: parameter block, tube segments, scales of the shooting problem."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ctr_dynamics.model.kernels import workspace_rows
+from ctr_dynamics.model.layout import Layout
+from ctr_dynamics.model.mesh import Mesh, Segment, Tubes, build_mesh, node_count, point_count, section_key
+from ctr_dynamics.model.newton import buffers, lanes_for
+from ctr_dynamics.robot import Robot
+
+
+class Model:
+    """Numbers of one robot for the kernels.
+
+    Attributes:
+        n: number of tubes; tube 1 is the innermost.
+        tubes, lane: tuples whose lengths tell the compiler the tube count and one lane.
+        jacobian_lanes: lanes of the Jacobian's sweep.
+        layout: rows of the parameter block.
+        parameters: (NP,) block at the robot file's values; actuators and tip wrench are 0.
+        scale: (5 + N,) N and N m, unit of each shooting residual; step: (5 + N,) perturbation of each unknown.
+        nodes: requested nodes from plate to tip.
+    """
+
+    def __init__(self, robot: Robot, nodes: int = 24, base_cells: int = 4) -> None:
+        self.robot = robot
+        self.n = n = robot.n_tubes
+        self.tubes = (0,) * n
+        self.lane = ()
+        self.jacobian_lanes = lanes_for(6 + n)
+        self.layout = Layout(n)
+        self.nodes = nodes
+        self.base_cells = base_cells
+        self.segments: Tubes = tuple(
+            tuple(
+                Segment(float(start), float(end), np.ascontiguousarray(segment.coefficients, dtype=float))
+                for segment, start, end in zip(
+                    tube.precurvature, tube.breakpoints[:-1], tube.breakpoints[1:], strict=True
+                )
+            )
+            for tube in robot.tubes
+        )
+        bodies = [tube.end_body for tube in robot.tubes]
+        inertia = np.array([body.inertia.value if body else (0.0, 0.0, 0.0) for body in bodies])
+        self.parameters = self.layout.pack(
+            bending_stiffness=[tube.bending_stiffness for tube in robot.tubes],
+            torsional_stiffness=[tube.torsion_stiffness for tube in robot.tubes],
+            mass_per_length=[tube.density.value * tube.area for tube in robot.tubes],
+            inertia_per_length=[tube.density.value * tube.second_moment for tube in robot.tubes],
+            bending_damping=[tube.bending_damping.value for tube in robot.tubes],
+            torsion_damping=[tube.torsion_damping.value for tube in robot.tubes],
+            precurvature=1.0,
+            body_mass=[body.mass.value if body else 0.0 for body in bodies],
+            body_inertia_x=inertia[:, 0],
+            body_inertia_y=inertia[:, 1],
+            body_inertia_z=inertia[:, 2],
+            gravity=robot.gravity.value,
+            tube_coulomb=robot.friction.tubes.coulomb.value,
+            tube_viscous=robot.friction.tubes.viscous.value,
+            epsilon=robot.friction.epsilon.value,
+            base_coulomb=robot.friction.base.coulomb.value,
+            base_viscous=robot.friction.base.viscous.value,
+        )
+        reach = float(robot.lengths[0] + robot.rest.beta.value[0])
+        stiffness = robot.tubes[0].bending_stiffness
+        force, moment = stiffness / reach**2, stiffness / reach
+        self.scale = np.array([force] * 3 + [moment] * (2 + n))
+        self.step = np.array([moment] * n + [force] * 3 + [moment] * 2) * 1e-6
+        self._meshes: dict[tuple, Mesh] = {}
+
+    def mesh(self, beta: np.ndarray) -> tuple[tuple, Mesh]:
+        """Key and mesh of the sections at the translations ``beta`` (N,) m; built once for each key."""
+        key = section_key(self.segments, beta)
+        if key not in self._meshes:
+            self._meshes[key] = build_mesh(self.segments, beta, self.nodes, self.base_cells)
+        return key, self._meshes[key]
+
+    def buffers(self, mesh: Mesh, lanes: int) -> tuple[np.ndarray, ...]:
+        """Buffers of a sweep: (W, par, seclen, x, hist, histb, out, outb, nodes, res), flat, ``lanes`` numbers a row."""
+        return buffers(
+            self.n, mesh, point_count(mesh), node_count(mesh), lanes, workspace_rows(self.n)
+        )
+

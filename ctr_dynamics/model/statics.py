@@ -1,0 +1,295 @@
+"""Static equilibrium: the dynamic model with every velocity zero, its branches and its stability."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from ctr_dynamics.model.kernels import lane_count, sweep
+from ctr_dynamics.model.mesh import Mesh, section_lengths
+from ctr_dynamics.model.model import Model
+from ctr_dynamics.model.newton import CONVERGED, broadcast, lanes_for, solve
+
+
+@dataclass
+class Equilibrium:
+    """A static solution (or the reason why there is none).
+
+    Attributes:
+        converged: whether the shooting residual met the tolerance.
+        x: (5 + N,) base torques (N m), n (N) and m_xy (N m) at s = 0+ in the frame of tube 1.
+        fields: (points * F + base fields,) the fields at rest, as the dynamic model stores them.
+        nodes: (nodes, S) state at the nodes.
+        mesh, key: sections it was solved on.
+        end_angles: (N,) psi_L, end angle of each tube about the tangent in a rotation-minimising frame, rad.
+        stability: det of d alpha / d psi_L with the loads held; > 0 is stable; None unless asked for.
+    """
+
+    converged: bool
+    x: np.ndarray
+    fields: np.ndarray
+    nodes: np.ndarray
+    mesh: Mesh
+    key: tuple
+    end_angles: np.ndarray
+    stability: float | None = None
+
+    @property
+    def tip_position(self) -> np.ndarray:
+        """(3,) m in ``ctr_base``."""
+        return self.nodes[-1, :3]
+
+    @property
+    def tip_quaternion(self) -> np.ndarray:
+        """(4,) wxyz, unit, tube 1's tip frame in ``ctr_base``."""
+        h = self.nodes[-1, 3:7]
+        return h / np.linalg.norm(h)
+
+
+class Statics:
+    """Solver of static equilibria of one model."""
+
+    def __init__(self, model: Model, tolerance: float = 1e-9) -> None:
+        self.model = model
+        self.tolerance = tolerance
+
+    def solve(self, beta, alpha, force=(0, 0, 0), torque=(0, 0, 0), *, guess=None, end_angles=None, parameters=None):
+        """Equilibrium at beta (N,) m, alpha (N,) rad (at beta) under a wrench on tube 1's tip (N, N m, ``ctr_base``).
+
+        Args:
+            guess: (5 + N,) unknowns to start from.
+            end_angles: (N,) psi_L that choose the branch; without them the branch is the one that continuous growth of
+                precurvature, weight and load reaches from straight tubes.
+            parameters: (NP,) block instead of the robot file's.
+        Returns:
+            Equilibrium
+        """
+        model, layout = self.model, self.model.layout
+        beta = np.asarray(beta, float)
+        key, mesh = model.mesh(beta)
+        par = (model.parameters if parameters is None else parameters).copy()
+        par[layout["alpha"]] = alpha
+        par[layout["alpha_rate"]] = 0.0
+        par[layout["beta"]] = beta
+        par[layout["force"]] = force
+        par[layout["torque"]] = torque
+        work = _Work(model, mesh, beta)
+        if end_angles is not None:
+            x, found = self._from_end_angles(work, par, np.asarray(end_angles, float))
+            found = found and self._to_loads(work, par, x)
+        else:
+            x = np.zeros(5 + model.n) if guess is None else np.array(guess, float)
+            found = work.newton(par, x, self.tolerance)
+            if not found:
+                x[:] = 0.0
+                found = self._grow(work, par, x)
+        return work.result(key, x, par, found)
+
+    def _grow(self, work: _Work, par: np.ndarray, x: np.ndarray) -> bool:
+        """Continuation in one factor on precurvature, weight and load."""
+        names = ("precurvature", "gravity", "force", "torque")
+        rows = np.concatenate([self.model.layout.rows(name) for name in names])
+        return _continue(work, par, x, rows, self.tolerance)
+
+    def _to_loads(self, work: _Work, par: np.ndarray, x: np.ndarray) -> bool:
+        """Continuation in the weight and the load alone, from an unloaded solution."""
+        rows = np.concatenate([self.model.layout.rows(name) for name in ("gravity", "force", "torque")])
+        if not np.any(par[rows]):
+            return work.newton(par, x, self.tolerance)
+        return _continue(work, par, x, rows, self.tolerance)
+
+    def _from_end_angles(self, work: _Work, par: np.ndarray, end_angles: np.ndarray) -> tuple[np.ndarray, bool]:
+        """Unloaded solution whose end angles are near the given ones.
+
+        The unloaded robot is an initial-value problem from its ends: with psi_L given and free ends, torsion integrates backward without
+        iteration. Its base torques start the shooting.
+        """
+        unloaded = par.copy()
+        for name in ("gravity", "force", "torque"):
+            unloaded[self.model.layout[name]] = 0.0
+        x, _ = work.backward(unloaded, end_angles)
+        return x, work.newton(unloaded, x, self.tolerance)
+
+    def stability(self, equilibrium: Equilibrium, beta, alpha, force=(0, 0, 0), torque=(0, 0, 0)) -> float:
+        """det(d alpha / d psi_L) with the loads held, positive on stable branches (Gilbert et al. 2016, Ha et al. 2016).
+
+        psi_L and the tip's imbalance r are smooth functions of (x, alpha), and their joint Jacobian is regular where the
+        shooting one is not, so det(d alpha / d psi_L) = det(r_x) / det([r_x, r_alpha; psi_x, psi_alpha]) is exact through a fold.
+        """
+        model, layout = self.model, self.model.layout
+        n = model.n
+        par = model.parameters.copy()
+        par[layout["alpha"]] = alpha
+        par[layout["beta"]] = beta
+        par[layout["force"]] = force
+        par[layout["torque"]] = torque
+        work = _Work(model, equilibrium.mesh, np.asarray(beta, float))
+        joint = work.joint_jacobian(par, equilibrium.x, model.step, layout.rows("alpha"))
+        sign_x, log_x = np.linalg.slogdet(joint[: 5 + n, : 5 + n])
+        sign_j, log_j = np.linalg.slogdet(joint)
+        return float(sign_x * sign_j * math.exp(min(log_x - log_j, 700.0)))
+
+
+def _continue(work: _Work, par: np.ndarray, x: np.ndarray, rows: np.ndarray, tolerance: float) -> bool:
+    """Raise the parameters in ``rows`` from 0 to their values in adaptive steps; ``x`` follows. True when they are reached."""
+    target = par[rows].copy()
+    reached, step = 0.0, 0.1
+    par[rows] = 0.0
+    if not work.newton(par, x, tolerance):
+        par[rows] = target
+        return False
+    before, x_before = reached, x.copy()
+    while reached < 1.0:
+        trial = min(1.0, reached + step)
+        par[rows] = target * trial
+        guess = x.copy()
+        if reached > before:
+            guess += (x - x_before) * (trial - reached) / (reached - before)
+        if work.newton(par, guess, tolerance):
+            before, x_before = reached, x.copy()
+            x[:] = guess
+            reached = trial
+            step *= 1.5
+        else:
+            step *= 0.4
+            if step < 1e-4:
+                par[rows] = target
+                return False
+    return True
+
+
+class _Work:
+    """Buffers of one static problem on one mesh."""
+
+    def __init__(self, model: Model, mesh: Mesh, beta: np.ndarray) -> None:
+        self.model, self.mesh, self.beta = model, mesh, beta
+        self.plain = model.buffers(mesh, 1)
+        self.lanes = lanes_for(6 + 2 * model.n)
+        self.many = model.buffers(mesh, lane_count(self.lanes))
+        self.seclen = np.zeros(len(mesh.sec_cells))
+        section_lengths(mesh.bp_tube, mesh.bp_offset, beta, self.seclen)
+        self.inverse = np.zeros((5 + model.n, 5 + model.n))
+
+    def newton(self, par: np.ndarray, x: np.ndarray, tolerance: float) -> bool:
+        """Solve for ``x`` in place; ``x`` is left as it was when there is no solution."""
+        model = self.model
+        W, _, _, _, hist, histb, out, outb, nodes, res = self.plain
+        trial = x.copy()
+        outcome, *_ = solve(
+            model.tubes, model.lane, self.lanes, self.mesh, 0.0, par, self.seclen, trial, hist, histb,
+            (W, out, outb, nodes, res), self.many, model.scale, model.step, self.inverse, True, tolerance, 40,
+        )  # fmt: skip
+        if outcome == CONVERGED:
+            x[:] = trial
+        return outcome == CONVERGED
+
+    def sweep(self, par: np.ndarray, x: np.ndarray) -> None:
+        """One plain sweep at ``x``; results stay in the buffers."""
+        W, _, _, _, hist, histb, out, outb, nodes, res = self.plain
+        mesh = self.mesh
+        sweep(
+            self.model.tubes, self.model.lane, W, 0.0, mesh.sec_cells, mesh.sec_tubes, mesh.ust, mesh.ust0, mesh.ust_base,
+            mesh.base_cells, par, self.seclen, x, hist, histb, out, outb, nodes, res,
+        )  # fmt: skip
+
+    def result(self, key: tuple, x: np.ndarray, par: np.ndarray, converged: bool) -> Equilibrium:
+        """Equilibrium at ``x``."""
+        self.sweep(par, x)
+        _, _, _, _, _, _, out, outb, nodes, _ = self.plain
+        states = nodes.reshape(-1, 16 + 3 * self.model.n).copy()
+        return Equilibrium(
+            converged=converged,
+            x=x.copy(),
+            fields=np.concatenate([out, outb]),
+            nodes=states,
+            mesh=self.mesh,
+            key=key,
+            end_angles=self._end_angles(out[None], states[None])[0],
+        )
+
+    def _end_angles(self, out: np.ndarray, states: np.ndarray) -> np.ndarray:
+        """psi_L (lanes, N) from fields (lanes, points * F) and states (lanes, nodes, S): base angle plus the integral of u_1z, plus theta."""
+        n, mesh = self.model.n, self.mesh
+        F = 7 + 2 * n
+        u_z = out.reshape(len(out), -1, F)[:, :, 8]
+        h0 = states[:, 0, 3:7]
+        psi = 2.0 * np.arctan2(h0[:, 3], h0[:, 0])
+        integral = np.zeros(len(out))
+        angles = np.zeros((len(out), n))
+        point = node = 0
+        for k, cells in enumerate(mesh.sec_cells):
+            step = self.seclen[k] / cells
+            stage = u_z[:, point : point + 4 * cells].reshape(len(out), cells, 4)
+            integral += step / 6.0 * (stage @ np.array([1.0, 2.0, 2.0, 1.0])).sum(axis=1)
+            point += 4 * cells + 1
+            node += cells + 1
+            after = mesh.sec_tubes[k + 1] if k + 1 < len(mesh.sec_cells) else 0
+            if after < mesh.sec_tubes[k]:
+                i = mesh.sec_tubes[k] - 1
+                theta = states[:, node - 1, 18 + n + i - 1] if i else 0.0
+                angles[:, i] = psi + integral + theta
+        return angles
+
+    def joint_jacobian(self, par: np.ndarray, x: np.ndarray, step: np.ndarray, alpha_rows: np.ndarray) -> np.ndarray:
+        """d(r, psi_L)/d(x, alpha), (5 + 2N, 5 + 2N), by perturbed lanes."""
+        model, mesh, L = self.model, self.mesh, lane_count(self.lanes)
+        n, m = model.n, 5 + model.n
+        W, parL, seclenL, xL, histL, histbL, outL, outbL, nodesL, resL = self.many
+        broadcast(self.lanes, par, parL)
+        broadcast(self.lanes, self.seclen, seclenL)
+        broadcast(self.lanes, x, xL)
+        for i in range(m):
+            xL[i * L + 1 + i] += step[i]
+        for i, row in enumerate(alpha_rows):
+            parL[row * L + 1 + m + i] += 1e-7
+        sweep(
+            model.tubes, self.lanes, W, 0.0, mesh.sec_cells, mesh.sec_tubes, mesh.ust, mesh.ust0, mesh.ust_base, mesh.base_cells,
+            parL, seclenL, xL, histL, histbL, outL, outbL, nodesL, resL,
+        )  # fmt: skip
+        out = np.ascontiguousarray(outL.reshape(-1, L).T)
+        states = np.ascontiguousarray(nodesL.reshape(-1, L).T).reshape(L, -1, 16 + 3 * n)
+        values = np.concatenate([resL.reshape(m, L), self._end_angles(out, states).T])
+        steps = np.concatenate([step, np.full(n, 1e-7)])
+        return (values[:, 1 : 1 + m + n] - values[:, :1]) / steps
+
+    def backward(self, par: np.ndarray, end_angles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Unloaded torsion from the free ends back to the actuators: (x, alpha) with end angles (N,) rad; x holds base torques only.
+
+        psi_i' = u_iz, m_iz' = E_i I_i (u x u*_i)_z with u the common curvature in a rotation-minimising frame; midpoint steps.
+        """
+        n, mesh, layout = self.model.n, self.mesh, self.model.layout
+        EI, GJ = par[layout["bending_stiffness"]], par[layout["torsional_stiffness"]]
+        KS = par[layout["precurvature"]]
+        angles, torque = end_angles.copy(), np.zeros(n)
+        ust = mesh.ust.reshape(-1, n, 3) * KS[:, None]
+
+        def slope(angles: np.ndarray, torque: np.ndarray, present: int, reference: np.ndarray):
+            c, s = np.cos(angles[:present]), np.sin(angles[:present])
+            wx = c * reference[:present, 0] - s * reference[:present, 1]
+            wy = s * reference[:present, 0] + c * reference[:present, 1]
+            ei = EI[:present]
+            ux, uy = (ei @ wx) / ei.sum(), (ei @ wy) / ei.sum()
+            turn, wind = np.zeros(n), np.zeros(n)
+            turn[:present] = torque[:present] / GJ[:present] + reference[:present, 2]
+            wind[:present] = ei * (ux * wy - uy * wx)
+            return turn, wind
+
+        point = len(ust)
+        for k in reversed(range(len(mesh.sec_cells))):
+            cells, present = mesh.sec_cells[k], mesh.sec_tubes[k]
+            point -= 4 * cells + 1
+            fine = 8
+            for cell in reversed(range(cells)):
+                step = self.seclen[k] / cells / fine
+                reference = ust[point + 4 * cell + 1]
+                for _ in range(fine):
+                    turn, wind = slope(angles, torque, present, reference)
+                    turn, wind = slope(angles - 0.5 * step * turn, torque - 0.5 * step * wind, present, reference)
+                    angles, torque = angles - step * turn, torque - step * wind
+        x = np.zeros(5 + n)
+        x[:n] = torque
+        # at s = 0 the frame of tube 1 is turned by psi_1(0): moments of the unloaded robot vanish in total
+        alpha = angles + self.beta * torque / GJ
+        return x, alpha

@@ -1,0 +1,108 @@
+"""Declares the parameters of the table on a node, checks what it was started with and what is set later."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
+from rclpy.node import Node
+from rclpy.parameter import Parameter as RosParameter
+
+from ctr_dynamics.errors import InputError
+from ctr_dynamics.parameters import PARAMETERS, Parameter, Settings
+
+# Every rclpy node has these besides its own.
+_ROS_NAMES = ("use_sim_time", "start_type_description_service")
+_ROS_PREFIXES = ("qos_overrides.",)
+_TABLE = {parameter.name: parameter for parameter in PARAMETERS}
+
+
+def declare(node: Node) -> Settings:
+    """Declare every parameter of the table with type, text, range and read-only mark.
+
+    The node must have been made with `automatically_declare_parameters_from_overrides=True`, so that a name
+    that no parameter has is seen at all; ROS otherwise passes over it in silence.
+
+    Raises:
+        InputError: an unknown name, or a value of the wrong type or out of its range.
+    """
+    given: dict[str, Any] = {}
+    for name, parameter in node.get_parameters_by_prefix("").items():
+        if name in _TABLE:
+            given[name] = _plain(parameter.value)
+        elif name not in _ROS_NAMES and not name.startswith(_ROS_PREFIXES):
+            raise InputError(f"parameter {name} is unknown", do=_advice(name))
+    settings = Settings(given)
+    for name, entry in _TABLE.items():
+        value = _ros_value(settings[name])
+        if name in given:
+            node.undeclare_parameter(name)
+        # The value has been checked: a whole number given for a float is a float by now.
+        node.declare_parameter(name, value, _descriptor(entry, value), ignore_override=True)
+    return settings
+
+
+def watch(
+    node: Node,
+    current: Callable[[], Settings],
+    prepare: Callable[[Settings, set[str]], None],
+    apply: Callable[[], None],
+) -> None:
+    """Check parameters that are set while the node runs, then apply them.
+
+    Args:
+        current: the settings in use.
+        prepare: called with the new settings and the names that change; raises InputError to refuse them.
+        apply: called once the change is accepted.
+    """
+
+    def check(parameters: Sequence[RosParameter]) -> SetParametersResult:
+        changes = {p.name: _plain(p.value) for p in parameters if p.name in _TABLE}
+        if not changes:
+            return SetParametersResult(successful=True)
+        try:
+            settings = current().replace(changes)
+            prepare(settings, {name for name in changes if settings[name] != current()[name]})
+        except InputError as error:
+            return SetParametersResult(successful=False, reason=str(error))
+        return SetParametersResult(successful=True)
+
+    def changed(parameters: Sequence[RosParameter]) -> None:
+        if any(p.name in _TABLE for p in parameters):
+            apply()
+
+    node.add_on_set_parameters_callback(check)
+    node.add_post_set_parameters_callback(changed)
+
+
+def _plain(value: Any) -> Any:
+    """Arrays of ROS parameters come as array.array."""
+    return list(value) if hasattr(value, "typecode") else value
+
+
+def _ros_value(value: Any) -> Any:
+    return list(value) if isinstance(value, tuple) else value
+
+
+def _descriptor(entry: Parameter, value: Any) -> ParameterDescriptor:
+    text = f"{entry.text} [{entry.unit}]" if entry.unit else entry.text
+    descriptor = ParameterDescriptor(
+        name=entry.name,
+        type=RosParameter.Type.from_parameter_value(value).value,
+        description=text,
+        read_only=entry.read_only,
+        additional_constraints=entry.range if entry.type in ("str", "floats") else "",
+    )
+    if entry.low is not None and entry.high is not None:
+        if entry.type == "float":
+            descriptor.floating_point_range = [FloatingPointRange(from_value=entry.low, to_value=entry.high)]
+        elif entry.type == "int":
+            descriptor.integer_range = [IntegerRange(from_value=int(entry.low), to_value=int(entry.high))]
+    return descriptor
+
+
+def _advice(name: str) -> str:
+    near = difflib.get_close_matches(name, list(_TABLE), 1)
+    return f"did you mean {near[0]}?" if near else "see the parameter table in the README"

@@ -1,0 +1,90 @@
+"""From numbers to diagnostics: what the node itself knows (timing, clock, topics), as statuses."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from ctr_dynamics.estimation.health import Status
+from ctr_dynamics.nodes.stepping import CLOCK_LIMIT_NS
+from ctr_dynamics.nodes.timing import LATE_NS, VERY_LATE_NS, StepTiming
+
+OK, WARN, ERROR, STALE = range(4)
+HARDWARE_ID = "ctr"
+
+
+def timing_status(timing: StepTiming, faults: int, last_fault: str) -> Status:
+    """Punctuality of the published steps; WARN on late or skipped steps, ERROR after a fault of the node."""
+    report = timing.report()
+
+    def spread(name: str) -> str:
+        return " / ".join(f"{report[name][part]:.2f}" for part in ("p50", "p99", "max"))
+
+    values = {
+        "policy": timing.policy,
+        "steps": str(timing.steps),
+        "later than 3 ms": str(timing.late),
+        "later than 20 ms": str(timing.very_late),
+        "skipped": str(timing.skipped),
+        "withheld": str(timing.withheld),
+        "restarts": str(timing.restarts),
+        "lateness p50 / p99 / max (ms)": spread("lateness_ms"),
+        "step p50 / p99 / max (ms)": spread("step_ms"),
+        "correction p50 / p99 / max (ms)": spread("correction_ms"),
+    }
+    if faults:
+        return Status(
+            "timing",
+            ERROR,
+            f"{faults} faults inside the node, the last {last_fault}; the estimator started anew, see log",
+            values,
+        )
+    if timing.skipped:
+        return Status("timing", WARN, f"{timing.skipped} steps were skipped, none should be", values)
+    if timing.very_late or timing.late > 0.001 * max(timing.steps, 1000):
+        return Status(
+            "timing",
+            WARN,
+            f"{timing.late} of {timing.steps} steps were published later than {LATE_NS * 1e-6:g} ms, "
+            f"{timing.very_late} later than {VERY_LATE_NS * 1e-6:g} ms; limits 0.1 % and 0",
+            values,
+        )
+    return Status("timing", OK, f"{timing.steps} steps on time", values)
+
+
+def clock_status(offset_ns: int, agree: bool, now_ns: int, use_sim_time: bool, policy: str) -> Status:
+    """Whether the stamps of the joints and the node's clock are of one time."""
+    values = {
+        "node clock minus joint stamp (s)": f"{offset_ns * 1e-9:.4f}",
+        "use_sim_time": str(use_sim_time),
+    }
+    if now_ns <= 0:
+        return Status(
+            "clock", WARN, "use_sim_time is set and no /clock has arrived; steps follow the inputs", values
+        )
+    if not agree:
+        side = "behind" if offset_ns > 0 else "ahead of"
+        return Status(
+            "clock",
+            WARN,
+            f"joint stamps are {abs(offset_ns) * 1e-9:.3f} s {side} the node's clock, limit "
+            f"{CLOCK_LIMIT_NS * 1e-9:g} s: steps follow the inputs instead of the policy '{policy}'; "
+            "synchronise the clocks or set use_sim_time",
+            values,
+        )
+    return Status("clock", OK, "joint stamps and the node's clock agree", values)
+
+
+def topics_status(qos_faults: Mapping[str, str], undecodable: Mapping[str, tuple[int, str]]) -> Status:
+    """Topics whose endpoints do not fit, and messages that could not be decoded."""
+    values = {
+        **qos_faults,
+        **{topic: f"{count} undecodable, {why}" for topic, (count, why) in undecodable.items()},
+    }
+    if qos_faults:
+        return Status("topics", ERROR, "; ".join(qos_faults.values()), values)
+    if undecodable:
+        topic, (count, why) = next(iter(undecodable.items()))
+        return Status(
+            "topics", WARN, f"{count} messages on {topic} could not be decoded, the last: {why}", values
+        )
+    return Status("topics", OK, "all endpoints fit", values)

@@ -1,0 +1,81 @@
+"""The node's publishers: one per output topic, fed with serialised bytes, each stamp once."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from rclpy.event_handler import PublisherEventCallbacks
+from rclpy.node import Node
+from rclpy.qos import QoSProfile
+
+from ctr_dynamics.messages import topics
+from ctr_dynamics.messages.encode import OutputStatus, StepEncoder, encode_diagnostics
+from ctr_dynamics.nodes.diagnostics import ERROR, OK
+from ctr_dynamics.nodes.naming import message_class, node_topic
+from ctr_dynamics.nodes.qos import QosFaults
+
+
+class Outputs:
+    """Publishes the messages of steps. No stamp goes out twice, not even after a reset of the estimator.
+
+    Args:
+        node: makes the publishers.
+        profile: their quality of service.
+        faults: told about subscribers that do not fit.
+        encoder: makes the messages.
+        record: also given every message (topic, stamp in ns, bytes).
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        profile: QoSProfile,
+        faults: QosFaults,
+        encoder: StepEncoder,
+        record: Callable[[str, int, bytes], None] | None = None,
+    ) -> None:
+        self.last_stamp_ns: int | None = None
+        self.valid: bool | None = None
+        self.reason = "no step has been taken yet: waiting for the first complete joint state"
+        self._encoder = encoder
+        self._record = record
+        self._publishers = {
+            topic.name: node.create_publisher(
+                message_class(topic.ros_type),
+                node_topic(topic.name),
+                profile,
+                event_callbacks=PublisherEventCallbacks(incompatible_qos=faults.publisher(topic.name)),
+            )
+            for topic in topics.OUTPUTS
+        }
+
+    def step(self, out: Any) -> bool:
+        """Publish one step; False when its stamp is not later than all that were published."""
+        if self.last_stamp_ns is not None and out.stamp_ns <= self.last_stamp_ns:
+            return False
+        messages = self._encoder.encode(out)
+        self.last_stamp_ns = out.stamp_ns
+        for message in messages:
+            self._send(*message)
+        self.valid = bool(out.valid)
+        self.reason = out.reason
+        return True
+
+    def forget_stamps(self) -> None:
+        """The clock itself has gone back (a simulation starts again): earlier stamps are new ones now."""
+        self.last_stamp_ns = None
+
+    def diagnostics(self, stamp_ns: int, statuses: list[Any]) -> None:
+        """Publish /diagnostics, led by the status of the outputs."""
+        if self.valid:
+            output = OutputStatus("output", OK, "valid", {})
+        else:
+            output = OutputStatus("output", ERROR, self.reason or "outputs are invalid", {})
+        data = encode_diagnostics(stamp_ns, [output, *statuses], self._encoder.hardware_id)
+        self._send(topics.DIAGNOSTICS, stamp_ns, data)
+
+    def _send(self, topic: str, stamp_ns: int, data: bytes) -> None:
+        self._publishers[topic].publish(data)
+        if self._record is not None:
+            self._record(topic, stamp_ns, data)

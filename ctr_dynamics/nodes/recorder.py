@@ -1,0 +1,61 @@
+"""Records a live run: serialised messages go through a queue to a thread that writes them as MCAP."""
+
+from __future__ import annotations
+
+import queue
+import threading
+from collections.abc import Callable
+from typing import Any, Protocol
+
+
+class Writer(Protocol):
+    """What the recorder needs of a bag writer, such as `bagio.writer.LiveRecorder`."""
+
+    def write(self, topic: str, log_ns: int, data: bytes) -> None: ...
+    def close(self) -> None: ...
+
+
+class Recorder:
+    """Writes in its own thread, so that no disk ever holds up a step.
+
+    When the disk falls behind by more than `LIMIT` messages, further ones are dropped and counted. A disk
+    that fails ends the recording, not the node.
+    """
+
+    LIMIT = 100_000
+
+    def __init__(self, writer: Writer, log_error: Callable[[str], Any]) -> None:
+        self.written = 0
+        self.dropped = 0
+        self.error = ""
+        self._writer = writer
+        self._log_error = log_error
+        self._queue: queue.SimpleQueue[tuple[str, int, bytes] | None] = queue.SimpleQueue()
+        self._thread = threading.Thread(target=self._run, name="recorder", daemon=True)
+        self._thread.start()
+
+    def put(self, topic: str, log_ns: int, data: bytes) -> None:
+        """Have one message written; returns at once."""
+        if self.error or self._queue.qsize() > self.LIMIT:
+            self.dropped += 1
+        else:
+            self._queue.put((topic, log_ns, data))
+
+    def close(self) -> None:
+        """Write what is queued, finish the file, end the thread."""
+        self._queue.put(None)
+        self._thread.join()
+
+    def _run(self) -> None:
+        try:
+            while (item := self._queue.get()) is not None:
+                self._writer.write(*item)
+                self.written += 1
+        except OSError as error:
+            self.error = f"{type(error).__name__}: {error}"
+            self._log_error(f"recording stopped: {self.error}")
+        try:
+            self._writer.close()
+        except OSError as error:
+            self.error = self.error or f"{type(error).__name__}: {error}"
+            self._log_error(f"the recording could not be finished: {error}")

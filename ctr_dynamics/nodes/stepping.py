@@ -1,0 +1,262 @@
+"""The stepping thread: takes in what arrived, advances the estimator on absolute deadlines, hands out steps.
+
+Free of ROS: messages come as callables in an inbox, steps leave through one function, the clock is a
+function. Timers of an executor drop ticks; here the stamps decide which steps are due (`Estimator.advance`),
+and the thread sleeps until the next one is, or until a message wakes it.
+"""
+
+from __future__ import annotations
+
+import gc
+import threading
+import time
+import traceback
+from collections import deque
+from collections.abc import Callable, Sequence
+from typing import Any, Protocol
+
+from ctr_dynamics.nodes.timing import StepTiming
+
+STEP_NS = 3_000_000
+CLOCK_LIMIT_NS = 1_000_000_000
+"""Stamps farther than this from the node's clock are of another clock."""
+CATCH_UP_NS = 5_000_000_000
+"""A backlog longer than this is given up: the estimator starts anew."""
+SLICE_STEPS = 8
+"""Steps of a backlog taken between two looks at the inbox."""
+IDLE_NS = 50_000_000
+RETRY_NS = 1_000_000
+COLLECT_NS = 1_000_000_000
+COLLECT_SLACK_NS = 1_500_000
+
+
+class Steps(Protocol):
+    """What the thread needs of an estimator."""
+
+    @property
+    def t0_ns(self) -> int | None: ...
+    def advance(self, now_ns: int | None = None) -> Sequence[Any]: ...
+    def reset(self) -> None: ...
+
+
+class Call:
+    """A function to be run by the stepping thread, for its caller to wait for."""
+
+    def __init__(self, function: Callable[[], Any]) -> None:
+        self.function = function
+        self.result: Any = None
+        self.error: Exception | None = None
+        self.done = threading.Event()
+
+    def __call__(self) -> None:
+        try:
+            self.result = self.function()
+        except Exception as error:
+            self.error = error
+        self.done.set()
+
+
+class ClockCheck:
+    """Whether the joint stamps belong to the node's clock: three successive ones beyond the limit say no."""
+
+    def __init__(self, limit_ns: int = CLOCK_LIMIT_NS) -> None:
+        self.limit_ns = limit_ns
+        self.offset_ns = 0
+        self.agree = True
+        self._streak = 0
+
+    def sample(self, stamp_ns: int, now_ns: int) -> None:
+        self.offset_ns = now_ns - stamp_ns
+        if (abs(self.offset_ns) <= self.limit_ns) == self.agree:
+            self._streak = 0
+            return
+        self._streak += 1
+        if self._streak >= 3:
+            self.agree = not self.agree
+            self._streak = 0
+
+
+class StepLoop(threading.Thread):
+    """Runs an estimator against a clock.
+
+    Args:
+        estimator: see `Steps`; touched by this thread alone once started.
+        publish: called with every step in order of its stamp; returns False when the stamp was withheld.
+        housekeeping: called after each round with the current time; publishes diagnostics when they are due.
+        clock_ns: the current time of the clock that stamps the messages, 0 while it has none.
+        timing: the account of punctuality.
+        log_error: takes one line for the log.
+        wall: whether that clock runs at the rate of the wall clock, so that one may sleep until a stamp.
+    """
+
+    def __init__(
+        self,
+        estimator: Steps,
+        publish: Callable[[Any], bool],
+        housekeeping: Callable[[int], None],
+        clock_ns: Callable[[], int],
+        timing: StepTiming,
+        log_error: Callable[[str], Any],
+        wall: bool = True,
+    ) -> None:
+        super().__init__(name="stepping", daemon=True)
+        self.estimator = estimator
+        self.timing = timing
+        self.clock_check = ClockCheck()
+        self.inbox: deque[Callable[[], None]] = deque()
+        self.faults = 0
+        self.last_fault = ""
+        self._publish = publish
+        self._housekeeping = housekeeping
+        self._clock_ns = clock_ns
+        self._log_error = log_error
+        self._wall = wall
+        self._took_steps = False
+        self._wake = threading.Event()
+        self._stopping = False
+        self._last: tuple[int, int] | None = None  # k and stamp of the last step taken
+        self._next_collection_ns = 0
+
+    # Called from other threads.
+
+    def put(self, item: Callable[[], None]) -> None:
+        """Have `item` run by the stepping thread before its next step; returns at once."""
+        self.inbox.append(item)
+        self._wake.set()
+
+    def call(self, function: Callable[[], Any], timeout_s: float = 5.0) -> Any:
+        """Run `function` in the stepping thread and return its result.
+
+        Raises:
+            TimeoutError: the thread did not come to it in time.
+            Exception: whatever the function raised.
+        """
+        call = Call(function)
+        self.put(call)
+        if not call.done.wait(timeout_s):
+            raise TimeoutError(f"the stepping thread did not answer within {timeout_s:g} s")
+        if call.error is not None:
+            raise call.error
+        return call.result
+
+    def wake(self) -> None:
+        self._wake.set()
+
+    def stop(self) -> None:
+        """End the thread after the round in progress; join it afterwards."""
+        self._stopping = True
+        self._wake.set()
+
+    # The thread's own.
+
+    def swap(self, estimator: Steps) -> None:
+        """Go on with another estimator, which starts at its next joint state."""
+        self.estimator = estimator
+        self._last = None
+        self.timing.restarted()
+
+    def reset(self) -> None:
+        self.estimator.reset()
+        self._last = None
+        self.timing.restarted()
+
+    def run(self) -> None:
+        # What exists at the start is never garbage. The rest is collected between deadlines, so that no
+        # collection falls into a step.
+        gc.collect()
+        gc.freeze()
+        gc.disable()
+        try:
+            while not self._stopping:
+                self._wake.clear()
+                self._round()
+                self._sleep()
+        finally:
+            gc.enable()
+            gc.unfreeze()
+
+    def _round(self) -> None:
+        try:
+            while self.inbox:
+                self.inbox.popleft()()
+            self._advance()
+        except Exception as error:
+            # The node stays up whatever a message provokes: the fault is shown, the estimator starts anew.
+            self.faults += 1
+            self.last_fault = f"{type(error).__name__}: {error}"
+            self._log_error(
+                f"fault in the stepping thread, the estimator starts anew\n{traceback.format_exc()}"
+            )
+            self.reset()
+        now_ns = self._clock_ns()
+        self._housekeeping(now_ns)
+        self._collect(now_ns)
+
+    def _advance(self) -> None:
+        self._took_steps = False
+        while not self._stopping:
+            now_ns = self._clock_ns()
+            until_ns, more = self._until(now_ns)
+            begin = time.perf_counter_ns()
+            steps = self.estimator.advance(until_ns)
+            self.timing.advanced(len(steps), time.perf_counter_ns() - begin)
+            self._took_steps = self._took_steps or bool(steps)
+            for step in steps:
+                if self._last is not None and step.k <= self._last[0]:
+                    self.timing.restarted()  # the estimator has started anew by itself
+                self._last = (step.k, step.stamp_ns)
+                if self._publish(step):
+                    self.timing.published(step.k, step.stamp_ns, self._clock_ns())
+                else:
+                    self.timing.withheld += 1
+            if not more or not steps or self.inbox:
+                if more:
+                    self._wake.set()
+                return
+
+    def _until(self, now_ns: int) -> tuple[int | None, bool]:
+        """The time up to which to advance, and whether that leaves due steps for a next slice."""
+        if now_ns <= 0 or not self.clock_check.agree:
+            return None, False  # without a usable clock only what the inputs cover is taken
+        if self._last is None:
+            return now_ns, False
+        behind_ns = now_ns - self._last[1]
+        if behind_ns > CATCH_UP_NS:
+            self._log_error(
+                f"steps are {behind_ns * 1e-9:.1f} s behind, limit {CATCH_UP_NS * 1e-9:g} s: "
+                "the estimator starts anew"
+            )
+            self.reset()
+            return now_ns, False
+        if behind_ns > SLICE_STEPS * STEP_NS:
+            return self._last[1] + SLICE_STEPS * STEP_NS, True
+        return now_ns, False
+
+    def _sleep(self) -> None:
+        if self._stopping or self._wake.is_set():
+            return
+        wait_ns = IDLE_NS
+        due_ns = self._next_due_ns()
+        if due_ns is not None and self._wall:
+            # Due and not taken: the estimator is waiting for an input. Look again soon, but do not spin.
+            wait_ns = min(due_ns - self._clock_ns(), IDLE_NS) if self._took_steps else RETRY_NS
+        if wait_ns > 0:
+            self._wake.wait(wait_ns * 1e-9)
+
+    def _next_due_ns(self) -> int | None:
+        """When the next step falls due at the latest; None when only a message can make one due."""
+        if not self.clock_check.agree or self.estimator.t0_ns is None or self._last is None:
+            return None
+        timeout_ns = 0 if self.timing.policy == "predict" else self.timing.input_timeout_ns
+        return self._last[1] + STEP_NS + timeout_ns
+
+    def _collect(self, now_ns: int) -> None:
+        now = time.monotonic_ns()
+        if now < self._next_collection_ns:
+            return
+        due_ns = self._next_due_ns()
+        tight = self._wall and due_ns is not None and due_ns - now_ns < COLLECT_SLACK_NS
+        if tight and now < self._next_collection_ns + COLLECT_NS:
+            return  # a longer pause may come, but do not wait for it for ever
+        gc.collect()
+        self._next_collection_ns = now + COLLECT_NS

@@ -1,0 +1,155 @@
+"""How punctual the published steps are: lateness, step times, skipped steps; numbers without a clock."""
+
+from __future__ import annotations
+
+import heapq
+from collections import deque
+from typing import Any
+
+LATE_NS = 3_000_000
+"""A step published later than one step after it was due is late."""
+VERY_LATE_NS = 20_000_000
+
+
+class Histogram:
+    """Counts of durations in bins of constant width, in constant memory; durations in ns.
+
+    Quantiles are the upper edge of their bin (`bin_ns` is their resolution), the maximum is exact.
+    """
+
+    def __init__(self, bin_ns: int = 10_000, bins: int = 5000) -> None:
+        self.bin_ns = bin_ns
+        self.counts = [0] * (bins + 1)  # the last one holds everything beyond
+        self.count = 0
+        self.max_ns = 0
+
+    def add(self, value_ns: int) -> None:
+        index = min(max(value_ns, 0) // self.bin_ns, len(self.counts) - 1)
+        self.counts[index] += 1
+        self.count += 1
+        self.max_ns = max(self.max_ns, value_ns)
+
+    def quantile(self, fraction: float) -> float:
+        """Duration in ms that `fraction` of the values do not exceed; 0 without values."""
+        if self.count == 0:
+            return 0.0
+        wanted, seen = fraction * self.count, 0
+        for index, count in enumerate(self.counts[:-1]):
+            seen += count
+            if seen >= wanted:
+                return min((index + 1) * self.bin_ns, self.max_ns) * 1e-6
+        return self.max_ns * 1e-6
+
+    def summary(self) -> dict[str, float]:
+        """p50, p99, p999 and max in ms."""
+        quantiles = {"p50": 0.5, "p99": 0.99, "p999": 0.999}
+        values = {name: self.quantile(fraction) for name, fraction in quantiles.items()}
+        values["max"] = self.max_ns * 1e-6
+        return {name: round(value, 4) for name, value in values.items()}
+
+
+class StepTiming:
+    """Lateness of every published step against the moment it was due.
+
+    Under `predict` a step is due at its own stamp t_k. Under `wait` it is due when the joint state that
+    covers t_k arrived, or `input_timeout_ns` after t_k if none had arrived by then. All times are ns of the
+    clock that stamps the messages.
+
+    Steps that fall due while the start is still being solved (the static equilibrium of the first joints) are
+    counted apart as `start`: the node cannot publish before it has a state.
+
+    While `clocks_agree` is False (stamps far from the node's clock) only arrivals count: see `stepping`.
+    """
+
+    def __init__(self, policy: str, input_timeout_ns: int) -> None:
+        self.policy = policy
+        self.clocks_agree = True
+        self.input_timeout_ns = input_timeout_ns
+        self.lateness = Histogram()
+        self.step_time = Histogram()
+        self.steps = 0
+        self.late = 0
+        self.very_late = 0
+        self.skipped = 0
+        self.withheld = 0
+        self.restarts = 0
+        self.start_steps = 0
+        self.start_max_ns = 0
+        self.rollbacks = Histogram()
+        self._worst: list[tuple[int, int]] = []  # heap of (lateness, k)
+        self._arrivals: deque[tuple[int, int]] = deque(maxlen=4096)  # (joint stamp, arrival), stamps rising
+        self._last_k: int | None = None
+        self._start_until_ns: int | None = None
+
+    def arrived(self, joint_stamp_ns: int, arrival_ns: int) -> None:
+        """A joint state came in; ones that do not bring the stamps forward cover nothing new."""
+        if not self._arrivals or joint_stamp_ns > self._arrivals[-1][0]:
+            self._arrivals.append((joint_stamp_ns, arrival_ns))
+
+    def restarted(self) -> None:
+        """The estimator starts anew: k begins at 0 again."""
+        self.restarts += 1
+        self._last_k = None
+        self._start_until_ns = None
+        self._arrivals.clear()
+
+    def advanced(self, steps: int, duration_ns: int) -> None:
+        """One call of the estimator took `duration_ns` and gave `steps` steps."""
+        if steps:
+            for _ in range(steps):
+                self.step_time.add(duration_ns // steps)
+        else:
+            self.rollbacks.add(duration_ns)
+
+    def published(self, k: int, stamp_ns: int, now_ns: int) -> int:
+        """Step k with this stamp is out at `now_ns`; returns its lateness in ns."""
+        if self._last_k is not None and k > self._last_k + 1:
+            self.skipped += k - self._last_k - 1
+        if self._last_k is None:
+            self._start_until_ns = now_ns
+        self._last_k = k
+        lateness = max(now_ns - self._due_ns(stamp_ns, now_ns), 0)
+        if self._start_until_ns is not None:
+            if stamp_ns <= self._start_until_ns:
+                self.start_steps += 1
+                self.start_max_ns = max(self.start_max_ns, lateness)
+                return lateness
+            self._start_until_ns = None
+        self.steps += 1
+        self.lateness.add(lateness)
+        self.late += lateness > LATE_NS
+        self.very_late += lateness > VERY_LATE_NS
+        if len(self._worst) < 10:
+            heapq.heappush(self._worst, (lateness, k))
+        elif lateness > self._worst[0][0]:
+            heapq.heapreplace(self._worst, (lateness, k))
+        return lateness
+
+    def _due_ns(self, stamp_ns: int, now_ns: int) -> int:
+        if self.policy == "predict" and self.clocks_agree:
+            return stamp_ns
+        while self._arrivals and self._arrivals[0][0] < stamp_ns:
+            self._arrivals.popleft()
+        covered_ns = self._arrivals[0][1] if self._arrivals else now_ns
+        return min(covered_ns, stamp_ns + self.input_timeout_ns) if self.clocks_agree else covered_ns
+
+    def report(self) -> dict[str, Any]:
+        """Everything as JSON-able numbers; durations in ms."""
+        return {
+            "policy": self.policy,
+            "steps": self.steps,
+            "late_over_3ms": self.late,
+            "late_over_20ms": self.very_late,
+            "late_fraction": self.late / self.steps if self.steps else 0.0,
+            "skipped": self.skipped,
+            "withheld": self.withheld,
+            "restarts": self.restarts,
+            "lateness_ms": self.lateness.summary(),
+            "step_ms": self.step_time.summary(),
+            "correction_ms": self.rollbacks.summary(),
+            "start": {"steps": self.start_steps, "max_ms": round(self.start_max_ns * 1e-6, 3)},
+            "worst": [
+                {"k": k, "lateness_ms": round(late * 1e-6, 3)}
+                for late, k in sorted(self._worst, reverse=True)
+            ],
+        }

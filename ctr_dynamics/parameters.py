@@ -1,0 +1,325 @@
+"""The one table of parameters: it drives declaration, replay's --set, checks, README and YAML."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterator, Mapping
+from difflib import get_close_matches
+from pathlib import Path
+from typing import Any
+
+from ctr_dynamics.errors import InputError
+from ctr_dynamics.parameter_types import Parameter, Value, axes_mask
+from ctr_dynamics.robot.loader import read_yaml
+
+__all__ = ["PARAMETERS", "Parameter", "Settings", "Value", "axes_mask", "parameter", "parse_assignments"]
+
+SCHEMES = ("backward_euler", "bdf2", "trapezoid", "bdf_alpha", "sdirk2", "sdirk3")
+RELIABILITY = ("best_effort", "reliable")
+ZEROS = (0.0, 0.0, 0.0)
+
+PARAMETERS: tuple[Parameter, ...] = (
+    Parameter(
+        "robot", "str", "till2020_tissue", "", "Shipped robot or path of a robot file.", read_only=True
+    ),
+    Parameter(
+        "input_timeout_s",
+        "float",
+        0.1,
+        "s",
+        "Longest wait for, or extrapolation of, the joints.",
+        0.003,
+        10.0,
+    ),
+    Parameter("model.scheme", "str", "sdirk3", "", "Time scheme.", choices=SCHEMES, read_only=True),
+    Parameter("model.alpha", "float", -0.45, "", "Alpha of scheme bdf_alpha.", -0.5, 0.5, read_only=True),
+    Parameter("model.dt_s", "float", 0.003, "s", "Step of the output grid.", 0.003, 0.003, read_only=True),
+    Parameter("model.nodes", "int", 24, "", "Arc-length nodes in all.", 8, 1000, read_only=True),
+    Parameter(
+        "model.tolerance", "float", 1e-9, "", "Scaled residual at which the shooting ends.", 1e-13, 1e-4
+    ),
+    Parameter("filter.enabled", "bool", True, "", "Fuse the tracker; false runs the model alone."),
+    Parameter(
+        "filter.rank", "int", 16, "", "Columns of the covariance's square root.", 4, 40, read_only=True
+    ),
+    Parameter(
+        "filter.gate_probability",
+        "float",
+        0.9999,
+        "",
+        "Chi-square probability beyond which a tracker sample is rejected.",
+        0.5,
+        0.999999,
+    ),
+    Parameter(
+        "filter.tip_force_sigma_N",
+        "float",
+        0.02,
+        "N",
+        "Deviation per axis of the unknown tip force.",
+        0.0,
+        10.0,
+    ),
+    Parameter(
+        "filter.tip_force_time_s",
+        "float",
+        0.2,
+        "s",
+        "Correlation time of the unknown tip force.",
+        0.001,
+        1000.0,
+    ),
+    Parameter(
+        "filter.window_s",
+        "float",
+        0.2,
+        "s",
+        "How late a sample may come and still be fused at its own stamp.",
+        0.0,
+        2.0,
+    ),
+    Parameter(
+        "tracker.delay_s",
+        "float",
+        0.0,
+        "s",
+        "Added to the robot file's delay; above 0: poses are older than their stamps.",
+        -0.2,
+        0.2,
+    ),
+    Parameter(
+        "tracker.lever_arm_m",
+        "floats",
+        ZEROS,
+        "m",
+        "Sensor position in the tip frame, added to the robot file's.",
+        -1.0,
+        1.0,
+        size=3,
+    ),
+    Parameter(
+        "tracker.registration_rotation_rad",
+        "floats",
+        ZEROS,
+        "rad",
+        "Rotation vector of ctr_base in the tracker's frame, composed on top of the robot file's.",
+        -2 * math.pi,
+        2 * math.pi,
+        size=3,
+    ),
+    Parameter(
+        "tracker.registration_translation_m",
+        "floats",
+        ZEROS,
+        "m",
+        "Origin of ctr_base in the tracker's frame, composed on top of the robot file's.",
+        -100.0,
+        100.0,
+        size=3,
+    ),
+    Parameter(
+        "tracker.axes",
+        "str",
+        "xyzrpy",
+        "",
+        "Measured axes: positions, then rotations about the tip's x (r), y (p) and z (y).",
+        syntax=axes_mask,
+        syntax_text="subset of xyzrpy, in that order",
+    ),
+    Parameter(
+        "output.policy",
+        "str",
+        "predict",
+        "",
+        "Step when the covering joints are in (wait; replay's default), or on time (predict).",
+        choices=("wait", "predict"),
+    ),
+    Parameter("output.backbone_every", "int", 11, "", "Steps per backbone path.", 1, 1000, read_only=True),
+    Parameter("output.frame_id", "str", "ctr_base", "", "Frame of every output.", read_only=True),
+    Parameter(
+        "qos.subscription_reliability",
+        "str",
+        "best_effort",
+        "",
+        "Reliability asked of publishers.",
+        choices=RELIABILITY,
+        read_only=True,
+    ),
+    Parameter("qos.subscription_depth", "int", 50, "", "Inputs kept, each topic.", 1, 10000, read_only=True),
+    Parameter(
+        "qos.publisher_reliability",
+        "str",
+        "reliable",
+        "",
+        "Reliability offered to subscribers.",
+        choices=RELIABILITY,
+        read_only=True,
+    ),
+    Parameter("qos.publisher_depth", "int", 10, "", "Outputs kept, each topic.", 1, 10000, read_only=True),
+    Parameter("record.path", "str", "", "", "MCAP file to record to; empty: none.", read_only=True),
+    Parameter(
+        "timing_report",
+        "str",
+        "",
+        "",
+        "JSON file for the punctuality of the steps, written at exit; empty: none.",
+        read_only=True,
+    ),
+)
+
+_BY_NAME = {parameter.name: parameter for parameter in PARAMETERS}
+# In every node's parameter file, and none of this table's business.
+_ROS_NAMES = re.compile(r"use_sim_time|start_type_description_service|qos_overrides\..*")
+
+
+def parameter(name: str) -> Parameter:
+    """The parameter of that name.
+
+    Raises:
+        InputError: unknown, with the nearest name.
+    """
+    try:
+        return _BY_NAME[name]
+    except KeyError:
+        near = get_close_matches(name, _BY_NAME, 1)
+        hint = f"did you mean '{near[0]}'?" if near else "see the parameter table in README.md"
+        raise InputError(f"unknown parameter '{name}'", do=hint) from None
+
+
+class Settings(Mapping[str, Value]):
+    """Every parameter with its checked value; immutable.
+
+    Args:
+        values: name to value; those not given have their default.
+
+    Raises:
+        InputError: unknown name, wrong type or out of range.
+    """
+
+    __slots__ = ("_values",)
+
+    def __init__(self, values: Mapping[str, Any] | None = None) -> None:
+        checked = {p.name: p.default for p in PARAMETERS}
+        for name, value in (values or {}).items():
+            checked[name] = parameter(name).check(value)
+        self._values = checked
+
+    @classmethod
+    def from_sources(cls, file: Path | None = None, overrides: Mapping[str, Any] | None = None) -> Settings:
+        """Defaults, then a parameter file, then overrides.
+
+        Args:
+            file: YAML, either a ROS 2 parameter file or the parameters themselves, nested or dotted.
+            overrides: name to value or to text as on the command line.
+
+        Raises:
+            InputError: unreadable file, unknown name, wrong type or out of range.
+        """
+        values = read_parameter_file(file) if file is not None else {}
+        return cls({**values, **(overrides or {})})
+
+    def replace(self, values: Mapping[str, Any]) -> Settings:
+        """A copy with some values changed; raises as the constructor does."""
+        return Settings({**self._values, **values})
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain dict for JSON and YAML; arrays are lists."""
+        return {name: list(v) if isinstance(v, tuple) else v for name, v in self._values.items()}
+
+    # Any: a value's type is known from its parameter, which the type checker cannot follow.
+    def __getitem__(self, name: str) -> Any:
+        return self._values[parameter(name).name]
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._values
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._values)
+
+    def __len__(self) -> int:
+        return len(self._values)
+
+    def __repr__(self) -> str:
+        changed = {p.name: self[p.name] for p in PARAMETERS if self[p.name] != p.default}
+        return f"Settings({changed})"
+
+
+def parse_assignments(assignments: list[str]) -> dict[str, str]:
+    """`NAME=VALUE` texts of a command line by name; the values are checked later.
+
+    Raises:
+        InputError: no "=", unknown or repeated name.
+    """
+    values: dict[str, str] = {}
+    for text in assignments:
+        name, equals, value = text.partition("=")
+        name = name.strip()
+        if not equals or not name:
+            raise InputError(f"'{text}' is not NAME=VALUE", do="write for example tracker.delay_s=0.018")
+        parameter(name)
+        if name in values:
+            raise InputError(f"parameter '{name}' is given twice", do="give it once")
+        values[name] = value.strip()
+    return values
+
+
+def read_parameter_file(file: Path) -> dict[str, Value]:
+    """Values in a YAML parameter file by dotted name, checked.
+
+    Raises:
+        InputError: unreadable, no block for the estimator, unknown name, wrong type or out of range.
+    """
+    where = str(file)
+    try:
+        text = Path(file).read_text(encoding="utf-8")
+    except UnicodeDecodeError as error:
+        raise InputError(f"not UTF-8 at byte {error.start}", do="save as UTF-8 text", where=where) from None
+    except OSError as error:
+        raise InputError(f"cannot read: {error.strerror}", do="check path and rights", where=where) from None
+    data = read_yaml(text, where)
+    if data is None:
+        return {}
+    if not isinstance(data, dict):
+        raise InputError("holds no parameters", do="see config/estimator.yaml", where=where)
+    blocks = list(_ros_blocks(data, ""))
+    if blocks:
+        data = {}
+        mine = [b for node, b in blocks if node.rsplit("/", 1)[-1] in ("estimator", "*", "**")]
+        if not mine:
+            nodes = ", ".join(node for node, _ in blocks)
+            raise InputError(
+                f"holds parameters of {nodes}, none of the estimator",
+                do="name it /ctr/estimator",
+                where=where,
+            )
+        for block in mine:
+            data.update(_flat(block, ""))
+    values: dict[str, Value] = {}
+    for name, value in _flat(data, "").items():
+        if _ROS_NAMES.fullmatch(name):
+            continue
+        try:
+            values[name] = parameter(name).check(value)
+        except InputError as error:
+            raise InputError(str(error), where=where) from None
+    return values
+
+
+def _ros_blocks(data: Mapping[Any, Any], node: str) -> Iterator[tuple[str, Mapping[Any, Any]]]:
+    for key, value in data.items():
+        if key == "ros__parameters" and isinstance(value, Mapping):
+            yield node, value
+        elif isinstance(value, Mapping):
+            yield from _ros_blocks(value, f"{node}/{str(key).strip('/')}")
+
+
+def _flat(data: Mapping[Any, Any], prefix: str) -> dict[str, Any]:
+    flat: dict[str, Any] = {}
+    for key, value in data.items():
+        name = f"{prefix}{key}"
+        if isinstance(value, Mapping):
+            flat.update(_flat(value, f"{name}."))
+        else:
+            flat[name] = value
+    return flat

@@ -1,0 +1,221 @@
+"""Reading and writing robot files: YAML, every failure as one line."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+import re
+from collections.abc import Mapping
+from difflib import get_close_matches
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import yaml
+from pydantic import BaseModel, ValidationError
+
+from ctr_dynamics.errors import InputError
+from ctr_dynamics.robot.quantity import Quantity, VectorQuantity
+from ctr_dynamics.robot.schema import Robot
+
+MAX_BYTES = 1_000_000
+
+
+class _Loader(yaml.SafeLoader):
+    """SafeLoader that reads 52e9 as a number and refuses a key given twice."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        seen = set()
+        for key_node, _ in node.value:
+            key = key_node.value
+            if key in seen:
+                raise yaml.constructor.ConstructorError(
+                    None, None, f"key '{key}' is given twice", key_node.start_mark
+                )
+            seen.add(key)
+        return super().construct_mapping(node, deep)
+
+
+# YAML 1.1 takes 52e9 and 1e-3 for text; robot files follow YAML 1.2.
+_Loader.add_implicit_resolver(
+    "tag:yaml.org,2002:float",
+    re.compile(r"^[-+]?(\d+(\.\d*)?|\.\d+)([eE][-+]?\d+)$"),
+    list("-+0123456789."),
+)
+
+
+def read_yaml(text: str, where: str) -> Any:
+    """Parse YAML 1.2 numbers and unique keys.
+
+    Raises:
+        InputError: with `where` and the line.
+    """
+    try:
+        return yaml.load(text, Loader=_Loader)
+    except yaml.YAMLError as error:
+        mark = getattr(error, "problem_mark", None)
+        line = f" in line {mark.line + 1}" if mark else ""
+        what = getattr(error, "problem", None) or str(error)
+        raise InputError(f"not valid YAML{line}: {what}", do="mend the file", where=where) from None
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"not valid YAML: {error}", do="mend the file", where=where) from None
+
+
+def robot_names() -> tuple[str, ...]:
+    """Names of the robots shipped with the package."""
+    folder = resources.files("ctr_dynamics") / "config" / "robots"
+    return tuple(sorted(p.name[:-5] for p in folder.iterdir() if p.name.endswith(".yaml")))
+
+
+def load_robot(name_or_path: str | Path) -> Robot:
+    """Load a robot by its shipped name or from a YAML file.
+
+    Args:
+        name_or_path: for example "till2020_tissue" or "my_robot.yaml".
+
+    Raises:
+        InputError: no such robot, not readable, or not a valid robot file.
+    """
+    name = str(name_or_path)
+    if name in robot_names():
+        data = (resources.files("ctr_dynamics") / "config" / "robots" / f"{name}.yaml").read_bytes()
+        return _from_bytes(data, f"robot {name}", name)
+    path = Path(name_or_path)
+    if not path.is_file():
+        shipped = robot_names()
+        near = get_close_matches(name, shipped, 1)
+        hint = f"did you mean '{near[0]}'?" if near else "give a shipped name or the path of a YAML file"
+        known = ", ".join(shipped)
+        raise InputError(f"robot '{name}' is neither a shipped robot ({known}) nor a file", do=hint)
+    try:
+        if path.stat().st_size > MAX_BYTES:
+            raise InputError(
+                f"robot file has {path.stat().st_size} bytes, more than {MAX_BYTES} bytes",
+                do="give a robot file in YAML",
+                where=name,
+            )
+        data = path.read_bytes()
+    except OSError as error:
+        raise InputError(f"cannot read: {error.strerror}", do="check path and rights", where=name) from None
+    return _from_bytes(data, name, name)
+
+
+def _from_bytes(data: bytes, where: str, source: str) -> Robot:
+    try:
+        text = data.decode("utf-8")
+    except UnicodeDecodeError as error:
+        raise InputError(f"not UTF-8 at byte {error.start}", do="save as UTF-8 text", where=where) from None
+    robot = robot_from_dict(read_yaml(text, where), where)
+    robot._source = source
+    robot._sha256 = hashlib.sha256(data).hexdigest()
+    return robot
+
+
+def robot_from_dict(data: Any, where: str = "robot") -> Robot:
+    """Validate the contents of a robot file.
+
+    Raises:
+        InputError: the first problem, with its key path; how many more there are is added.
+    """
+    if not isinstance(data, dict):
+        kind = "empty" if data is None else f"a {type(data).__name__}"
+        raise InputError(
+            f"robot file is {kind}, not a mapping", do="see config/robots for examples", where=where
+        )
+    try:
+        return Robot.model_validate(data)
+    except ValidationError as error:
+        raise InputError(_one_line(error), where=where) from None
+
+
+def _one_line(error: ValidationError) -> str:
+    errors = error.errors(include_url=False, include_context=True)
+    first = errors[0]
+    path = ""
+    for part in first["loc"]:
+        # pydantic puts validator names of unions into the path; keys and indices are what the file has.
+        if isinstance(part, int):
+            path += f"[{part}]"
+        elif "[" not in str(part):
+            path += f".{part}" if path else str(part)
+    text = first["msg"]
+    if first["type"] != "robot":
+        text = f"{text[0].lower()}{text[1:]}"
+        value = first.get("input")
+        if isinstance(value, (str, int, float, type(None))):
+            text += f", got {value!r}"
+    line = f"{path}: {text}" if path else text
+    return line + (f" (and {len(errors) - 1} more)" if len(errors) > 1 else "")
+
+
+def quantities(robot: Robot) -> dict[str, Quantity | VectorQuantity]:
+    """Every quantity of the robot by its key path, e.g. "tubes[0].youngs_modulus"."""
+    found: dict[str, Quantity | VectorQuantity] = {}
+
+    def visit(item: Any, path: str) -> None:
+        if isinstance(item, (Quantity, VectorQuantity)):
+            found[path] = item
+        elif isinstance(item, BaseModel):
+            for key in type(item).model_fields:
+                visit(getattr(item, key), f"{path}.{key}" if path else key)
+        elif isinstance(item, tuple):
+            for i, part in enumerate(item):
+                visit(part, f"{path}[{i}]")
+
+    visit(robot, "")
+    return found
+
+
+def robot_with(robot: Robot, values: Mapping[str, Any]) -> Robot:
+    """The robot with some values replaced, validated anew; absolute tolerances are kept.
+
+    Args:
+        robot: where to start.
+        values: key path of a quantity (as in `quantities`, or "rest.beta") to its new value in the same unit.
+
+    Raises:
+        InputError: unknown path or a value that does not fit.
+    """
+    data = robot_to_dict(robot)
+    for path, value in values.items():
+        node: Any = data
+        for key in re.findall(r"[^.\[\]]+", path):
+            try:
+                node = node[int(key) if isinstance(node, list) else key]
+            except (KeyError, IndexError, TypeError, ValueError):
+                node = None
+        if not isinstance(node, dict) or "value" not in node:
+            raise InputError(f"'{path}' names no quantity of robot '{robot.name}'", do="see its file")
+        node["value"] = list(value) if hasattr(value, "__len__") else float(value)
+    return robot_from_dict(data, f"robot {robot.name}")
+
+
+def robot_to_dict(robot: Robot) -> dict[str, Any]:
+    """Contents of the robot's file as plain lists, dicts and numbers."""
+    return _plain(robot.model_dump(exclude_none=True))
+
+
+def robot_to_yaml(robot: Robot) -> str:
+    """The robot as the text of a robot file; loading it gives an equal robot."""
+    return yaml.dump(robot_to_dict(robot), sort_keys=False, allow_unicode=True, Dumper=_Dumper)
+
+
+class _Dumper(yaml.SafeDumper):
+    """Quantities on one line each, as people write them."""
+
+    def ignore_aliases(self, data: Any) -> bool:
+        return True
+
+    def represent_mapping(self, tag: str, mapping: Any, flow_style: bool | None = None) -> yaml.MappingNode:
+        short = isinstance(mapping, dict) and {"value", "unit"} <= set(mapping)
+        return super().represent_mapping(tag, mapping, flow_style=True if short else flow_style)
+
+
+def _plain(item: Any) -> Any:
+    if isinstance(item, dict):
+        return {key: _plain(value) for key, value in item.items()}
+    if isinstance(item, (list, tuple)):
+        return [_plain(value) for value in item]
+    if isinstance(item, float) and not math.isfinite(item):
+        raise ValueError("a robot holds a number that is not finite")
+    return item

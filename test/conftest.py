@@ -1,0 +1,8 @@
+"""Isolation of every test run: its own ROS domain on this machine only, its own figures backend."""
+
+import os
+
+# Set before anything imports rclpy; child processes inherit both. 0 and the low ids are left to people.
+os.environ["ROS_DOMAIN_ID"] = str(20 + os.getpid() % 200)
+os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+os.environ.setdefault("MPLBACKEND", "Agg")

@@ -1,0 +1,105 @@
+"""The command line's frame: lazy commands, exit codes and one-line errors."""
+
+import subprocess
+import sys
+import types
+from pathlib import Path
+
+import pytest
+
+import ctr_dynamics
+from ctr_dynamics.cli import main as cli
+from ctr_dynamics.errors import InputError
+
+
+@pytest.fixture
+def command(monkeypatch):
+    """Put a function in the place of a command; returns a caller of the command line."""
+
+    def install(function):
+        module = types.ModuleType("ctr_dynamics.cli.info")
+        module.info = function
+        monkeypatch.setattr(cli, "available", lambda: ["info", "warmup"])
+        monkeypatch.setattr(cli, "import_module", {"ctr_dynamics.cli.info": module}.__getitem__)
+        return lambda *arguments: cli.main(["info", *arguments])
+
+    return install
+
+
+def test_version(capsys):
+    assert cli.main(["--version"]) == 0
+    assert capsys.readouterr().out == f"ctr-dynamics {ctr_dynamics.__version__}\n"
+
+
+def test_help_names_every_command_and_imports_none(capsys):
+    code = (
+        "import sys; from ctr_dynamics.cli.main import main; code = main(['--help']); "
+        "assert 'numba' not in sys.modules and 'rclpy' not in sys.modules; sys.exit(code)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    for name in cli.available():
+        assert f"  {name} " in done.stdout
+
+
+@pytest.mark.parametrize(("returned", "code"), [(None, 0), (0, 0), (1, 1)])
+def test_what_a_command_returns_is_the_exit_code(command, returned, code):
+    def info() -> int | None:
+        return returned
+
+    assert command(info)() == code
+
+
+def test_arguments_reach_the_command_with_their_types(command):
+    seen = []
+
+    def info(bag: str, nodes: int = 24) -> None:
+        seen.append((bag, nodes))
+
+    assert command(info)("a.mcap", "--nodes", "100") == 0
+    assert seen == [("a.mcap", 100)]
+
+
+def test_input_error_is_one_line_and_exit_code_2(command, capsys):
+    def info() -> None:
+        raise InputError("tube is 300 m long,\nmore than 2 m", do="give metres", where="r.yaml")
+
+    assert command(info)() == 2
+    captured = capsys.readouterr()
+    assert captured.err == "ctr-dynamics: error: r.yaml: tube is 300 m long, more than 2 m; give metres\n"
+    assert captured.out == ""
+
+
+def test_unreadable_file_is_one_line_and_exit_code_2(command, capsys):
+    def info() -> None:
+        Path("/nonexistent/bag.mcap").read_bytes()
+
+    assert command(info)() == 2
+    assert (
+        capsys.readouterr().err == "ctr-dynamics: error: /nonexistent/bag.mcap: No such file or directory\n"
+    )
+
+
+def test_interrupt_is_exit_code_130(command, capsys):
+    def info() -> None:
+        raise KeyboardInterrupt
+
+    assert command(info)() == 130
+    assert capsys.readouterr().err == "ctr-dynamics: error: interrupted\n"
+
+
+def test_bugs_are_not_hidden(command):
+    def info() -> None:
+        raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        command(info)()
+
+
+@pytest.mark.parametrize("arguments", [["nope"], ["--nope"], ["info", "--nope"], []])
+def test_bad_arguments_are_exit_code_2(command, arguments):
+    def info() -> None:
+        pass
+
+    command(info)
+    assert cli.main(arguments) == 2
