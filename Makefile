@@ -18,7 +18,7 @@ ifdef ROS_DISTRO
 unexport LD_LIBRARY_PATH
 endif
 
-.PHONY: demo test lint format check-docs clean install
+.PHONY: demo test lint format clean install
 .DELETE_ON_ERROR:
 
 demo: install

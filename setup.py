@@ -66,7 +66,8 @@ setup(
             "ros-kilted-std-srvs==5.5.1",
             *(f"ros-kilted-{name}-msgs==5.5.1" for name in ROS_MESSAGES),
         ],
-        "dev": ["pytest>=8", "hypothesis>=6.100", "ruff", "mypy", "types-PyYAML", "build"],
+        # colcon runs pytest when it finds it in this extra.
+        "test": ["pytest>=8", "hypothesis>=6.100", "ruff", "mypy", "types-PyYAML", "build"],
     },
     python_requires=">=3.10",
     zip_safe=False,
@@ -77,7 +78,6 @@ setup(
     long_description="Dynamic Cosserat-rod model of concentric tube robots advanced at fixed 3 ms steps, "
     "fused with a tip tracker by a reduced-rank Kalman filter, live in ROS 2 or from recorded bags.",
     license="Apache-2.0",
-    tests_require=["pytest"],
     entry_points={
         "console_scripts": [
             "ctr-dynamics = ctr_dynamics.cli.main:main",

@@ -1,7 +1,8 @@
 """What is in a bag and what is wrong with it: rates, gaps, stamps, clocks, frames, units, numbers.
 
-`inspect` reads a bag once and returns plain facts per topic and a list of problems, each with value, limit, unit
-and what to do. It needs no robot: limits are those that hold for any concentric tube robot of laboratory size.
+`inspect` reads a bag once and returns plain facts per topic and a list of problems, each with value, limit,
+unit and what to do. It needs no robot: limits are those that hold for any concentric tube robot of laboratory
+size.
 """
 
 from __future__ import annotations
@@ -63,7 +64,7 @@ class BagReport:
         levels = {finding.level for finding in self.problems}
         for level in ("error", "warning", "note"):
             if level in levels:
-                return level  # type: ignore[return-value]
+                return level
         return "ok"
 
     def to_dict(self) -> dict[str, Any]:
@@ -107,7 +108,11 @@ def inspect(path: str | Path) -> BagReport:
         entry = times.get(topic)
         if entry is None:
             definition = TOPIC.get(topic)
-            stamped = definition is not None and definition.has_header and definition.ros_type == known[topic].ros_type
+            stamped = (
+                definition is not None
+                and definition.has_header
+                and definition.ros_type == known[topic].ros_type
+            )
             entry = times[topic] = _Times(stamped)
         entry.add(log_ns, data)
         if topic in DECODERS:
@@ -127,7 +132,13 @@ def inspect(path: str | Path) -> BagReport:
     return BagReport(
         bag=str(bag.path),
         files=[
-            {"name": f.path.name, "bytes": f.size, "complete": f.complete, "library": f.library, "profile": f.profile}
+            {
+                "name": f.path.name,
+                "bytes": f.size,
+                "complete": f.complete,
+                "library": f.library,
+                "profile": f.profile,
+            }
             for f in bag.files
         ],
         duration_s=(max(ends, default=0) - start_ns) * 1e-9,
@@ -187,13 +198,15 @@ def _stamp_findings(
                     "warning",
                     name,
                     f"{wide.size} gaps longer than {limit:g} s, the longest {steps[worst] * 1e-9:.3f} s at "
-                    f"{(ordered[worst] - ordered[0]) * 1e-9:.3f} s after its first stamp; outputs are invalid or "
-                    "open-loop there",
+                    f"{(ordered[worst] - ordered[0]) * 1e-9:.3f} s after its first stamp; outputs are "
+                    "invalid or open-loop there",
                 )
             )
     if report.duplicate_stamps:
         found.append(
-            Finding("warning", name, f"{report.duplicate_stamps} stamps occur more than once; check the driver")
+            Finding(
+                "warning", name, f"{report.duplicate_stamps} stamps occur more than once; check the driver"
+            )
         )
     if report.stamps_backwards:
         back = -int(np.diff(stamps).min()) * 1e-9
@@ -203,7 +216,9 @@ def _stamp_findings(
                 "note" if late else "warning",
                 name,
                 f"stamps run backwards {report.stamps_backwards} times, by {back:.3f} s at most"
-                + (f" (up to {LATE_LIMIT_S:g} s is fused at its own stamp)" if late else "; check the clocks"),
+                + (
+                    f" (up to {LATE_LIMIT_S:g} s is fused at its own stamp)" if late else "; check the clocks"
+                ),
             )
         )
     return found
@@ -227,8 +242,8 @@ def _between_topics(bag: Bag, times: dict[str, _Times], reports: list[TopicRepor
                 Finding(
                     "warning",
                     name,
-                    f"log times are {offset['median']:.3f} s after the stamps (median), limit {CLOCK_LIMIT_S:g} s: "
-                    "driver and recorder use different clocks",
+                    f"log times are {offset['median']:.3f} s after the stamps (median), limit "
+                    f"{CLOCK_LIMIT_S:g} s: driver and recorder use different clocks",
                 )
             )
         if offset and name == TRACKER_TIP and offset["max"] - offset["min"] > LATE_LIMIT_S:
@@ -236,8 +251,9 @@ def _between_topics(bag: Bag, times: dict[str, _Times], reports: list[TopicRepor
                 Finding(
                     "warning",
                     name,
-                    f"the slowest sample came {offset['max'] - offset['min']:.3f} s later than the quickest, limit "
-                    f"{LATE_LIMIT_S:g} s: such samples are not fused; raise filter.window_s or mend the driver",
+                    f"the slowest sample came {offset['max'] - offset['min']:.3f} s later than the "
+                    f"quickest, limit {LATE_LIMIT_S:g} s: such samples are not fused; raise filter.window_s "
+                    "or mend the driver",
                 )
             )
     joints, tracker = by_name.get(JOINT_STATES), by_name.get(TRACKER_TIP)

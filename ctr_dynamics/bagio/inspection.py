@@ -1,10 +1,11 @@
-"""Checks of the numbers in the input topics: units, signs, names, frames, NaN, quaternions. See `bagio.info`."""
+"""Checks of the numbers in the input topics: units, signs, names, frames, NaN, quaternions."""
 
 from __future__ import annotations
 
 import math
 import re
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any, Literal, Protocol
 
 from ctr_dynamics.messages import cdr
@@ -81,15 +82,17 @@ class _Base:
     def _common(self) -> list[Finding]:
         found = []
         if self.malformed:
-            found.append(Finding("error", self.topic, f"{self.malformed} messages cannot be decoded ({self.fault})"))
+            found.append(
+                Finding("error", self.topic, f"{self.malformed} messages cannot be decoded ({self.fault})")
+            )
         for frame, count in self.frames.items():
             if frame != FRAME:
                 found.append(
                     Finding(
                         "error",
                         self.topic,
-                        f"{count} messages are in frame {frame!r}, {FRAME!r} is expected; transform them, or name the "
-                        "frame so if it is that one",
+                        f"{count} messages are in frame {frame!r}, {FRAME!r} is expected; transform them, "
+                        "or name the frame so if it is that one",
                     )
                 )
         return found
@@ -121,10 +124,9 @@ class JointInspector(_Base):
         self.messages += 1
         if len(message.names) != len(message.positions):
             self.uneven += 1
-            return
         betas: dict[int, float] = {}
         count = 0
-        for name, value in zip(message.names, message.positions, strict=True):
+        for name, value in zip(message.names, message.positions, strict=False):
             match = _JOINT.fullmatch(name)
             if match is None:
                 if len(self.others) < 50:
@@ -137,7 +139,7 @@ class JointInspector(_Base):
         if count < len(self.ranges):
             self.incomplete += 1
         ordered = [betas[tube] for tube in sorted(betas)]
-        if any(inner > outer for inner, outer in zip(ordered, ordered[1:], strict=False)):
+        if any(inner > outer for inner, outer in pairwise(ordered)):
             self.disordered += 1
 
     @property
@@ -149,10 +151,12 @@ class JointInspector(_Base):
         return {"tubes": len(self.tubes), "joints": joints, "other_names": sorted(self.others)}
 
     def findings(self) -> list[Finding]:
-        found = [item for item in self._common() if "frame" not in item.text]
+        found = self._common()
         if not self.ranges:
             others = ", ".join(sorted(self.others)[:8]) or "none"
-            text = f"no joint is named tubeN_rotation or tubeN_translation (names found: {others}); rename them"
+            text = (
+                f"no joint is named tubeN_rotation or tubeN_translation (names found: {others}); rename them"
+            )
             return [*found, Finding("error", self.topic, text)]
         missing = [
             name
@@ -168,15 +172,20 @@ class JointInspector(_Base):
             )
         if self.incomplete:
             found.append(
-                Finding("note", self.topic, f"{self.incomplete} of {self.messages} messages do not hold every joint")
+                Finding(
+                    "note",
+                    self.topic,
+                    f"{self.incomplete} of {self.messages} messages do not hold every joint",
+                )
             )
         if self.disordered:
             found.append(
                 Finding(
                     "error",
                     self.topic,
-                    f"{self.disordered} messages break tube1_translation <= tube2_translation <= ... <= 0: an inner "
-                    "tube's base lies behind the next outer one's; check tube numbers (1 is the innermost)",
+                    f"{self.disordered} messages break tube1_translation <= tube2_translation <= ... <= 0: "
+                    "an inner tube's base lies behind the next outer one's; check tube numbers (1 is the "
+                    "innermost)",
                 )
             )
         found += self._not_finite(sum(r.bad for r in self.ranges.values()))
@@ -187,13 +196,19 @@ class JointInspector(_Base):
     def _units(self, name: str, extent: _Range) -> list[Finding]:
         if name.endswith("_translation"):
             if extent.size > LENGTH_LIMIT_M:
-                text = f"{name} reaches {extent.size:g} m, limit {LENGTH_LIMIT_M:g} m: millimetres? Give metres"
+                text = (
+                    f"{name} reaches {extent.size:g} m, limit {LENGTH_LIMIT_M:g} m: millimetres? Give metres"
+                )
                 return [Finding("error", self.topic, text)]
             if extent.high > 0:
-                text = f"{name} reaches {extent.high:+g} m, it must be zero or negative (behind the base plate)"
+                text = (
+                    f"{name} reaches {extent.high:+g} m, it must be zero or negative (behind the base plate)"
+                )
                 return [Finding("error", self.topic, text)]
         elif extent.size > ANGLE_LIMIT_RAD:
-            text = f"{name} reaches {extent.size:g} rad, limit {ANGLE_LIMIT_RAD:.3g} rad: degrees? Give radians"
+            text = (
+                f"{name} reaches {extent.size:g} rad, limit {ANGLE_LIMIT_RAD:.3g} rad: degrees? Give radians"
+            )
             return [Finding("error", self.topic, text)]
         return []
 
@@ -238,10 +253,16 @@ class PoseInspector(_Base):
         found += self._not_finite(sum(axis.bad for axis in self.axes) + self.norm.bad)
         size = max(axis.size for axis in self.axes)
         if size > LENGTH_LIMIT_M:
-            text = f"positions reach {size:g} m, limit {LENGTH_LIMIT_M:g} m: millimetres, or another frame? Give metres"
+            text = (
+                f"positions reach {size:g} m, limit {LENGTH_LIMIT_M:g} m: "
+                "millimetres, or another frame? Give metres"
+            )
             found.append(Finding("error", self.topic, text))
         if self.zero:
-            text = f"{self.zero} quaternions are zero; if the tracker has no orientation, set tracker.axes to xyz"
+            text = (
+                f"{self.zero} quaternions are zero; "
+                "if the tracker has no orientation, set tracker.axes to xyz"
+            )
             found.append(Finding("warning", self.topic, text))
         if self.unnormalised:
             text = (
@@ -280,7 +301,9 @@ class WrenchInspector(_Base):
     def findings(self) -> list[Finding]:
         found = self._common() + self._not_finite(self.force.bad + self.torque.bad)
         if self.force.size > FORCE_LIMIT_N:
-            text = f"forces reach {self.force.size:g} N, limit {FORCE_LIMIT_N:g} N: millinewtons? Give newtons"
+            text = (
+                f"forces reach {self.force.size:g} N, limit {FORCE_LIMIT_N:g} N: millinewtons? Give newtons"
+            )
             found.append(Finding("warning", self.topic, text))
         return found
 

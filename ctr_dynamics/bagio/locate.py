@@ -1,4 +1,4 @@
-"""From the path a user gives to the MCAP files it means: a file, a rosbag2 folder, or a folder with one file."""
+"""From a path to the MCAP files it means: a file, a rosbag2 folder, or a folder that holds one file."""
 
 from __future__ import annotations
 
@@ -56,10 +56,14 @@ def _locate_in_folder(folder: Path) -> Located:
         if len(present) == 1:
             return Located(folder, present, notes)
     if not present:
-        other = next((item.name for pattern in ("*.db3", "*.mcap.zstd", "*.bag") for item in folder.glob(pattern)), "")
+        other = next(
+            (item.name for pattern in ("*.db3", "*.mcap.zstd", "*.bag") for item in folder.glob(pattern)), ""
+        )
         if other:
             raise InputError(
-                f"holds no .mcap file, but {other}", where=str(folder), do="convert it with `ros2 bag convert`"
+                f"holds no .mcap file, but {other}",
+                where=str(folder),
+                do="convert it with `ros2 bag convert`",
             )
         raise InputError("holds no .mcap file", where=str(folder), do="give an .mcap file or a bag folder")
     if len(present) > 1:
@@ -84,7 +88,9 @@ def _read_metadata(path: Path, notes: list[str]) -> dict[str, Any] | None:
         return information
     except (OSError, ValueError, KeyError, TypeError, RecursionError, yaml.YAMLError) as error:
         reason = " ".join(str(error).split())[:120]
-        notes.append(f"{path.name} is not usable ({type(error).__name__}: {reason}); the .mcap file is read without it")
+        notes.append(
+            f"{path.name} is not usable ({type(error).__name__}: {reason}); the .mcap file is read without it"
+        )
         return None
 
 
@@ -92,7 +98,9 @@ def _from_metadata(folder: Path, information: dict[str, Any], present: list[Path
     storage = str(information.get("storage_identifier") or "mcap")
     if storage != "mcap":
         raise InputError(
-            f"storage {storage!r}, only 'mcap' is read", where=str(folder), do="convert it with `ros2 bag convert`"
+            f"storage {storage!r}, only 'mcap' is read",
+            where=str(folder),
+            do="convert it with `ros2 bag convert`",
         )
     mode = str(information.get("compression_mode") or "").lower()
     if mode not in ("", "none", "storage"):

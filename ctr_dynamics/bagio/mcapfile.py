@@ -1,8 +1,8 @@
 """One MCAP file: its channels and blocks of messages, also when it was cut off, not closed or damaged.
 
-A closed file is read by its summary. Anything else is scanned record by record: what was written is found, what
-is missing is said in `McapFile.notes`. Every length is checked against the file before it is believed, so no
-content can make the reader allocate more than a block.
+A closed file is read by its summary. Anything else is scanned record by record: what was written is found,
+what is missing is said in `McapFile.notes`. Every length is checked against the file before it is believed,
+so no content can make the reader allocate more than a block.
 (MCAP specification 0: magic, records of opcode, uint64 length and content, footer, magic.)
 """
 
@@ -78,7 +78,9 @@ class McapFile:
     def load(self, stream: IO[bytes], block: Block) -> Iterator[StoredMessage]:
         """Messages of one block in the order of the file. What is damaged is left out and noted."""
         if block.length > MAX_CHUNK_BYTES:
-            self.note(f"chunk at byte {block.offset} has {block.length} bytes, at most {MAX_CHUNK_BYTES} are read")
+            self.note(
+                f"chunk at byte {block.offset} has {block.length} bytes, at most {MAX_CHUNK_BYTES} are read"
+            )
             return
         stream.seek(block.offset)
         data = stream.read(block.length)
@@ -110,8 +112,10 @@ class McapFile:
         if len(record) < head + 8:
             return b""
         _, _, size, crc, name_length = _CHUNK.unpack_from(record, _RECORD.size)
-        if name_length > 64 or len(record) < head + name_length + 8:
+        if name_length > 64:
             self.note(f"{where} is damaged and left out")
+            return b""
+        if len(record) < head + name_length + 8:
             return b""
         compression = record[head : head + name_length].decode("ascii", "replace")
         start = head + name_length + 8
@@ -137,7 +141,7 @@ class McapFile:
 
 
 def _decompress(content: bytes, compression: str, size: int) -> tuple[bytes, bool]:
-    """Content of a chunk, at most `size` bytes, and whether it is all there. Of a cut chunk: what can be had."""
+    """Content of a chunk, at most `size` bytes, as far as it can be had, and whether it is all there."""
     if compression == "":
         return content[:size], len(content) == size
     # In pieces: what lies before a cut or a damaged place is still delivered.
@@ -256,7 +260,9 @@ def _read_summary(file: McapFile, stream: IO[bytes]) -> bool:
         if len(file.blocks) != statistics.chunk_count or (statistics.message_count and not file.blocks):
             return False
         file.counts = dict(statistics.channel_message_counts)
-        if any(channel.schema_id and channel.schema_id not in file.schemas for channel in file.channels.values()):
+        if any(
+            channel.schema_id and channel.schema_id not in file.schemas for channel in file.channels.values()
+        ):
             return False
         _read_header(file, stream)
         for entry in metadata:
@@ -279,7 +285,7 @@ def _read_header(file: McapFile, stream: IO[bytes]) -> None:
     if len(head) < _RECORD.size:
         return
     opcode, length = _RECORD.unpack(head)
-    if opcode == Opcode.HEADER and length < 2**16:
+    if opcode == Opcode.HEADER and length < min(2**16, file.size - stream.tell()):
         header = Header.read(ReadDataStream(BytesIO(stream.read(length))))
         file.library, file.profile = header.library, header.profile
 
@@ -348,11 +354,13 @@ def _scan(file: McapFile, stream: IO[bytes]) -> None:
         position = end
     run.close()
     if closed:
-        file.note("the summary at the end is missing or damaged; the messages were found by reading the whole file")
+        file.note(
+            "the summary at the end is missing or damaged; the messages were found by reading the whole file"
+        )
     else:
         file.note(
-            f"cut off, not closed or damaged: the record at byte {min(position, file.size)} of {file.size} is not "
-            f"whole; {sum(file.counts.values())} messages were found, later ones are missing"
+            f"cut off, not closed or damaged: the record at byte {min(position, file.size)} of {file.size} "
+            f"is not whole; {sum(file.counts.values())} messages were found, anything later is missing"
         )
 
 

@@ -1,4 +1,4 @@
-"""Reading bags: messages in arrival order, the estimator's inputs decoded, and what is missing said by name."""
+"""Reading bags: messages in arrival order, inputs decoded, and what is missing said by name."""
 
 from __future__ import annotations
 
@@ -99,7 +99,9 @@ class Bag:
         for name in required:
             here = self.topics.get(name)
             if here is None or (here.messages == 0 and all(file.complete for file in self.files)):
-                known = ", ".join(f"{topic.name} ({topic.ros_type})" for topic in list(self.topics.values())[:6])
+                known = ", ".join(
+                    f"{topic.name} ({topic.ros_type})" for topic in list(self.topics.values())[:6]
+                )
                 state = "no topic" if here is None else "no message on"
                 raise InputError(
                     f"{state} {name}; the bag holds {known or 'no topics at all'}",
@@ -110,7 +112,9 @@ class Bag:
             for channel in file.channels.values():
                 if channel.topic in DECODERS:
                     schema = file.schemas.get(channel.schema_id)
-                    _check_channel(file.path, channel.topic, channel.message_encoding, schema.name if schema else "")
+                    _check_channel(
+                        file.path, channel.topic, channel.message_encoding, schema.name if schema else ""
+                    )
 
     def messages(self, only: Collection[str] | None = None) -> Iterator[RawMessage]:
         """Messages in the order of log time, ties by topic name, then in the order of the file.
@@ -152,8 +156,9 @@ class Bag:
                 yield RawMessage(topic, log_ns, data)
 
     def inputs(self) -> Iterator[InputMessage]:
-        """Decoded messages of the estimator's input topics, in arrival order. What cannot be decoded is counted
-        in `malformed` and left out.
+        """Decoded messages of the estimator's input topics, in arrival order.
+
+        What cannot be decoded is counted in `malformed` and left out.
 
         Raises:
             InputError: an input topic has another type or encoding.

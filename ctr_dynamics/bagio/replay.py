@@ -1,7 +1,8 @@
 """Replay: a recorded bag through the estimator, without a ROS graph and as fast as it goes.
 
-Messages are given to the estimator in the order in which they arrived (log time, ties by topic name), all of one
-arrival time before a step is taken, so that a replay does what a node would have done, and twice the same.
+Messages are given to the estimator in the order in which they arrived (log time, ties by topic name), all of
+one arrival time before a step is taken, so that a replay does what a node would have done, and twice the
+same.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ import json
 import math
 import time
 from array import array
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -25,7 +26,7 @@ from ctr_dynamics.bagio.writer import BagWriter, atomic_file, write_bag
 from ctr_dynamics.errors import InputError
 from ctr_dynamics.messages.cdr import JointStateIn, PoseIn
 from ctr_dynamics.messages.encode import StepEncoder
-from ctr_dynamics.messages.topics import JOINT_STATES, STEP_NS
+from ctr_dynamics.messages.topics import JOINT_STATES
 from ctr_dynamics.parameters import Settings
 from ctr_dynamics.robot import Robot, load_robot
 
@@ -54,9 +55,9 @@ class ReplayResult:
 class StampClock:
     """Time on the clock of the stamps at a message's arrival, from its log time.
 
-    Drivers may stamp by another clock than the recorder's. The smallest difference between a joint state's log
-    time and its stamp so far is taken as that of the clocks. A single stamp that is wildly off does not count;
-    three in a row do. The time given never runs backwards.
+    Drivers may stamp by another clock than the recorder's. The smallest difference between a joint state's
+    log time and its stamp so far is taken as that of the clocks. A single stamp that is wildly off does not
+    count; three in a row do. The time given never runs backwards.
     """
 
     LIMIT_NS = 1_000_000_000
@@ -102,17 +103,22 @@ def arrivals(messages: Iterator[InputMessage]) -> Iterator[list[InputMessage]]:
 
 
 class Player:
-    """Feeds an estimator from a bag and yields its steps, one call of `advance` per step where inputs allow.
-
-    `step_s` holds the time spent on each step, roll-back included.
-    """
+    """Feeds an estimator from a bag and yields its steps."""
 
     def __init__(self, estimator: Estimator) -> None:
         self.estimator = estimator
-        self.step_s = array("d")
         self.joint_names: set[str] = set()
         self._clock = StampClock()
-        self._next_ns: int | None = None
+        self._call_times_s = array("d")
+
+    def times_s(self) -> Sequence[float]:
+        """Time spent on each step, in s, roll-back included.
+
+        From the estimator's own account (`step_times_s`) when it keeps one; else steps that came from one
+        call share its time.
+        """
+        own = getattr(self.estimator, "step_times_s", None)
+        return own if own is not None and len(own) == len(self._call_times_s) else self._call_times_s
 
     def play(self, bag: Bag, until_ns: int | None = None) -> Iterator[StepOutput]:
         """Steps in order, to the last joint stamp.
@@ -149,23 +155,15 @@ class Player:
             self.estimator.add_tip_load(message.stamp_ns, message.force, message.torque, message.frame_id)
 
     def _advance(self, now_ns: int | None) -> Iterator[StepOutput]:
-        if now_ns is None:
-            return
-        # One step a call, so that its time is its own; what is due for other reasons comes with the last call.
-        while self._next_ns is not None and self._next_ns < now_ns:
-            before = self._next_ns
-            yield from self._timed(partial(self.estimator.advance, before))
-            if self._next_ns == before:
-                break
-        yield from self._timed(partial(self.estimator.advance, now_ns))
+        if now_ns is not None:
+            yield from self._timed(partial(self.estimator.advance, now_ns))
 
     def _timed(self, call: Callable[[], list[StepOutput]]) -> Iterator[StepOutput]:
         begin = time.perf_counter()
         steps = call()
         if steps:
             spent = (time.perf_counter() - begin) / len(steps)
-            self.step_s.extend([spent] * len(steps))
-            self._next_ns = steps[-1].stamp_ns + STEP_NS
+            self._call_times_s.extend([spent] * len(steps))
             yield from steps
 
 
@@ -218,8 +216,8 @@ def replay(
         bag: an ``.mcap`` file, a rosbag2 folder, or a folder that holds exactly one ``.mcap``.
         robot: a robot, the name of a shipped one, or a robot file.
         settings: parameters; ``output.policy`` counts as given (the command takes ``wait`` by default).
-        output: MCAP file to write every output topic to; None for none. Files appear only when the replay ends
-            well.
+        output: MCAP file to write every output topic to; None for none. Files appear only when the
+            replay ends well.
         summary: JSON file for the summary; None for none.
         progress: called now and then with the fraction done and the number of steps.
         make_estimator: another estimator with the same interface.
@@ -240,13 +238,13 @@ def replay(
         "inputs": [{"name": name, "sha256": digest} for name, digest in inputs.items()],
         "parameters": settings.as_dict(),
     }
-    make = make_estimator or _default_estimator()
-    _warm_up(opened, make(robot, settings))
     with contextlib.ExitStack() as stack:
         writer: BagWriter | None = None
         if output is not None:
             writer = stack.enter_context(write_bag(Path(output), _metadata(provenance)))
         summary_part = stack.enter_context(atomic_file(Path(summary))) if summary is not None else None
+        make = make_estimator or _default_estimator()
+        _warm_up(opened, make(robot, settings))
         numbers = _run(opened, make(robot, settings), robot, settings, writer, progress)
         content = plain({**numbers, **provenance, "notes": opened.notes})
         if summary_part is not None:
@@ -294,7 +292,7 @@ def _run(
     if steps == 0:
         raise _no_step(bag, robot, player.joint_names)
     duration_s = (last_ns - first_ns) * 1e-9
-    p50, p99, worst = np.percentile(np.array(player.step_s) * 1e3, (50, 99, 100))
+    p50, p99, worst = np.percentile(np.array(player.times_s()) * 1e3, (50, 99, 100))
     return {
         **estimator.summary(),
         "steps": steps,
@@ -340,8 +338,8 @@ def _no_step(bag: Bag, robot: Robot, names: set[str]) -> InputError:
     expected = ", ".join(f"tube{i}_rotation, tube{i}_translation" for i in range(1, robot.n_tubes + 1))
     found = ", ".join(sorted(names)[:12]) or "none"
     return InputError(
-        f"no step was possible: no usable joint state of robot '{robot.name}' on {JOINT_STATES} (joints found: "
-        f"{found}; needed: {expected}; readable messages: {_readable(bag)})",
+        f"no step was possible: no usable joint state of robot '{robot.name}' on {JOINT_STATES} (joints "
+        f"found: {found}; needed: {expected}; readable messages: {_readable(bag)})",
         where=str(bag.path),
         do="check joint names, units and robot with `ctr-dynamics info`",
     )

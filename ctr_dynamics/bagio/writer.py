@@ -1,8 +1,8 @@
 """Writing bags: one MCAP file with embedded definitions, which Foxglove and `ros2 bag` open as it is.
 
-`BagWriter` writes a finished file in one go, with the same bytes whenever the content is the same (no wall clock,
-no host name), under a temporary name until it is complete. `LiveRecorder` writes while a node runs and gives
-every block to the operating system at once, so that a killed process loses a fraction of a second.
+`BagWriter` writes a finished file in one go, with the same bytes whenever the content is the same (no wall
+clock, no host name), under a temporary name until it is complete. `LiveRecorder` writes while a node runs and
+gives every block to the operating system at once, so that a killed process loses a fraction of a second.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import time
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from types import TracebackType
-from typing import IO
+from typing import IO, cast
 
 from mcap.writer import CompressionType, Writer
 
@@ -66,7 +66,9 @@ class _Channels:
     def add(self, topic: str, ros_type: str) -> int:
         definition = schema(ros_type)
         if ros_type not in self.schemas:
-            self.schemas[ros_type] = self.writer.register_schema(ros_type, "ros2msg", definition.text.encode())
+            self.schemas[ros_type] = self.writer.register_schema(
+                ros_type, "ros2msg", definition.text.encode()
+            )
         metadata = {"offered_qos_profiles": "", "topic_type_hash": definition.type_hash}
         self.channels[topic] = self.writer.register_channel(topic, "cdr", self.schemas[ros_type], metadata)
         return self.channels[topic]
@@ -116,11 +118,10 @@ def write_bag(path: Path, metadata: Mapping[str, str]) -> Iterator[BagWriter]:
     Raises:
         InputError: the file cannot be written.
     """
-    with atomic_file(Path(path)) as temporary:
-        with temporary.open("wb") as stream:
-            writer = BagWriter(stream, metadata)
-            yield writer
-            writer.finish()
+    with atomic_file(Path(path)) as temporary, temporary.open("wb") as stream:
+        writer = BagWriter(stream, metadata)
+        yield writer
+        writer.finish()
 
 
 class LiveRecorder:
@@ -139,14 +140,17 @@ class LiveRecorder:
         self.messages = 0
         self._lock = threading.Lock()
         try:
-            # Unbuffered: a block that is complete is in the hands of the system, whatever happens to this process.
+            # Unbuffered: a block that is complete is in the hands of the system, whatever happens to this
+            # process.
             self._stream: IO[bytes] = self.path.open("xb", buffering=0)
         except FileExistsError:
             raise InputError("the file exists", where=str(self.path), do="give another name") from None
         except OSError as error:
             raise InputError(f"cannot be created ({error.strerror})", where=str(self.path)) from None
         self._writer = Writer(
-            _Unbuffered(self._stream), chunk_size=_LIVE_CHUNK_BYTES, compression=CompressionType.LZ4
+            cast(IO[bytes], _Unbuffered(self._stream)),
+            chunk_size=_LIVE_CHUNK_BYTES,
+            compression=CompressionType.LZ4,
         )
         self._writer.start(profile="ros2", library=LIBRARY)
         self._writer.add_metadata(METADATA_NAME, dict(metadata))
@@ -154,7 +158,9 @@ class LiveRecorder:
         self._open = True
         self._flushed = time.monotonic()
 
-    def write(self, topic: str, log_ns: int, data: bytes, ros_type: str = "", publish_ns: int | None = None) -> None:
+    def write(
+        self, topic: str, log_ns: int, data: bytes, ros_type: str = "", publish_ns: int | None = None
+    ) -> None:
         """Record one message.
 
         Args:

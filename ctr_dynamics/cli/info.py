@@ -38,13 +38,17 @@ _HEAD = ("topic", "type", "messages", "Hz", "longest gap s", "first s", "last s"
 def _text(report: BagReport) -> str:
     """The report as plain text."""
     try:
-        start = datetime.fromtimestamp(report.start_ns * 1e-9, tz=timezone.utc).isoformat(timespec="milliseconds")
+        start = datetime.fromtimestamp(report.start_ns * 1e-9, tz=timezone.utc).isoformat(
+            timespec="milliseconds"
+        )
     except (OverflowError, ValueError, OSError):
         start = f"{report.start_ns} ns"
     lines = [f"bag       {report.bag}"]
     for file in report.files:
         state = "" if file["complete"] else ", not closed properly"
-        lines.append(f"file      {file['name']}, {file['bytes']} bytes, written by {file['library'] or '?'}{state}")
+        lines.append(
+            f"file      {file['name']}, {file['bytes']} bytes, written by {file['library'] or '?'}{state}"
+        )
     lines += [f"start     {start}", f"duration  {report.duration_s:.3f} s", ""]
     rows = [_HEAD, *(_topic_row(topic) for topic in report.topics)]
     widths = [max(len(row[i]) for row in rows) for i in range(len(_HEAD))]

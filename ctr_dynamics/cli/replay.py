@@ -68,8 +68,8 @@ def _table(result: ReplayResult) -> list[tuple[str, str]]:
         ("residual rms, fused", _number(residual.get("fused"), ".3f", "mm", 1e3)),
         (
             "NIS per degree of freedom",
-            f"{_number(nis.get('mean'), '.3f')} (95 % band of the mean {_number(nis.get('lower95'), '.3f')} to "
-            f"{_number(nis.get('upper95'), '.3f')})",
+            f"{_number(nis.get('mean'), '.3f')} (95 % band of the mean {_number(nis.get('lower95'), '.3f')} "
+            f"to {_number(nis.get('upper95'), '.3f')})",
         ),
         (
             "tracker samples",
@@ -87,9 +87,11 @@ def _table(result: ReplayResult) -> list[tuple[str, str]]:
         )
     if result.failures:
         reasons = summary["solver"].get("reasons") or {}
-        listed = ", ".join(f"{reason} ({count})" for reason, count in reasons.items()) if isinstance(
-            reasons, dict
-        ) else ", ".join(map(str, reasons))
+        listed = (
+            ", ".join(f"{reason} ({count})" for reason, count in reasons.items())
+            if isinstance(reasons, dict)
+            else ", ".join(map(str, reasons))
+        )
         rows.append(("failed steps", f"{result.failures}: {listed or 'no reason given'}"))
     return rows
 
@@ -111,12 +113,15 @@ def replay(
         Path | None, typer.Option("--summary", metavar="OUT.json", help="Summary to write.")
     ] = None,
     params: Annotated[
-        Path | None, typer.Option("--params", metavar="FILE", help="YAML file with parameters of the estimator.")
+        Path | None,
+        typer.Option("--params", metavar="FILE", help="YAML file with parameters of the estimator."),
     ] = None,
     assignments: Annotated[
         list[str] | None, typer.Option("--set", metavar="NAME=VALUE", help="One parameter; may be repeated.")
     ] = None,
-    no_fusion: Annotated[bool, typer.Option("--no-fusion", help="The model alone, without the tracker.")] = False,
+    no_fusion: Annotated[
+        bool, typer.Option("--no-fusion", help="The model alone, without the tracker.")
+    ] = False,
 ) -> int:
     """Run a recorded bag through the estimator, without a ROS graph.
 

@@ -1,8 +1,9 @@
 """Plain CDR (XCDR1), the wire and bag format of ROS 2 messages: a writer and the decoders of the inputs.
 
-A serialised message is four bytes of encapsulation (``00 01 00 00`` = little-endian CDR) and then the fields in
-order, each number aligned to its own size counted from the end of the encapsulation. Strings carry a uint32
-length that includes their closing zero; sequences carry a uint32 count. (OMG DDS-XTypes 1.3, section 7.4.)
+A serialised message is four bytes of encapsulation (``00 01 00 00`` = little-endian CDR) and then the fields
+in order, each number aligned to its own size counted from the end of the encapsulation. Strings carry a
+uint32 length that includes their closing zero; sequences carry a uint32 count. (OMG DDS-XTypes 1.3, section
+7.4.)
 """
 
 from __future__ import annotations
@@ -26,7 +27,8 @@ def split_stamp(stamp_ns: int) -> tuple[int, int]:
 
 
 class CdrWriter:
-    """Writes one little-endian message field by field. Each method returns the byte offset of what it wrote."""
+    """Writes one little-endian message field by field. Each method returns the byte offset of what it
+    wrote."""
 
     def __init__(self) -> None:
         self.data = bytearray(ENCAPSULATION)

@@ -1,7 +1,7 @@
 """From the estimator's numbers to serialised messages: the one place where outputs get their ROS form.
 
-Replay, the recorder and the node all use `StepEncoder`; rclpy publishes the bytes as they are. Beside it stand
-the encoders of the input topics (for simulated bags and the driver) and of /diagnostics.
+Replay, the recorder and the node all use `StepEncoder`; rclpy publishes the bytes as they are. Beside it
+stand the encoders of the input topics (for simulated bags and the driver) and of /diagnostics.
 """
 
 from __future__ import annotations

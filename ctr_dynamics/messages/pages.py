@@ -1,4 +1,5 @@
-"""Writes the pages of ``msg_docs/`` from the topic table: `python -m ctr_dynamics.messages.pages msg_docs`."""
+"""Writes the pages of ``msg_docs/`` from the topic table: `python -m ctr_dynamics.messages.pages
+msg_docs`."""
 
 from __future__ import annotations
 
@@ -13,12 +14,17 @@ INDEX = "README.md"
 
 
 def undocumented(topic: Topic) -> list[str]:
-    """Fields of the message type that the table does not explain, and table entries that the type does not have."""
+    """Fields of the message type that the table does not explain, and table entries that the type does not
+    have."""
     leaves = leaf_fields(topic.ros_type)
     paths = {field.path: _prefixes(field.path) for field in topic.fields}
-    missing = [leaf for leaf in leaves if not any((leaf + "\0").startswith(p) for ps in paths.values() for p in ps)]
+    missing = [
+        leaf for leaf in leaves if not any((leaf + "\0").startswith(p) for ps in paths.values() for p in ps)
+    ]
     unknown = [
-        path for path, prefixes in paths.items() if not any((leaf + "\0").startswith(p) for leaf in leaves for p in prefixes)
+        path
+        for path, prefixes in paths.items()
+        if not any((leaf + "\0").startswith(p) for leaf in leaves for p in prefixes)
     ]
     return missing + [f"{path} (not in {topic.ros_type})" for path in unknown]
 
@@ -64,8 +70,9 @@ def index() -> str:
     lines = [
         "# Topics",
         "",
-        "SI units and radians. Vectors and poses are in `ctr_base`: origin at the hole of the base plate, +z along the "
-        "robot at the base, +y against gravity. The tip is the end of tube 1, the innermost; its frame is tube 1's.",
+        "SI units and radians. Vectors and poses are in `ctr_base`: origin at the hole of the base plate, "
+        "+z along the robot at the base, +y against gravity. The tip is the end of tube 1, the innermost; "
+        "its frame is tube 1's.",
         "",
     ]
     for title, group in (("Inputs", INPUTS), ("Outputs", OUTPUTS)):

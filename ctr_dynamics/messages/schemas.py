@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import lru_cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.store import Typestore
@@ -41,10 +41,12 @@ def leaf_fields(ros_type: str) -> list[str]:
     store = typestore()
     _, fields = store.fielddefs[ros_type]
     paths: list[str] = []
-    for name, (kind, detail) in fields:
+    description: Any  # a nested tuple whose form depends on its kind
+    for name, description in fields:
+        kind, detail = description
         mark = ""
         if kind.name in ("ARRAY", "SEQUENCE"):
-            kind, detail = detail[0]  # type: ignore[misc, assignment]
+            kind, detail = detail[0]
             mark = "[]"
         if kind.name == "NAME":
             paths += [f"{name}{mark}.{inner}" for inner in leaf_fields(str(detail))]

@@ -1,8 +1,8 @@
 """Message templates: messages of fixed size in which only the numbers change.
 
-Writing a message field by field costs tens of microseconds in Python. All outputs keep their strings and lengths
-from one step to the next, so each is laid out once by `CdrWriter`, and a step only writes numbers into place
-through NumPy views. A template is a buffer that is used again: it belongs to one thread.
+Writing a message field by field costs tens of microseconds in Python. All outputs keep their strings and
+lengths from one step to the next, so each is laid out once by `CdrWriter`, and a step only writes numbers
+into place through NumPy views. A template is a buffer that is used again: it belongs to one thread.
 """
 
 from __future__ import annotations
@@ -16,12 +16,14 @@ from ctr_dynamics.messages.cdr import CdrWriter, split_stamp
 
 
 class NotFiniteError(RuntimeError):
-    """A message was about to carry a NaN or an infinity. A valid output never does: this is a fault inside."""
+    """A message was about to carry a NaN or an infinity. A valid output never does: this is a fault
+    inside."""
 
     def __init__(self, topic: str, stamp_ns: int, values: NDArray) -> None:
         bad = np.flatnonzero(~np.isfinite(np.asarray(values, dtype=float).ravel()))
         super().__init__(
-            f"{topic} at stamp {stamp_ns} ns holds {bad.size} numbers that are not finite (first at index {bad[0]})"
+            f"{topic} at stamp {stamp_ns} ns holds {bad.size} numbers that are not finite (first at index "
+            f"{bad[0]})"
         )
 
 
@@ -35,7 +37,9 @@ class Template:
         numbers: byte offset of every float64 to fill, in the order of filling.
     """
 
-    def __init__(self, topic: str, writer: CdrWriter, stamps: Sequence[int], numbers: Sequence[int] = ()) -> None:
+    def __init__(
+        self, topic: str, writer: CdrWriter, stamps: Sequence[int], numbers: Sequence[int] = ()
+    ) -> None:
         self.topic = topic
         self.data = writer.data
         size = len(self.data) - 4
@@ -80,8 +84,11 @@ def _span(offset: int, count: int) -> list[int]:
 
 
 def stamped_numbers(topic: str, frame_id: str, count: int) -> Template:
-    """A header and then `count` float64: PoseStamped 7, PoseWithCovarianceStamped 43, TwistWithCovarianceStamped
-    42, WrenchStamped 6, Vector3Stamped 3."""
+    """A header and then `count` float64.
+
+    PoseStamped has 7, PoseWithCovarianceStamped 43, TwistWithCovarianceStamped 42, WrenchStamped 6,
+    Vector3Stamped 3.
+    """
     writer = CdrWriter()
     stamp = writer.header(0, frame_id)
     offset = writer.float64s([0.0] * count)

@@ -1,8 +1,9 @@
-"""The one table of topics: what the estimator hears and says, with types, rates and the meaning of every field.
+"""The one table of topics: what the estimator hears and says, with types, rates and the meaning of every
+field.
 
-The node, replay, the recorder and the pages in ``msg_docs/`` all follow this table. SI units and radians; poses
-and vectors in the base frame ``ctr_base`` (origin at the hole of the base plate, +z along the robot at the base,
-+y against gravity). The tip is the end of tube 1, the innermost, and its frame is that of tube 1.
+The node, replay, the recorder and the pages in ``msg_docs/`` all follow this table. SI units and radians;
+poses and vectors in the base frame ``ctr_base`` (origin at the hole of the base plate, +z along the robot at
+the base, +y against gravity). The tip is the end of tube 1, the innermost, and its frame is that of tube 1.
 """
 
 from __future__ import annotations
@@ -82,7 +83,9 @@ class Topic:
         return self.name.strip("/").replace("/", "_") + ".md"
 
 
-_STAMP = Field("header.stamp", "model time t_k = stamp of the first complete joint state + k * 3,000,000 ns", "s, ns")
+_STAMP = Field(
+    "header.stamp", "model time t_k = stamp of the first complete joint state + k * 3,000,000 ns", "s, ns"
+)
 _FRAME = Field("header.frame_id", "`ctr_base` (parameter `output.frame_id`)")
 _POSITION = "position of the tip in the base frame"
 _ORIENTATION = "orientation of the tip frame in the base frame, unit quaternion in ROS order x, y, z, w"
@@ -99,19 +102,23 @@ TOPICS: tuple[Topic, ...] = (
         (
             Field("header.stamp", "time at which the encoders were read", "s, ns"),
             Field("header.frame_id", "not used"),
-            Field("name", "`tubeN_rotation` and `tubeN_translation` for every tube N = 1.. (1 innermost), any order"),
+            Field(
+                "name",
+                "`tubeN_rotation` and `tubeN_translation` for every tube N = 1.. (1 innermost), any order",
+            ),
             Field(
                 "position",
-                "`tubeN_rotation`: actuator angle alpha_N in rad; `tubeN_translation`: beta_N in m, the position of "
-                "the tube's base, zero or negative (behind the base plate)",
+                "`tubeN_rotation`: actuator angle alpha_N in rad; `tubeN_translation`: beta_N in m, the "
+                "position of the tube's base, zero or negative (behind the base plate)",
                 "rad, m",
             ),
             Field("velocity", "not used; may be empty"),
             Field("effort", "not used; may be empty"),
         ),
         (
-            "Joints are matched by name, never by place. Other names in the message are ignored; a message in which "
-            "a tube's rotation or translation is missing is not used and is counted in `/diagnostics`.",
+            "Joints are matched by name, never by place. Other names in the message are ignored; a message "
+            "in which a tube's rotation or translation is missing is not used and is counted in "
+            "`/diagnostics`.",
             "Values are linear between two stamps.",
         ),
     ),
@@ -123,14 +130,19 @@ TOPICS: tuple[Topic, ...] = (
         "the tracker's (40 Hz in the shipped bags)",
         "Measured pose of the tip sensor.",
         (
-            Field("header.stamp", "acquisition time (parameter `tracker.delay_s` corrects a known delay)", "s, ns"),
+            Field(
+                "header.stamp",
+                "acquisition time (parameter `tracker.delay_s` corrects a known delay)",
+                "s, ns",
+            ),
             Field("header.frame_id", "`ctr_base`; a pose in another frame is rejected"),
             Field("pose.position", "position of the sensor", "m"),
             Field("pose.orientation", "orientation of the sensor, unit quaternion in ROS order x, y, z, w"),
         ),
         (
-            "Samples up to 0.2 s late and out of order are fused at their own stamp. Samples with numbers that are "
-            "not finite, or with a quaternion whose norm is far from one, are rejected and counted.",
+            "Samples up to 0.2 s late and out of order are fused at their own stamp. Samples with numbers "
+            "that are not finite, or with a quaternion whose norm is far from one, are rejected and "
+            "counted.",
         ),
     ),
     Topic(
@@ -147,8 +159,8 @@ TOPICS: tuple[Topic, ...] = (
             Field("wrench.torque", "torque about the tip point, base axes", "N m"),
         ),
         (
-            "Before the first stamp the load is that first one if it comes within 0.1 s of the first joint state, "
-            "else zero.",
+            "Before the first stamp the load is that first one if it comes within 0.1 s of the first joint "
+            "state, else zero.",
         ),
     ),
     Topic(
@@ -181,7 +193,9 @@ TOPICS: tuple[Topic, ...] = (
         (
             _STAMP,
             _FRAME,
-            Field("twist.twist.linear", "rate of change of the tip point, insertion included, base axes", "m/s"),
+            Field(
+                "twist.twist.linear", "rate of change of the tip point, insertion included, base axes", "m/s"
+            ),
             Field("twist.twist.angular", "angular velocity of the tip frame, base axes", "rad/s"),
             Field(
                 "twist.covariance",
@@ -207,7 +221,10 @@ TOPICS: tuple[Topic, ...] = (
             Field("pose.position", _POSITION, "m"),
             Field("pose.orientation", _ORIENTATION),
         ),
-        ("It is not the filter's prior. Its distance from the tracker shows what the simulation gets wrong.",),
+        (
+            "It is not the filter's prior. Its distance from the tracker shows what the simulation gets "
+            "wrong.",
+        ),
     ),
     Topic(
         BACKBONE,
@@ -238,7 +255,10 @@ TOPICS: tuple[Topic, ...] = (
             _FRAME,
             Field("height", "1"),
             Field("width", "number of points"),
-            Field("fields", "15 fields of type FLOAT32 (7), count 1, offsets 0, 4, ... 56, named as in the layout"),
+            Field(
+                "fields",
+                "15 fields of type FLOAT32 (7), count 1, offsets 0, 4, ... 56, named as in the layout",
+            ),
             Field("is_bigendian", "false"),
             Field("point_step", "60", "byte"),
             Field("row_step", "60 times width", "byte"),
@@ -246,10 +266,10 @@ TOPICS: tuple[Topic, ...] = (
             Field("is_dense", "true: every number is finite"),
         ),
         (
-            "Layout of a point: `s` arc length from the base plate (m); `x`, `y`, `z` position (m); `qx`, `qy`, `qz`, "
-            "`qw` orientation of tube 1's frame; `vx`, `vy`, `vz` velocity, base axes (m/s); `ux`, `uy`, `uz` "
-            "curvature and twist of tube 1 in its own frame (1/m); `sd` deviation (1 sigma) of the position, root of the "
-            "trace of its covariance (m).",
+            "Layout of a point: `s` arc length from the base plate (m); `x`, `y`, `z` position (m); `qx`, "
+            "`qy`, `qz`, `qw` orientation of tube 1's frame; `vx`, `vy`, `vz` velocity, base axes (m/s); "
+            "`ux`, `uy`, `uz` curvature and twist of tube 1 in its own frame (1/m); `sd` deviation (1 "
+            "sigma) of the position, root of the trace of its covariance (m).",
             "Read it with `numpy.frombuffer(msg.data, numpy.float32).reshape(msg.width, 15)`.",
             _NOT_INVALID,
         ),
@@ -264,7 +284,10 @@ TOPICS: tuple[Topic, ...] = (
         (
             _STAMP,
             _FRAME,
-            Field("name", "`mode1`..`modeM`, then `mode1.frequency_hz`.., then `mode1.damping_ratio`.. (3 M names)"),
+            Field(
+                "name",
+                "`mode1`..`modeM`, then `mode1.frequency_hz`.., then `mode1.damping_ratio`.. (3 M names)",
+            ),
             Field(
                 "position",
                 "first M: amplitude of the mode, its present contribution to the tip's displacement; next M: "
@@ -275,8 +298,8 @@ TOPICS: tuple[Topic, ...] = (
             Field("effort", "empty"),
         ),
         (
-            "Modes are ordered by frequency, the slowest first. With M = len(name) / 3 the controller's state is "
-            "`position[:M]` and `velocity[:M]`.",
+            "Modes are ordered by frequency, the slowest first. With M = len(name) / 3 the controller's "
+            "state is `position[:M]` and `velocity[:M]`.",
             _NOT_INVALID,
         ),
     ),
@@ -286,7 +309,8 @@ TOPICS: tuple[Topic, ...] = (
         "out",
         OUTPUT_QOS,
         "once for every tracker sample, accepted or not",
-        "What the filter made of a tracker sample: innovation, its variance, NIS, degrees of freedom, verdict, delay.",
+        "What the filter made of a tracker sample: innovation, its variance, NIS, degrees of freedom, "
+        "verdict, delay.",
         (
             Field("header.stamp", "stamp of the tracker sample", "s, ns"),
             _FRAME,
@@ -296,12 +320,14 @@ TOPICS: tuple[Topic, ...] = (
             Field("effort", "empty"),
         ),
         (
-            "Layout, found by name: `residual.x`, `.y`, `.z` measured minus expected position (m), `residual.rx`, "
-            "`.ry`, `.rz` the rotation from the expected to the measured orientation about the base axes (rad); "
-            "`variance.x` .. `variance.rz` variances of these (m^2, rad^2); `nis` the normalised innovation squared "
-            "and `dof` its degrees of freedom; `accepted` 1 or 0; `delay_s` how long after its stamp the sample was "
-            "taken in (s); for a sample that was not used `reason.WORDS` with value 1.",
-            "A number that does not exist (a masked axis, a sample with a NaN) is left out: no NaN is published.",
+            "Layout, found by name: `residual.x`, `.y`, `.z` measured minus expected position (m), "
+            "`residual.rx`, `.ry`, `.rz` the rotation from the expected to the measured orientation about "
+            "the base axes (rad); `variance.x` .. `variance.rz` variances of these (m^2, rad^2); `nis` the "
+            "normalised innovation squared and `dof` its degrees of freedom; `accepted` 1 or 0; `delay_s` "
+            "how long after its stamp the sample was taken in (s); for a sample that was not used "
+            "`reason.WORDS` with value 1.",
+            "A number that does not exist (a masked axis, a sample with a NaN) is left out: no NaN is "
+            "published.",
         ),
     ),
     Topic(
@@ -314,7 +340,11 @@ TOPICS: tuple[Topic, ...] = (
         (
             _STAMP,
             _FRAME,
-            Field("wrench.force", "estimated force, base axes; its deviation is in `/ctr/estimator/disturbance_sigma`", "N"),
+            Field(
+                "wrench.force",
+                "estimated force, base axes; its deviation is in `/ctr/estimator/disturbance_sigma`",
+                "N",
+            ),
             Field("wrench.torque", "zero: the unknown load is modelled as a force at the tip point", "N m"),
         ),
         (_NOT_INVALID,),
@@ -340,7 +370,11 @@ TOPICS: tuple[Topic, ...] = (
         OUTPUT_QOS,
         PER_STEP,
         "Whether the outputs of this step can be used.",
-        (Field("data", "true: the step's outputs are published; false: they are not, `/diagnostics` says why"),),
+        (
+            Field(
+                "data", "true: the step's outputs are published; false: they are not, `/diagnostics` says why"
+            ),
+        ),
         ("It has no header. It is published after the other topics of its step.",),
     ),
     Topic(

@@ -38,7 +38,9 @@ def make_innovation(rng: np.random.Generator, stamp_ns: int, **changes: Any) -> 
     return item
 
 
-def make_step(k: int = 11, points: int = 37, modes: int = 3, seed: int = 0, **changes: Any) -> SimpleNamespace:
+def make_step(
+    k: int = 11, points: int = 37, modes: int = 3, seed: int = 0, **changes: Any
+) -> SimpleNamespace:
     """A step with the fields of StepOutput and random content."""
     rng = np.random.default_rng(seed + k)
     stamp_ns = T0_NS + k * topics.STEP_NS

@@ -1,0 +1,161 @@
+"""The covariance in low rank: columns of field and parameter perturbations with a small covariance of their coefficients.
+
+The error of the fields and the uncertain parameters is V a, with V (fields + parameters, r) and a of covariance Pi_aa; tracker states b are kept in
+full beside a, so that P = [V 0; 0 I] Pi [V 0; 0 I]^T. Columns move with the tangent of the step; process noise of the tip force appends columns,
+and the weakest directions in an energy norm are dropped (Verlaan and Heemink 1997, reduced-rank square-root filter).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ctr_dynamics.model.mesh import Mesh, section_lengths
+from ctr_dynamics.model.model import Model
+from ctr_dynamics.model.newton import lanes_for
+from ctr_dynamics.model.scheme import RATES, Y_NOW
+from ctr_dynamics.model.simulator import Record, remap_fields
+from ctr_dynamics.model.tangent import linearise, step_tangent
+
+from .uncertainty import ModelUncertainty
+
+Floats = NDArray[np.float64]
+EPSILON = 1e-6  # of one standard deviation: small against the curvature of the step, large against rounding
+
+
+def field_weights(model: Model, mesh: Mesh, beta: Floats) -> Floats:
+    """(fields,) weights of the energy norm: half the sum of weight times field squared is energy in J."""
+    n, layout, par = model.n, model.layout, model.parameters
+    F = 7 + 2 * n
+    seclen = np.zeros(len(mesh.sec_cells))
+    section_lengths(mesh.bp_tube, mesh.bp_offset, beta, seclen)
+    EI, GJ = par[layout["bending_stiffness"]], par[layout["torsional_stiffness"]]
+    RA, RI = par[layout["mass_per_length"]], par[layout["inertia_per_length"]]
+    rows = []
+    for k, cells in enumerate(mesh.sec_cells):
+        present = int(mesh.sec_tubes[k])
+        density = np.zeros(F)
+        density[0:3] = RA[:present].sum()
+        density[3:5] = RI[:present].sum()
+        density[5] = 2 * RI[:present].sum()
+        density[6:8] = EI[:present].sum()
+        density[8] = GJ[0]
+        density[9 : 9 + present - 1] = GJ[1:present]
+        density[8 + n : 8 + n + present - 1] = 2 * RI[1:present]
+        step = seclen[k] / cells
+        stage = np.tile(np.array([1.0, 2.0, 2.0, 1.0]) / 6.0 * step, cells)
+        rows.append((np.append(stage, 0.0)[:, None] * density).ravel())
+    base_points = 4 * mesh.base_cells + 1
+    for i in range(n):
+        step = -beta[i] / mesh.base_cells
+        stage = np.append(np.tile(np.array([1.0, 2.0, 2.0, 1.0]) / 6.0 * step, mesh.base_cells), 0.0)
+        rows.append((stage[:, None] * np.array([2 * RI[i], GJ[i]])).ravel())
+        assert len(stage) == base_points
+    weights = np.concatenate(rows)
+    body = par[layout["body_mass"]][0]
+    main = sum((4 * c + 1) * F for c in mesh.sec_cells)
+    weights[main - F : main - F + 3] += body  # the payload's kinetic energy, at the last point
+    return weights
+
+
+class Columns:
+    """V and its parts.
+
+    Attributes:
+        dbank: (3 + stages, fields, r) columns of the stored fields; ``fields`` is the first slot.
+        theta: (n_theta, r) parameter parts.
+        dnodes: (nodes * S, r) columns of the node states after the last step.
+        dx: (5 + N, r) columns of the unknowns after the last step.
+    """
+
+    def __init__(self, model: Model, uncertainty: ModelUncertainty, rank: int, stages: int) -> None:
+        self.model, self.uncertainty, self.rank = model, uncertainty, rank
+        self.stages = stages
+        self.lanes = lanes_for(6 + model.n + rank)
+        self._work: dict[tuple, tuple] = {}
+        self._weights: dict[tuple, Floats] = {}
+        self.key: tuple = ()
+        self.mesh: Mesh | None = None
+        self.beta = np.zeros(model.n)
+
+    def start(self, key: tuple, mesh: Mesh, beta: Floats, alpha: Floats, par: Floats, x: Floats) -> Floats:
+        """Columns of the static equilibrium's dependence on the uncertain parameters; returns Pi_aa (r, r)."""
+        model, unc = self.model, self.uncertainty
+        count = len(unc.names)
+        lanes = lanes_for(6 + model.n + count)
+        big = model.buffers(mesh, 8 * len(lanes))
+        main, base = len(big[4]) // (8 * len(lanes)), len(big[5]) // (8 * len(lanes))
+        m = 5 + model.n
+        par = par.copy()
+        par[model.layout["alpha"]], par[model.layout["beta"]], par[model.layout["alpha_rate"]] = alpha, beta, 0.0
+        scale = np.where(unc.sigma > 0, unc.sigma, 1e-3)
+        dx, fields = np.zeros((m, count)), np.zeros((main + base, count))
+        dnodes = np.zeros((len(big[8]) // (8 * len(lanes)), count))
+        linearise(
+            model.tubes, lanes, mesh, 0.0, par, unc.effect * scale, x, np.zeros(main), np.zeros(base),
+            np.zeros((main + base, count)), 1e-4, model.step, big, np.zeros((m, m)), dx, fields, dnodes,
+        )  # fmt: skip
+        self.key, self.mesh, self.beta = key, mesh, beta.copy()
+        r = self.rank
+        wide = max(count, r)
+        self.theta = np.zeros((count, wide))
+        self.theta[:, :count] = np.diag(scale)
+        self.dbank = np.zeros((RATES + self.stages, main + base, wide))
+        self.dbank[:RATES - 1, :, :count] = fields
+        self.dnodes, self.dx = np.zeros((len(dnodes), wide)), np.zeros((m, wide))
+        self.dnodes[:, :count], self.dx[:, :count] = dnodes, dx
+        variance = np.zeros(wide)
+        variance[:count] = np.where(unc.sigma > 0, 1.0, 0.0)
+        return np.diag(variance)
+
+    @property
+    def fields(self) -> Floats:
+        """(fields, r) columns of the fields."""
+        return self.dbank[Y_NOW]
+
+    def _remap(self, record: Record, beta: Floats) -> None:
+        """Carry the columns to another set of sections."""
+        assert self.mesh is not None
+        slots, _, r = self.dbank.shape
+        rows = np.ascontiguousarray(self.dbank.transpose(0, 2, 1)).reshape(slots * r, -1)
+        moved = remap_fields(self.model.n, rows, self.mesh, self.beta, record.mesh, beta)
+        self.dbank = np.ascontiguousarray(moved.reshape(slots, r, -1).transpose(0, 2, 1))
+        self.key, self.mesh = record.key, record.mesh
+
+    def propagate(self, records: tuple[Record, ...], par: Floats) -> bool:
+        """Move the columns over the solved (sub)steps in ``records``; False where a stage cannot be linearised (columns then stay)."""
+        model = self.model
+        m = 5 + model.n
+        dpar = self.uncertainty.effect @ self.theta
+        for record in records:
+            beta = record.inputs[-1, 2 * model.n : 3 * model.n]
+            if record.key != self.key:
+                self._remap(record, beta)
+            self.beta = beta
+            columns = self.theta.shape[1]
+            work_key = (record.key, columns)
+            if work_key not in self._work:
+                lanes = lanes_for(1 + m + columns)
+                L = 8 * len(lanes)
+                big = model.buffers(record.mesh, L)
+                main, base = len(big[4]) // L, len(big[5]) // L
+                self._work[work_key] = (
+                    lanes, big, (np.zeros(main), np.zeros(base), np.zeros((main + base, columns))), np.zeros((m, m)),
+                    np.zeros((m, columns)), np.zeros((len(big[8]) // L, columns)),
+                )  # fmt: skip
+            lanes, big, work, inverse, dx, dnodes = self._work[work_key]
+            ok = step_tangent(
+                model.tubes, lanes, record.mesh, record.scheme.c0, record.scheme.weights, par.copy(), record.inputs, record.found,
+                record.before, record.rates, dpar, EPSILON, model.step, big, work, self.dbank, inverse, dx, dnodes,
+            )  # fmt: skip
+            if not ok:
+                return False
+            self.dx, self.dnodes, self.inverse = dx.copy(), dnodes.copy(), inverse.copy()
+        return True
+
+    def weights(self) -> Floats:
+        """Energy weights on the current sections."""
+        assert self.mesh is not None
+        if self.key not in self._weights:
+            self._weights[self.key] = field_weights(self.model, self.mesh, self.beta)
+        return self._weights[self.key]

@@ -1,0 +1,272 @@
+"""The extended Kalman filter on the fields of the rod: predict with the tangent of the step, update with filterpy at the sample's own stamp.
+
+Numbered steps, as in docs/ekf.md: (1) columns follow the step's tangent; (2) the tip force decays and is driven, the drift likewise; (3) columns are
+reduced to the rank; (4) a sample is compared with the tip of its own time, whose columns have been kept; (5) gate; (6) filterpy's
+update of (a, b); (7) fields, parameters, kept tips and the shooting unknowns move by the columns.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from copy import copy
+from dataclasses import dataclass
+
+import numpy as np
+from filterpy.kalman import ExtendedKalmanFilter
+from numpy.typing import NDArray
+from scipy.stats import chi2
+
+from ctr_dynamics.model.model import Model
+from ctr_dynamics.model.simulator import Simulator, State, StepResult
+
+from .columns import Columns
+from .tip import Tip, between, tip_of
+from .tracker import DRIFT, STATES, TrackerModel, expected, registered, residual, sensitivity
+from .uncertainty import bias_sigma, model_uncertainty
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class FusionOptions:
+    """Tuning of the filter; the parameter table says what each means."""
+
+    rank: int = 24
+    gate_probability: float = 0.9999
+    force_sigma: float = 0.002
+    force_sigma_max: float = 0.2
+    adaptation: float = 0.1
+    force_time: float = 0.2
+    window: float = 0.2
+    reduce_every: int = 8
+    retain: float = 1.0
+
+
+@dataclass(frozen=True)
+class Update:
+    """One tracker sample's outcome: residual (6,), its predicted variance (6,), NIS, degrees of freedom, accepted, reason."""
+
+    residual: Floats
+    variance: Floats
+    nis: float
+    dof: int
+    accepted: bool
+    reason: str
+
+
+class Fusion:
+    """Filter of one simulated robot.
+
+    The owner steps the simulator with ``record=True`` and hands the result to :meth:`predict`; the filter writes into the simulator's state and
+    parameters when it corrects.
+    """
+
+    def __init__(self, simulator: Simulator, tracker: TrackerModel, options: FusionOptions) -> None:
+        self.simulator, self.tracker, self.options = simulator, tracker, options
+        self.model: Model = simulator.model
+        self.uncertainty = model_uncertainty(self.model)
+        self.nominal = simulator.parameters.copy()
+        self.columns = Columns(self.model, self.uncertainty, options.rank, simulator.scheme.stages)
+        self.theta = np.zeros(len(self.uncertainty.names))
+        self.bias = np.zeros(STATES)
+        self.tips: deque[Tip] = deque(maxlen=max(2, math.ceil(options.window / simulator.scheme.dt) + 2))
+        self.pi = np.zeros((0, 0))
+        self.steps = 0
+        self.force_sigma = options.force_sigma
+
+    # -- start and prediction --
+
+    def start(self, state: State, stamp: float) -> None:
+        """Begin at the static equilibrium in ``state`` with the robot file's tolerances as the prior."""
+        inputs = state.inputs
+        pi_aa = self.columns.start(
+            state.key, state.mesh, inputs.beta, inputs.alpha, self._block(inputs), state.unknowns[-1]
+        )
+        r = len(pi_aa)
+        self.theta[:] = 0.0
+        self.bias[:] = 0.0
+        self.pi = np.zeros((r + STATES, r + STATES))
+        self.pi[:r, :r] = pi_aa
+        sigma = bias_sigma(self.model.robot)
+        self.pi[r:, r:] = np.diag(sigma**2)
+        force = self.uncertainty.force
+        # the unknown force starts with its stationary spread, in columns of its own
+        scale = np.diag(self.columns.theta)[force]
+        for axis, size in enumerate(scale):
+            i = force.start + axis
+            self.pi[i, i] = (self.options.force_sigma / size) ** 2
+        self.steps = 0
+        self.tips.clear()
+        self._reduce()
+        self._keep_tip(state, stamp)
+
+    def _block(self, inputs) -> Floats:
+        par = self.simulator.parameters.copy()
+        layout = self.model.layout
+        par[layout["force"]], par[layout["torque"]] = inputs.force, inputs.torque
+        return par
+
+    def predict(self, state: State, result: StepResult, stamp: float) -> bool:
+        """Steps (1)-(3) after the simulator took a step to ``stamp`` (s). False where the tangent does not exist; the columns then stay."""
+        ok = self.columns.propagate(result.records, self.simulator.parameters)
+        self.steps += 1
+        decay = math.exp(-self.simulator.scheme.dt / self.options.force_time)
+        force = self.uncertainty.force
+        self.theta[force] *= decay
+        self.columns.theta[force] *= decay
+        self._drive_drift()
+        self._apply_theta()
+        self._keep_tip(state, stamp)
+        if self.steps % self.options.reduce_every == 0:
+            self._drive_force(self.options.reduce_every)
+            self._reduce()
+        return ok
+
+    def _drive_drift(self) -> None:
+        noise = self.model.robot.tracker.noise
+        decay = math.exp(-self.simulator.scheme.dt / noise.drift_time.value)
+        r = self.columns.theta.shape[1]
+        rows = np.arange(r, r + STATES)[DRIFT]
+        self.bias[DRIFT] *= decay
+        self.pi[rows, :] *= decay
+        self.pi[:, rows] *= decay
+        self.pi[rows, rows] += (1 - decay**2) * noise.drift.value**2
+
+    def _drive_force(self, steps: int) -> None:
+        """Append three columns that hold the tip force's new randomness of ``steps`` steps."""
+        decay2 = math.exp(-2 * steps * self.simulator.scheme.dt / self.options.force_time)
+        c = self.columns
+        r = c.theta.shape[1]
+        wide = r + 3
+        size = self.force_sigma
+
+        def widen(array: Floats) -> Floats:
+            return np.concatenate([array, np.zeros((*array.shape[:-1], 3))], axis=-1)
+
+        c.theta, c.dbank, c.dnodes, c.dx = widen(c.theta), widen(c.dbank), widen(c.dnodes), widen(c.dx)
+        c.theta[self.uncertainty.force, r:] = size * np.eye(3)
+        for tip in self.tips:
+            tip.columns = widen(tip.columns)
+        pi = np.zeros((wide + STATES, wide + STATES))
+        keep = np.r_[0:r, wide : wide + STATES]
+        pi[np.ix_(keep, keep)] = self.pi
+        pi[range(r, wide), range(r, wide)] = 1.0 - decay2
+        self.pi = pi
+
+    def _reduce(self) -> None:
+        """Step (3): rotate to principal columns in the energy norm, drop the weakest, and make Pi_aa the identity."""
+        c = self.columns
+        r = c.theta.shape[1]
+        sigma = np.where(self.uncertainty.sigma > 0, self.uncertainty.sigma, self.options.force_sigma)
+        V = c.fields
+        gram = V.T @ (c.weights()[:, None] * V)
+        unit = max(float(np.trace(gram)) / r, 1e-12) * self.options.retain
+        scaled = c.theta / sigma[:, None]
+        gram = gram + unit * 0.01 * (scaled.T @ scaled)
+        pi_aa = 0.5 * (self.pi[:r, :r] + self.pi[:r, :r].T)
+        lam, E = np.linalg.eigh(pi_aa)
+        lam = np.maximum(lam, 0.0)
+        root = E * np.sqrt(lam)  # Pi_aa = root root^T
+        values, U = np.linalg.eigh(root.T @ gram @ root)
+        order = np.argsort(values)[::-1][: self.options.rank]
+        U = U[:, order]
+        T = root @ U  # old coefficients = T new coefficients
+        inverse_root = np.where(lam > 1e-14 * lam.max(), 1.0 / np.sqrt(np.maximum(lam, 1e-300)), 0.0)
+        S = U.T @ (inverse_root[:, None] * E.T)  # new = S old
+        k = len(order)
+        pi = np.zeros((k + STATES, k + STATES))
+        pi[:k, :k] = np.eye(k)
+        pi[:k, k:] = S @ self.pi[:r, r:]
+        pi[k:, :k] = pi[:k, k:].T
+        pi[k:, k:] = self.pi[r:, r:]
+        self.pi = pi
+        c.theta = c.theta @ T
+        slots = 2
+        dbank = np.zeros((*c.dbank.shape[:2], k))
+        dbank[:slots] = c.dbank[:slots] @ T
+        c.dbank = dbank
+        c.dnodes, c.dx = c.dnodes @ T, c.dx @ T
+        for tip in self.tips:
+            tip.columns = tip.columns @ T
+
+    def _apply_theta(self) -> None:
+        """Write the estimated parameters and force into the simulator's block."""
+        self.simulator.parameters[:] = self.nominal + self.uncertainty.effect @ self.theta
+
+    def _keep_tip(self, state: State, stamp: float) -> None:
+        rate = float(state.inputs.beta_rate[0])
+        S = state.nodes.shape[1]
+        self.tips.append(tip_of(stamp, state.nodes[-1], self.columns.dnodes[-S:], rate))
+
+    # -- update --
+
+    def update(self, state: State, stamp: float, position: Floats, quaternion: Floats) -> Update:
+        """Steps (4)-(7) with a reading of time stamp ``stamp`` (s): position (3,) m, quaternion (4,) wxyz, in the tracker's frame."""
+        time = stamp - self.tracker.delay - self.bias[9]
+        tip = self._tip_at(time)
+        if tip is None:
+            return Update(np.full(6, np.nan), np.full(6, np.nan), math.nan, 0, False, "outside the window of kept steps")
+        nu = residual(position, quaternion, *expected(self.tracker, self.bias, tip))
+        H = sensitivity(self.tracker, self.bias, tip)
+        mask = self.tracker.mask
+        nu, H, R = nu[mask], H[mask], np.diag(self.tracker.variance[mask])
+        S = H @ self.pi @ H.T + R
+        nis = float(nu @ np.linalg.solve(S, nu))
+        dof = int(mask.sum())
+        full, variance = np.full(6, np.nan), np.full(6, np.nan)
+        full[mask], variance[mask] = nu, np.diag(S)
+        if not math.isfinite(nis):
+            return Update(full, variance, nis, dof, False, "not finite")
+        self._adapt(nis / dof)
+        if nis > chi2.ppf(self.options.gate_probability, dof):
+            return Update(full, variance, nis, dof, False, "outside the gate")
+        size = len(self.pi)
+        ekf = ExtendedKalmanFilter(dim_x=size, dim_z=dof)
+        ekf.P = self.pi
+        ekf.R = R
+        ekf.update(nu[:, None], HJacobian=lambda x: H, Hx=lambda x: np.zeros((dof, 1)))
+        self.pi = 0.5 * (ekf.P + ekf.P.T)
+        self._correct(state, ekf.x[:, 0])
+        return Update(full, variance, nis, dof, True, "")
+
+    def _adapt(self, ratio: float) -> None:
+        """Raise the drive of the tip force while innovations are larger than predicted, lower it while they are smaller."""
+        o = self.options
+        size = self.force_sigma * math.exp(o.adaptation * (min(ratio, 10.0) - 1.0))
+        self.force_sigma = min(max(size, o.force_sigma), o.force_sigma_max)
+
+    def _tip_at(self, time: float) -> Tip | None:
+        tips = self.tips
+        if not tips or time < tips[0].stamp - 1e-6 or time > tips[-1].stamp + self.simulator.scheme.dt:
+            return None
+        if len(tips) == 1:
+            return copy(tips[0])
+        i = int((time - tips[0].stamp) / self.simulator.scheme.dt)
+        i = min(max(i, 0), len(tips) - 2)
+        return between(tips[i], tips[i + 1], time)
+
+    def _correct(self, state: State, x: Floats) -> None:
+        """Step (7)."""
+        c = self.columns
+        r = c.theta.shape[1]
+        a = x[:r]
+        self.bias += x[r:]
+        self.theta += c.theta @ a
+        self._apply_theta()
+        change = c.fields @ a
+        state.bank[:2] += change
+        shift = c.dx @ a
+        state.unknowns += shift
+        state.earlier += shift
+        state.nodes += (c.dnodes @ a).reshape(state.nodes.shape)
+        for tip in self.tips:
+            tip.shift(a)
+
+    # -- outputs --
+
+    def tip_estimate(self) -> tuple[Floats, Floats, Floats, Floats]:
+        """Fused tip now: position (3,) m, quaternion (4,) wxyz, twist (6,), covariance (12, 12) of pose and twist (base axes)."""
+        tip = self.tips[-1]
+        position, quaternion, J = registered(self.tracker, self.bias, tip)
+        return position, quaternion, np.concatenate([tip.velocity, tip.rate]), J @ self.pi @ J.T

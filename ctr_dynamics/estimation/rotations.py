@@ -1,0 +1,66 @@
+"""Rotations: small helpers on unit quaternions (w, x, y, z) and rotation vectors, in plain floats where the filter needs speed."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+
+
+def matrix(h: Floats) -> Floats:
+    """Rotation matrix (3, 3) of a quaternion (4,) wxyz of any length but 0."""
+    w, x, y, z = h
+    k = 2.0 / (w * w + x * x + y * y + z * z)
+    return np.array(
+        [
+            [1 - k * (y * y + z * z), k * (x * y - w * z), k * (x * z + w * y)],
+            [k * (x * y + w * z), 1 - k * (x * x + z * z), k * (y * z - w * x)],
+            [k * (x * z - w * y), k * (y * z + w * x), 1 - k * (x * x + y * y)],
+        ]
+    )
+
+
+def multiply(a: Floats, b: Floats) -> Floats:
+    """Hamilton product a b of quaternions (4,)."""
+    aw, ax, ay, az = a
+    bw, bx, by, bz = b
+    return np.array(
+        [
+            aw * bw - ax * bx - ay * by - az * bz,
+            aw * bx + ax * bw + ay * bz - az * by,
+            aw * by - ax * bz + ay * bw + az * bx,
+            aw * bz + ax * by - ay * bx + az * bw,
+        ]
+    )
+
+
+def from_vector(r: Floats) -> Floats:
+    """Unit quaternion (4,) of a rotation vector (3,) rad."""
+    angle = math.sqrt(r[0] * r[0] + r[1] * r[1] + r[2] * r[2])
+    k = 0.5 * math.sin(0.5 * angle) / (0.5 * angle) if angle > 1e-8 else 0.5
+    return np.array([math.cos(0.5 * angle), k * r[0], k * r[1], k * r[2]])
+
+
+def to_vector(h: Floats) -> Floats:
+    """Rotation vector (3,) rad, shorter than pi, of a quaternion (4,) of any length but 0."""
+    w, x, y, z = h
+    norm = math.sqrt(x * x + y * y + z * z)
+    if norm < 1e-12 * abs(w) or norm == 0.0:
+        return np.array([2 * x / w, 2 * y / w, 2 * z / w]) if w else np.zeros(3)
+    angle = 2.0 * math.atan2(norm, w)
+    if angle > math.pi:
+        angle -= 2.0 * math.pi
+    return np.array([x, y, z]) * (angle / norm)
+
+
+def conjugate(h: Floats) -> Floats:
+    """Inverse of a unit quaternion (4,)."""
+    return np.array([h[0], -h[1], -h[2], -h[3]])
+
+
+def skew(v: Floats) -> Floats:
+    """(3, 3) with skew(v) w = v x w."""
+    return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])

@@ -1,0 +1,131 @@
+"""The tracker's measurement: registration, lever arm, delay and drift between the model's tip and a reported pose (docs/ekf.md).
+
+reading = R_reg (p + R lever) + t_reg + drift, R_reading = R_reg R, both of the time stamp - delay.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ctr_dynamics.robot import Robot
+
+from .rotations import conjugate, from_vector, matrix, multiply, skew, to_vector
+from .tip import Tip
+
+Floats = NDArray[np.float64]
+
+ROTATION, TRANSLATION, LEVER, DELAY, DRIFT = slice(0, 3), slice(3, 6), slice(6, 9), 9, slice(10, 13)
+STATES = 13
+
+
+@dataclass(frozen=True)
+class TrackerModel:
+    """Nominal geometry and noise of the tracker.
+
+    Attributes:
+        rotation: (4,) wxyz of R_reg; translation: (3,) m; lever: (3,) m in the tip frame; delay: s, > 0 when a pose is older than its stamp.
+        mask: (6,) measured axes: position x, y, z in the tracker's frame, then rotation about the sensor's x, y, z.
+        variance: (6,) white noise.
+    """
+
+    rotation: Floats
+    translation: Floats
+    lever: Floats
+    delay: float
+    mask: NDArray[np.bool_]
+    variance: Floats
+
+    def to_base(self, position: Floats, quaternion: Floats) -> tuple[Floats, Floats]:
+        """Reading as a tip pose in ``ctr_base`` with the nominal geometry."""
+        q = multiply(conjugate(self.rotation), quaternion)
+        return matrix(conjugate(self.rotation)) @ (position - self.translation) - matrix(q) @ self.lever, q
+
+
+def tracker_model(
+    robot: Robot,
+    *,
+    delay: float = 0.0,
+    lever: Floats | None = None,
+    rotation: Floats | None = None,
+    translation: Floats | None = None,
+    mask: tuple[bool, ...] = (True,) * 6,
+) -> TrackerModel:
+    """Tracker of ``robot`` with corrections: ``delay`` (s) and ``lever`` (3,) m are added, ``rotation`` (3,) rad and ``translation`` (3,) m composed."""
+    t = robot.tracker
+    own_rotation, own_translation = from_vector(np.array(t.registration_rotation.value)), np.array(t.registration_translation.value)
+    extra = from_vector(np.zeros(3) if rotation is None else np.asarray(rotation, float))
+    shift = np.zeros(3) if translation is None else np.asarray(translation, float)
+    return TrackerModel(
+        rotation=multiply(extra, own_rotation),
+        translation=matrix(extra) @ own_translation + shift,
+        lever=np.array(t.lever_arm.value) + (np.zeros(3) if lever is None else np.asarray(lever, float)),
+        delay=t.delay.value + delay,
+        mask=np.array(mask, dtype=bool),
+        variance=np.array([t.noise.position.value**2] * 3 + [t.noise.rotation.value**2] * 3),
+    )
+
+
+def expected(model: TrackerModel, bias: Floats, tip: Tip) -> tuple[Floats, Floats]:
+    """Reading (position (3,) m, quaternion (4,) wxyz) that the tip and the tracker states (13,) predict."""
+    R = matrix(tip.quaternion)
+    registration = multiply(from_vector(bias[ROTATION]), model.rotation)
+    position = matrix(registration) @ (tip.position + R @ (model.lever + bias[LEVER])) + model.translation + bias[TRANSLATION]
+    return position + bias[DRIFT], multiply(registration, tip.quaternion)
+
+
+def residual(position: Floats, quaternion: Floats, expected_position: Floats, expected_quaternion: Floats) -> Floats:
+    """(6,) reading minus expectation: position in the tracker's axes, rotation vector in the sensor's axes."""
+    turn = to_vector(multiply(conjugate(expected_quaternion), quaternion))
+    return np.concatenate([position - expected_position, turn])
+
+
+def sensitivity(model: TrackerModel, bias: Floats, tip: Tip) -> Floats:
+    """H (6, r + 13): derivative of the expected reading by the columns' coefficients and the tracker states."""
+    r = tip.columns.shape[1]
+    R = matrix(tip.quaternion)
+    Q = matrix(multiply(from_vector(bias[ROTATION]), model.rotation))
+    arm = R @ (model.lever + bias[LEVER])
+    H = np.zeros((6, r + STATES))
+    H[0:3, :r] = Q @ (tip.columns[0:3] - skew(arm) @ tip.columns[3:6])
+    H[3:6, :r] = R.T @ tip.columns[3:6]
+    b = H[:, r:]
+    b[0:3, ROTATION] = -skew(Q @ (tip.position + arm))
+    b[3:6, ROTATION] = R.T @ Q.T
+    b[0:3, TRANSLATION] = np.eye(3)
+    b[0:3, LEVER] = Q @ R
+    b[0:3, DELAY] = -Q @ (tip.velocity + np.cross(tip.rate, arm))
+    b[3:6, DELAY] = -R.T @ tip.rate
+    b[0:3, DRIFT] = np.eye(3)
+    return H
+
+
+def registered(model: TrackerModel, bias: Floats, tip: Tip) -> tuple[Floats, Floats, Floats]:
+    """Tip pose in ``ctr_base`` as the tracker realises it, and its sensitivity (12, r + 13): pose (base axes), then twist.
+
+    The base frame of a real robot is known through its registration only, so the estimated registration and lever-arm errors are part of the
+    pose: it is where a perfect tracker with the nominal geometry would see the tip. Drift and delay are left out.
+    """
+    r = tip.columns.shape[1]
+    R = matrix(tip.quaternion)
+    turn = from_vector(matrix(conjugate(model.rotation)) @ bias[ROTATION])
+    C = matrix(turn)
+    arm = R @ bias[LEVER]
+    shift = matrix(conjugate(model.rotation)) @ bias[TRANSLATION]
+    # R_reg^T (R_b R_reg (p + R (lever + b)) + b_t) - R_final lever
+    full = R @ (model.lever + bias[LEVER])
+    quaternion = multiply(turn, tip.quaternion)
+    position = C @ (tip.position + full) + shift - matrix(quaternion) @ model.lever
+    J = np.zeros((12, r + STATES))
+    J[0:3, :r] = C @ (tip.columns[0:3] - skew(arm) @ tip.columns[3:6])
+    J[3:6, :r] = C @ tip.columns[3:6]
+    J[6:9, :r] = tip.columns[6:9]
+    J[9:12, :r] = tip.columns[9:12]
+    N = matrix(conjugate(model.rotation))
+    J[0:3, r:][:, ROTATION] = -skew(position) @ N
+    J[3:6, r:][:, ROTATION] = N
+    J[0:3, r:][:, TRANSLATION] = N
+    J[0:3, r:][:, LEVER] = C @ R
+    return position, quaternion, J

@@ -1,0 +1,121 @@
+"""What the robot file is unsure of: the parameters that the filter carries, with their deviations and their effect on the model.
+
+Model parameters and the unknown tip force move the fields and ride in the columns of the covariance; tracker errors (registration, lever arm,
+delay, drift) enter the measurement only and are states of their own.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ctr_dynamics.model.layout import Layout
+from ctr_dynamics.model.model import Model
+from ctr_dynamics.robot import Robot
+
+FORCE = ("tip_force.x", "tip_force.y", "tip_force.z")
+
+# Tracker states: name and number of axes, in their order in the filter.
+BIASES = (("registration_rotation", 3), ("registration_translation", 3), ("lever_arm", 3), ("delay", 1), ("drift", 3))
+
+
+@dataclass(frozen=True)
+class ModelUncertainty:
+    """Parameters of the model that are uncertain.
+
+    Attributes:
+        names: (n_theta,) names; the last three are the tip force's axes.
+        sigma: (n_theta,) prior deviations; 0 for the tip force, which the filter drives itself.
+        effect: (NP, n_theta) derivative of the parameter block.
+    """
+
+    names: tuple[str, ...]
+    sigma: np.ndarray
+    effect: np.ndarray
+
+    @property
+    def force(self) -> slice:
+        """Rows of the tip force among the parameters."""
+        return slice(len(self.names) - 3, len(self.names))
+
+
+def model_uncertainty(model: Model) -> ModelUncertainty:
+    """Uncertain parameters of ``model`` from its robot file's tolerances; those with tolerance 0 are left out."""
+    robot: Robot = model.robot
+    layout, nominal, n = model.layout, model.parameters, model.n
+    names: list[str] = []
+    sigma: list[float] = []
+    effect: list[np.ndarray] = []
+
+    def add(name: str, deviation: float, column: np.ndarray) -> None:
+        if deviation > 0.0 and np.any(column):
+            names.append(name)
+            sigma.append(deviation)
+            effect.append(column)
+
+    def scaled(*groups: tuple[str, int]) -> np.ndarray:
+        column = np.zeros(layout.size)
+        for group, tube in groups:
+            row = layout[group].start + tube
+            column[row] = nominal[row]
+        return column
+
+    for i, tube in enumerate(robot.tubes):
+        stiffness = [("bending_stiffness", i)]
+        if tube.shear_follows_youngs:
+            stiffness.append(("torsional_stiffness", i))
+        add(f"youngs_modulus.tube{i + 1}", tube.youngs_modulus.relative, scaled(*stiffness))
+        if not tube.shear_follows_youngs:
+            add(f"shear_modulus.tube{i + 1}", tube.shear.relative, scaled(("torsional_stiffness", i)))
+        if any(np.any(segment.coefficients) for segment in tube.precurvature):
+            add(f"precurvature.tube{i + 1}", tube.precurvature_tolerance, scaled(("precurvature", i)))
+        if tube.end_body:
+            column = np.zeros(layout.size)
+            column[layout["body_mass"].start + i] = 1.0
+            add(f"payload_mass.tube{i + 1}", tube.end_body.mass.tolerance, column)
+    # densities of one alloy vary together: one scale for all tubes
+    groups = [(group, i) for i in range(n) for group in ("mass_per_length", "inertia_per_length")]
+    add("density", max(tube.density.relative for tube in robot.tubes), scaled(*groups))
+    for name, quantity in (
+        ("base_coulomb", robot.friction.base.coulomb),
+        ("base_viscous", robot.friction.base.viscous),
+        ("tube_coulomb", robot.friction.tubes.coulomb),
+        ("tube_viscous", robot.friction.tubes.viscous),
+    ):
+        add(name, quantity.relative, scaled((name, 0)))
+    g = np.array(robot.gravity.value)
+    if np.any(g):
+        across = np.linalg.svd(g[None] / np.linalg.norm(g))[2][1:]
+        for axis, direction in zip("12", across, strict=True):
+            column = np.zeros(layout.size)
+            column[layout["gravity"]] = np.cross(direction, g)
+            add(f"gravity_direction.{axis}", robot.gravity.direction_tolerance, column)
+    for i in range(n):
+        column = np.zeros(layout.size)
+        column[layout["alpha"].start + i] = 1.0
+        add(f"encoder_offset.tube{i + 1}", robot.encoders.offset.tolerance, column)
+    for axis, name in enumerate(FORCE):
+        column = np.zeros(layout.size)
+        column[layout["force"].start + axis] = 1.0
+        names.append(name)
+        sigma.append(0.0)
+        effect.append(column)
+    return ModelUncertainty(tuple(names), np.array(sigma), np.array(effect).T)
+
+
+def bias_sigma(robot: Robot) -> np.ndarray:
+    """(13,) prior deviations of the tracker states in the order of ``BIASES``."""
+    tracker = robot.tracker
+    return np.concatenate(
+        [
+            np.full(3, np.max(tracker.registration_rotation.tolerance)),
+            np.full(3, np.max(tracker.registration_translation.tolerance)),
+            np.full(3, np.max(tracker.lever_arm.tolerance)),
+            [tracker.delay.tolerance],
+            np.full(3, tracker.noise.drift.value),
+        ]
+    )
+
+
+__all__ = ["BIASES", "FORCE", "Layout", "ModelUncertainty", "bias_sigma", "model_uncertainty"]

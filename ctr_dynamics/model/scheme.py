@@ -1,0 +1,93 @@
+"""Time schemes. Each is a list of implicit stages y_t = c0 y + h with h a weighted sum of stored fields, so that one solver serves all.
+
+BDF-alpha and its named members follow (15) and Celaya and Jos (2013); a stage of a singly diagonally implicit Runge-Kutta (SDIRK) scheme has
+the same form with c0 = 1 / (a_ii dt). Runge-Kutta schemes here are stiffly accurate: the last stage is the step's result.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from ctr_dynamics.errors import InputError
+
+Y_NOW, Y_BEFORE, RATE_NOW, RATES = 0, 1, 2, 3  # slots of stored fields; stage rates follow from RATES
+
+
+@dataclass(frozen=True)
+class Scheme:
+    """Coefficients for one step size.
+
+    Attributes:
+        name: as in the parameter table.
+        dt: s.
+        times: (stages,) stage times as fractions of the step.
+        c0: (stages,) 1/s.
+        weights: (stages, 3 + stages) of the stored fields y_{n}, y_{n-1}, y_t of step n, and the rates of the earlier stages, in h.
+        one_step: whether the step needs y_n only, so that its size may change freely.
+        order: of accuracy in time for smooth motions.
+    """
+
+    name: str
+    dt: float
+    times: np.ndarray
+    c0: np.ndarray
+    weights: np.ndarray
+    one_step: bool
+    order: int
+
+    @property
+    def stages(self) -> int:
+        """Number of implicit solves a step."""
+        return len(self.c0)
+
+
+def _bdf_alpha(name: str, dt: float, alpha: float, order: int) -> Scheme:
+    c0 = (1.5 + alpha) / ((1.0 + alpha) * dt)
+    c1, c2, d1 = -2.0 / dt, (0.5 + alpha) / ((1.0 + alpha) * dt), alpha / (1.0 + alpha)
+    # h_i = (c1 + d1 c0) y_{i-1} + c2 y_{i-2} + d1 h_{i-1}, and h_{i-1} = y_t,{i-1} - c0 y_{i-1}
+    weights = np.array([[c1, c2, d1, 0.0]])
+    return Scheme(name, dt, np.ones(1), np.array([c0]), weights, False, order)
+
+
+def _sdirk(name: str, dt: float, a: np.ndarray, order: int) -> Scheme:
+    s = len(a)
+    c0 = 1.0 / (np.diag(a) * dt)
+    weights = np.zeros((s, RATES + s))
+    weights[:, Y_NOW] = -c0
+    for i in range(s):
+        weights[i, RATES : RATES + i] = -c0[i] * dt * a[i, :i]
+    return Scheme(name, dt, a.sum(axis=1), c0, weights, True, order)
+
+
+def make_scheme(name: str, dt: float, alpha: float = -0.45) -> Scheme:
+    """The scheme ``name`` for step ``dt`` (s); ``alpha`` is read by ``bdf_alpha`` only.
+
+    Raises:
+        InputError: unknown name, dt not positive, or alpha outside [-0.5, 1].
+    """
+    if not (math.isfinite(dt) and dt > 0):
+        raise InputError(f"time step {dt} s must be above 0 s", do="give a step in seconds, such as 0.003")
+    if name == "backward_euler":
+        return Scheme(name, dt, np.ones(1), np.array([1 / dt]), np.array([[-1 / dt, 0.0, 0.0, 0.0]]), True, 1)
+    if name == "bdf2":
+        return _bdf_alpha(name, dt, 0.0, 2)
+    if name == "trapezoid":
+        return _bdf_alpha(name, dt, -0.5, 2)
+    if name == "bdf_alpha":
+        if not -0.5 <= alpha <= 1.0:
+            raise InputError(f"model.alpha {alpha:g} is outside [-0.5, 1]", do="-0.5 is the trapezoidal rule, 0 is BDF2")
+        return _bdf_alpha(name, dt, alpha, 2)
+    if name == "sdirk2":
+        g = 1.0 - math.sqrt(0.5)
+        return _sdirk(name, dt, np.array([[g, 0.0], [1.0 - g, g]]), 2)
+    if name == "sdirk3":
+        # Alexander (1977): three stages, third order, L-stable; g is the root of g^3 - 3 g^2 + 3 g / 2 - 1/6 in (1/6, 1/2).
+        g = 0.43586652150845899942
+        b1, b2 = -1.5 * g * g + 4.0 * g - 0.25, 1.5 * g * g - 5.0 * g + 1.25
+        return _sdirk(name, dt, np.array([[g, 0.0, 0.0], [0.5 * (1.0 - g), g, 0.0], [b1, b2, g]]), 3)
+    raise InputError(
+        f"time scheme '{name}' is not known", do="use backward_euler, bdf2, trapezoid, bdf_alpha, sdirk2 or sdirk3"
+    )

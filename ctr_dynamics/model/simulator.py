@@ -1,0 +1,265 @@
+"""The dynamic model in time: start at rest, step, follow moving actuators, recover from hard steps."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from ctr_dynamics.errors import InputError
+from ctr_dynamics.model.mesh import Mesh, node_positions, point_positions, section_key
+from ctr_dynamics.model.model import Model
+from ctr_dynamics.model.newton import CONVERGED, NOT_FINITE
+from ctr_dynamics.model.scheme import RATES, Y_BEFORE, Y_NOW, Scheme, make_scheme
+from ctr_dynamics.model.statics import Statics
+from ctr_dynamics.model.step import step
+
+OUTCOMES = {
+    CONVERGED: "ok",
+    1: "the shooting did not converge",
+    NOT_FINITE: "the shooting left the range of finite numbers",
+}
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """Actuators and tip wrench at one time: alpha (N,) rad, alpha_rate (N,) rad/s, beta (N,) m, beta_rate (N,) m/s, wrench in ``ctr_base``."""
+
+    alpha: np.ndarray
+    alpha_rate: np.ndarray
+    beta: np.ndarray
+    beta_rate: np.ndarray
+    force: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    torque: np.ndarray = field(default_factory=lambda: np.zeros(3))
+
+
+InputsAt = Callable[[float], Inputs]
+
+
+@dataclass(frozen=True)
+class StepResult:
+    """What a step did. ``ok`` False leaves the state as it was; ``reason`` says why."""
+
+    ok: bool
+    reason: str
+    iterations: int
+    sweeps: int
+    jacobians: int
+    substeps: int = 1
+    records: tuple[Record, ...] = ()
+
+
+@dataclass(frozen=True)
+class Record:
+    """What :func:`ctr_dynamics.model.tangent.step_tangent` needs of one solved step."""
+
+    scheme: Scheme
+    key: tuple
+    mesh: Mesh
+    before: np.ndarray
+    rates: np.ndarray
+    inputs: np.ndarray
+    found: np.ndarray
+
+
+@dataclass
+class State:
+    """Everything that lives between steps; :meth:`copy` makes an independent one."""
+
+    key: tuple
+    mesh: Mesh
+    bank: np.ndarray
+    unknowns: np.ndarray
+    earlier: np.ndarray
+    inverse: np.ndarray
+    usable: bool
+    nodes: np.ndarray
+    inputs: Inputs
+
+    def copy(self) -> State:
+        """An independent copy; meshes are shared, they are never written."""
+        return State(
+            self.key, self.mesh, self.bank.copy(), self.unknowns.copy(), self.earlier.copy(), self.inverse.copy(), self.usable,
+            self.nodes.copy(), self.inputs,
+        )  # fmt: skip
+
+    @property
+    def fields(self) -> np.ndarray:
+        """(fields,) q, omega, u, gamma at every point: the state of the PDE. A view: writing changes the state."""
+        return self.bank[Y_NOW]
+
+
+class Simulator:
+    """Forward simulation of one model.
+
+    Args:
+        model: the robot.
+        scheme: time scheme with its step.
+        tolerance: largest scaled imbalance at the tip.
+        parameters: (NP,) block instead of the robot file's; written to freely by its owner between steps.
+    """
+
+    def __init__(
+        self, model: Model, scheme: Scheme | None = None, tolerance: float = 1e-7, parameters: np.ndarray | None = None
+    ) -> None:
+        self.model = model
+        self.scheme = scheme or make_scheme("sdirk3", 0.003)
+        self.tolerance = tolerance
+        self.parameters = (model.parameters if parameters is None else parameters).copy()
+        self.limit = 40
+        self._buffers: dict[tuple, tuple] = {}
+
+    def rest(self, inputs: Inputs, guess: np.ndarray | None = None) -> State:
+        """State at rest in the static equilibrium at ``inputs``.
+
+        Raises:
+            InputError: there is no equilibrium that the continuation reaches, or the actuators are out of range.
+        """
+        equilibrium = Statics(self.model).solve(
+            inputs.beta, inputs.alpha, inputs.force, inputs.torque, guess=guess, parameters=self.parameters
+        )
+        if not equilibrium.converged:
+            raise InputError(
+                f"no static equilibrium found at beta {np.round(inputs.beta, 4)} m, alpha {np.round(inputs.alpha, 3)} rad",
+                do="check the robot file, the joints and the load",
+            )
+        stages = self.scheme.stages
+        bank = np.zeros((RATES + stages, len(equilibrium.fields)))
+        bank[Y_NOW] = bank[Y_BEFORE] = equilibrium.fields
+        m = 5 + self.model.n
+        unknowns = np.tile(equilibrium.x, (stages, 1))
+        return State(
+            equilibrium.key, equilibrium.mesh, bank, unknowns, unknowns.copy(), np.zeros((m, m)), False, equilibrium.nodes, inputs
+        )
+
+    def step(self, state: State, t: float, inputs_at: InputsAt, *, record: bool = False) -> StepResult:
+        """Advance ``state`` from t to t + dt (s) in place; ``inputs_at`` gives actuators and load at any time in between.
+
+        A step that fails is tried again with a fresh Jacobian and, for one-step schemes, in up to 32 substeps. With ``record`` the result
+        carries what the tangent of the step needs.
+        """
+        result = self._attempt(state, self.scheme, t, inputs_at, not state.usable, record)
+        if result.ok:
+            return result
+        totals = [result.iterations, result.sweeps, result.jacobians]
+        halvings = range(0, 6) if self.scheme.one_step else range(1)
+        for halving in halvings:
+            trial = state.copy()
+            trial.unknowns[:] = trial.unknowns[-1]
+            trial.earlier[:] = trial.unknowns
+            count = 2**halving
+            scheme = make_scheme(self.scheme.name, self.scheme.dt / count) if count > 1 else self.scheme
+            records: list[Record] = []
+            for part in range(count):
+                result = self._attempt(trial, scheme, t + part * scheme.dt, inputs_at, True, record)
+                records.extend(result.records)
+                for i, value in enumerate((result.iterations, result.sweeps, result.jacobians)):
+                    totals[i] += value
+                if not result.ok:
+                    break
+            if result.ok:
+                for name in ("key", "mesh", "bank", "unknowns", "earlier", "inverse", "nodes", "inputs"):
+                    setattr(state, name, getattr(trial, name))
+                state.usable = False
+                return StepResult(True, f"{count} substeps" if count > 1 else "fresh start", *totals, count, tuple(records))
+        return StepResult(False, result.reason, *totals)
+
+    def _attempt(self, state: State, scheme: Scheme, t: float, inputs_at: InputsAt, fresh: bool, record: bool) -> StepResult:
+        n, stages = self.model.n, scheme.stages
+        at_stages = [inputs_at(t + c * scheme.dt) for c in scheme.times]
+        last = at_stages[-1]
+        try:
+            if section_key(self.model.segments, last.beta) != state.key:
+                remap(self.model, state, last.beta)
+                fresh = True
+        except InputError as error:
+            return StepResult(False, str(error), 0, 0, 0)
+        inputs = np.empty((stages, 3 * n + 6))
+        for i, now in enumerate(at_stages):
+            inputs[i, :n], inputs[i, n : 2 * n], inputs[i, 2 * n : 3 * n] = now.alpha, now.alpha_rate, now.beta
+            inputs[i, 3 * n : 3 * n + 3], inputs[i, 3 * n + 3 :] = now.force, now.torque
+        small, big = self._work(state.key, state.mesh)
+        guess = 2.0 * state.unknowns - state.earlier
+        before = state.bank[:RATES].copy() if record else state.bank
+        found = np.empty_like(guess)
+        outcome, iterations, sweeps, jacobians = step(
+            self.model.tubes, self.model.lane, self.model.jacobian_lanes, state.mesh, scheme.c0, scheme.weights, self.parameters,
+            inputs, state.bank, guess, found, state.inverse, fresh, small, big, self.model.scale, self.model.step,
+            self.tolerance, self.limit,
+        )  # fmt: skip
+        state.usable = outcome == CONVERGED
+        if outcome != CONVERGED:
+            return StepResult(False, OUTCOMES[outcome], iterations, sweeps, jacobians)
+        state.earlier, state.unknowns = state.unknowns, found
+        state.nodes = small[6].reshape(-1, 16 + 3 * n).copy()
+        state.inputs = last
+        records: tuple[Record, ...] = ()
+        if record:
+            rates = state.bank[RATES : RATES + stages].copy()
+            records = (Record(scheme, state.key, state.mesh, before, rates, inputs, found.copy()),)
+        return StepResult(True, "ok", iterations, sweeps, jacobians, records=records)
+
+    def _work(self, key: tuple, mesh: Mesh) -> tuple:
+        if key not in self._buffers:
+            W, _, seclen, _, hist, histb, out, outb, nodes, res = self.model.buffers(mesh, 1)
+            lanes = 8 * len(self.model.jacobian_lanes)
+            self._buffers[key] = ((W, seclen, hist, histb, out, outb, nodes, res), self.model.buffers(mesh, lanes))
+        return self._buffers[key]
+
+    def node_positions(self, state: State) -> np.ndarray:
+        """Arc length (m) of the rows of ``state.nodes``."""
+        return node_positions(state.mesh, state.inputs.beta)
+
+
+def remap(model: Model, state: State, beta: np.ndarray) -> None:
+    """Carry the stored fields over to the sections at ``beta`` (N,) m: by cubic interpolation inside each old section, never across one.
+
+    Raises:
+        InputError: a tube would end behind the plate or beyond an inner one.
+    """
+    key, mesh = model.mesh(beta)
+    state.bank = remap_fields(model.n, state.bank, state.mesh, state.inputs.beta, mesh, beta)
+    state.key, state.mesh = key, mesh
+
+
+def remap_fields(
+    n: int, bank: np.ndarray, old: Mesh, old_beta: np.ndarray, new: Mesh, new_beta: np.ndarray
+) -> np.ndarray:
+    """Fields (rows, fields) of the sections ``old`` at ``old_beta`` as fields of the sections ``new`` at ``new_beta``."""
+    old_s, old_section = point_positions(old, old_beta)
+    new_s, new_section = point_positions(new, new_beta)
+    F = 7 + 2 * n
+    main = len(old_s) * F
+    ends = [old_s[old_section == k][-1] for k in range(len(old.sec_cells))]
+    tip_old, tip_new = old_s[-1], new_s[-1]
+    result = np.zeros((len(bank), len(new_s) * F + bank.shape[1] - main))
+    result[:, len(new_s) * F :] = bank[:, main:]
+    fields = bank[:, :main].reshape(len(bank), -1, F)
+    target = result[:, : len(new_s) * F].reshape(len(bank), -1, F)
+    for k in range(len(new.sec_cells)):
+        where = np.flatnonzero(new_section == k)
+        s = new_s[where] * tip_old / tip_new
+        middle = 0.5 * (s[0] + s[-1])
+        source = next((j for j, end in enumerate(ends) if middle <= end + 1e-12), len(ends) - 1)
+        points = np.flatnonzero(old_section == source)
+        # stage points at a cell's start, its two middles and its end: the distinct abscissae are starts, middles and the last end
+        distinct = np.concatenate([points[i:-1:4] for i in (0, 1)] + [points[-1:]])
+        distinct = distinct[np.argsort(old_s[distinct], kind="stable")]
+        target[:, where] = _interpolate(old_s[distinct], fields[:, distinct], s)
+    return result
+
+
+def _interpolate(x: np.ndarray, values: np.ndarray, at: np.ndarray) -> np.ndarray:
+    """Piecewise quadratic Lagrange interpolation of values (slots, points, F) at ``at``, held outside the range of ``x``."""
+    if x[-1] - x[0] < 1e-12 or len(x) < 3:
+        return np.repeat(values[:, -1:], len(at), axis=1)
+    at = np.clip(at, x[0], x[-1])
+    left = np.clip(2 * ((np.searchsorted(x, at, side="right") - 1) // 2), 0, len(x) - 3)
+    x0, x1, x2 = x[left], x[left + 1], x[left + 2]
+    w0 = (at - x1) * (at - x2) / ((x0 - x1) * (x0 - x2))
+    w1 = (at - x0) * (at - x2) / ((x1 - x0) * (x1 - x2))
+    w2 = (at - x0) * (at - x1) / ((x2 - x0) * (x2 - x1))
+    return (
+        w0[:, None] * values[:, left] + w1[:, None] * values[:, left + 1] + w2[:, None] * values[:, left + 2]
+    )

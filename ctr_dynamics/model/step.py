@@ -1,0 +1,79 @@
+"""One time step: every implicit stage solved by shooting, then the stored fields moved on."""
+
+import numpy as np
+from numba import njit
+
+from ctr_dynamics.model.mesh import section_lengths
+from ctr_dynamics.model.newton import CONVERGED, solve
+from ctr_dynamics.model.scheme import RATE_NOW, RATES, Y_BEFORE, Y_NOW
+
+
+@njit(cache=True, nogil=True)
+def history(weights, bank, hist, histb):
+    """h = sum of weights (slots,) times the stored fields ``bank`` (slots, fields), into the main and the base part."""
+    main = len(hist)
+    for i in range(main):
+        hist[i] = 0.0
+    for i in range(len(histb)):
+        histb[i] = 0.0
+    for slot in range(len(weights)):
+        w = weights[slot]
+        if w != 0.0:
+            row = bank[slot]
+            for i in range(main):
+                hist[i] += w * row[i]
+            for i in range(len(histb)):
+                histb[i] += w * row[main + i]
+
+
+@njit(cache=True, nogil=True)
+def step(tubes, lane, lanes, mesh, c0, weights, par, inputs, bank, guess, found, inverse, fresh, small, big, scale, perturb,
+         tolerance, limit):  # fmt: skip
+    """Advance the stored fields ``bank`` by one step.
+
+    ``inputs`` (stages, 3N + 6): alpha, alpha rate, beta of every tube, tip force and torque, at the stage times. ``guess`` and ``found``
+    (stages, 5 + N): unknowns to start from and those found. On failure ``bank`` is as it was before the step.
+    Returns (outcome, iterations, plain sweeps, Jacobian sweeps).
+    """
+    n = len(tubes)
+    stages = len(c0)
+    W, seclen, hist, histb, out, outb, nodes, res = small
+    x = np.empty(5 + n)
+    iterations, sweeps, jacobians = 0, 0, 0
+    base = 14 * n
+    for stage in range(stages):
+        history(weights[stage], bank, hist, histb)
+        for i in range(3 * n):
+            par[11 * n + i] = inputs[stage, i]
+        for i in range(6):
+            par[base + 3 + i] = inputs[stage, 3 * n + i]
+        section_lengths(mesh.bp_tube, mesh.bp_offset, par[13 * n : 14 * n], seclen)
+        for i in range(5 + n):
+            x[i] = guess[stage, i]
+        outcome, its, plain, jacs = solve(
+            tubes, lane, lanes, mesh, c0[stage], par, seclen, x, hist, histb, (W, out, outb, nodes, res), big, scale, perturb,
+            inverse, fresh, tolerance, limit,
+        )  # fmt: skip
+        fresh = False
+        iterations += its
+        sweeps += plain
+        jacobians += jacs
+        if outcome != CONVERGED:
+            return outcome, iterations, sweeps, jacobians
+        rate = bank[RATES + stage]
+        main = len(hist)
+        for i in range(main):
+            rate[i] = c0[stage] * out[i] + hist[i]
+        for i in range(len(histb)):
+            rate[main + i] = c0[stage] * outb[i] + histb[i]
+        for i in range(5 + n):
+            found[stage, i] = x[i]
+    main = len(hist)
+    for i in range(main + len(histb)):
+        bank[Y_BEFORE, i] = bank[Y_NOW, i]
+        bank[RATE_NOW, i] = bank[RATES + stages - 1, i]
+    for i in range(main):
+        bank[Y_NOW, i] = out[i]
+    for i in range(len(histb)):
+        bank[Y_NOW, main + i] = outb[i]
+    return CONVERGED, iterations, sweeps, jacobians

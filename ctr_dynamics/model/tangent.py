@@ -1,0 +1,140 @@
+"""Tangent of a step: how fields, tip and nodes after it depend on fields and parameters before it, for many columns at once.
+
+Every stage is linearised where it was solved. One sweep carries the base case, one lane for each unknown and one for each column; the lanes of
+the unknowns give the Jacobian of the shooting problem, through which every column's boundary values follow (implicit function theorem).
+"""
+
+import numpy as np
+from numba import njit
+
+from ctr_dynamics.model.kernels import lane_count, sweep
+from ctr_dynamics.model.mesh import section_lengths
+from ctr_dynamics.model.newton import broadcast, invert
+from ctr_dynamics.model.scheme import RATE_NOW, RATES, Y_BEFORE, Y_NOW
+from ctr_dynamics.model.step import history
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _combine(lanes, values, rows, m, columns, scale, perturb, dx, target):
+    """d(values)/d(column) with the boundary values following: target (rows, columns) from perturbed lanes of ``values`` (rows, L)."""
+    L = lane_count(lanes)
+    for r in range(rows):
+        base = values[r * L]
+        for k in range(columns):
+            target[r, k] = (values[r * L + 1 + m + k] - base) * scale
+        for i in range(m):
+            slope = (values[r * L + 1 + i] - base) / perturb[i]
+            for k in range(columns):
+                target[r, k] += slope * dx[i, k]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def linearise(tubes, lanes, mesh, c0, par, dpar, x, hist, histb, dhist, epsilon, perturb, big, inverse, dx, dfields, dnodes):
+    """Linearise one solved two-point problem.
+
+    ``par`` (NP,) and ``x`` (m,): where it was solved, with ``hist``, ``histb``. ``dpar`` (NP, r), ``dhist`` (fields, r): columns of perturbations
+    in units in which a step of ``epsilon`` is small. Writes ``dx`` (m, r), ``dfields`` (fields, r), ``dnodes`` (nodes * S, r) and the inverse
+    shooting Jacobian ``inverse`` (m, m). False if that is singular or anything is not finite.
+    """
+    n = len(tubes)
+    L = lane_count(lanes)
+    m = 5 + n
+    columns = dpar.shape[1]
+    W, parL, seclenL, xL, histL, histbL, outL, outbL, nodesL, resL = big
+    broadcast(lanes, par, parL)
+    broadcast(lanes, x, xL)
+    broadcast(lanes, hist, histL)
+    broadcast(lanes, histb, histbL)
+    for i in range(m):
+        xL[i * L + 1 + i] += perturb[i]
+    for r in range(len(par)):
+        for k in range(columns):
+            parL[r * L + 1 + m + k] += epsilon * dpar[r, k]
+    main = len(hist)
+    for r in range(main):
+        for k in range(columns):
+            histL[r * L + 1 + m + k] += epsilon * dhist[r, k]
+    for r in range(len(histb)):
+        for k in range(columns):
+            histbL[r * L + 1 + m + k] += epsilon * dhist[main + r, k]
+    sections = len(mesh.sec_cells)
+    beta = np.empty(n)
+    lengths = np.empty(sections)
+    for j in range(L):
+        for i in range(n):
+            beta[i] = parL[(13 * n + i) * L + j]
+        section_lengths(mesh.bp_tube, mesh.bp_offset, beta, lengths)
+        for k in range(sections):
+            seclenL[k * L + j] = lengths[k]
+    sweep(tubes, lanes, W, c0, mesh.sec_cells, mesh.sec_tubes, mesh.ust, mesh.ust0, mesh.ust_base, mesh.base_cells,
+          parL, seclenL, xL, histL, histbL, outL, outbL, nodesL, resL)  # fmt: skip
+    jacobian = np.empty((m, m))
+    for i in range(m):
+        for k in range(m):
+            jacobian[i, k] = (resL[i * L + 1 + k] - resL[i * L]) / perturb[k]
+            if not np.isfinite(jacobian[i, k]):
+                return False
+    if not invert(jacobian, inverse):
+        return False
+    for i in range(m):
+        for k in range(columns):
+            dx[i, k] = 0.0
+    for q in range(m):
+        for k in range(columns):
+            slope = (resL[q * L + 1 + m + k] - resL[q * L]) / epsilon
+            if not np.isfinite(slope):
+                return False
+            for i in range(m):
+                dx[i, k] -= inverse[i, q] * slope
+    _combine(lanes, outL, main, m, columns, 1.0 / epsilon, perturb, dx, dfields)
+    _combine(lanes, outbL, len(histb), m, columns, 1.0 / epsilon, perturb, dx, dfields[main:])
+    _combine(lanes, nodesL, dnodes.shape[0], m, columns, 1.0 / epsilon, perturb, dx, dnodes)
+    return True
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def step_tangent(tubes, lanes, mesh, c0, weights, par, inputs, found, before, rates, dpar, epsilon, perturb, big, work, dbank,
+                 inverse, dx, dnodes):  # fmt: skip
+    """Tangent of a whole step.
+
+    ``before`` (slots, fields): stored fields before the step; ``rates`` (stages, fields): the stages' rates; ``found`` (stages, m): their
+    unknowns; ``inputs`` as in :func:`ctr_dynamics.model.step.step`. ``dbank`` (3 + stages, fields, r): columns of the stored fields, advanced
+    in place like the fields themselves. ``work`` = (hist, histb, dhist (fields, r)). Returns False where a stage cannot be linearised.
+    """
+    n = len(tubes)
+    stages = len(c0)
+    hist, histb, dhist = work
+    slots, fields, columns = dbank.shape
+    bank = np.empty((slots, fields))
+    for i in range(fields):
+        for slot in range(RATES):
+            bank[slot, i] = before[slot, i]
+        for stage in range(stages):
+            bank[RATES + stage, i] = rates[stage, i]
+    base = 14 * n
+    dfields = np.empty((fields, columns))
+    for stage in range(stages):
+        history(weights[stage], bank, hist, histb)
+        dhist[:] = 0.0
+        for slot in range(RATES + stage):
+            w = weights[stage, slot]
+            if w != 0.0:
+                for i in range(fields):
+                    for k in range(columns):
+                        dhist[i, k] += w * dbank[slot, i, k]
+        for i in range(3 * n):
+            par[11 * n + i] = inputs[stage, i]
+        for i in range(6):
+            par[base + 3 + i] = inputs[stage, 3 * n + i]
+        if not linearise(tubes, lanes, mesh, c0[stage], par, dpar, found[stage], hist, histb, dhist, epsilon, perturb, big, inverse,
+                         dx, dfields, dnodes):  # fmt: skip
+            return False
+        for i in range(fields):
+            for k in range(columns):
+                dbank[RATES + stage, i, k] = c0[stage] * dfields[i, k] + dhist[i, k]
+    for i in range(fields):
+        for k in range(columns):
+            dbank[Y_BEFORE, i, k] = dbank[Y_NOW, i, k]
+            dbank[RATE_NOW, i, k] = dbank[RATES + stages - 1, i, k]
+            dbank[Y_NOW, i, k] = dfields[i, k]
+    return True
