@@ -37,11 +37,11 @@ PARAMETERS: tuple[Parameter, ...] = (
     Parameter("model.dt_s", "float", 0.003, "s", "Step of the output grid.", 0.003, 0.003, read_only=True),
     Parameter("model.nodes", "int", 24, "", "Arc-length nodes in all.", 8, 1000, read_only=True),
     Parameter(
-        "model.tolerance", "float", 1e-9, "", "Scaled residual at which the shooting ends.", 1e-13, 1e-4
+        "model.tolerance", "float", 1e-6, "", "Scaled residual at which the shooting ends.", 1e-13, 1e-4
     ),
     Parameter("filter.enabled", "bool", True, "", "Fuse the tracker; false runs the model alone."),
     Parameter(
-        "filter.rank", "int", 16, "", "Columns of the covariance's square root.", 4, 40, read_only=True
+        "filter.rank", "int", 24, "", "Columns of the covariance's square root.", 4, 40, read_only=True
     ),
     Parameter(
         "filter.gate_probability",
@@ -55,16 +55,34 @@ PARAMETERS: tuple[Parameter, ...] = (
     Parameter(
         "filter.tip_force_sigma_N",
         "float",
-        0.02,
+        0.001,
         "N",
-        "Deviation per axis of the unknown tip force.",
+        "Least deviation per axis of the unknown tip force.",
         0.0,
         10.0,
     ),
     Parameter(
-        "filter.tip_force_time_s",
+        "filter.tip_force_sigma_max_N",
         "float",
         0.2,
+        "N",
+        "Largest deviation to which unexpectedly large innovations raise that of the tip force.",
+        0.0,
+        10.0,
+    ),
+    Parameter(
+        "filter.adaptation",
+        "float",
+        0.1,
+        "",
+        "Rate of that raising: change of the deviation's logarithm per sample and unit of excess NIS; 0 fixes it.",
+        0.0,
+        1.0,
+    ),
+    Parameter(
+        "filter.tip_force_time_s",
+        "float",
+        0.3,
         "s",
         "Correlation time of the unknown tip force.",
         0.001,

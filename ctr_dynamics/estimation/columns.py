@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from ctr_dynamics.model.mesh import Mesh, section_lengths
 from ctr_dynamics.model.model import Model
 from ctr_dynamics.model.newton import lanes_for
-from ctr_dynamics.model.scheme import RATES, Y_NOW
+from ctr_dynamics.model.scheme import RATES, Y_NOW, Scheme
 from ctr_dynamics.model.simulator import Record, remap_fields
 from ctr_dynamics.model.tangent import linearise, step_tangent
 
@@ -62,16 +62,16 @@ class Columns:
     """V and its parts.
 
     Attributes:
-        dbank: (3 + stages, fields, r) columns of the stored fields; ``fields`` is the first slot.
+        stored: (slots, fields, r) columns of the stored fields: y_n, and for multi-step schemes y_{n-1} and the last rate.
         theta: (n_theta, r) parameter parts.
         dnodes: (nodes * S, r) columns of the node states after the last step.
         dx: (5 + N, r) columns of the unknowns after the last step.
     """
 
-    def __init__(self, model: Model, uncertainty: ModelUncertainty, rank: int, stages: int) -> None:
+    def __init__(self, model: Model, uncertainty: ModelUncertainty, rank: int, scheme: Scheme) -> None:
         self.model, self.uncertainty, self.rank = model, uncertainty, rank
-        self.stages = stages
-        self.lanes = lanes_for(6 + model.n + rank)
+        self.stages = scheme.stages
+        self.slots = 1 if scheme.one_step else RATES
         self._work: dict[tuple, tuple] = {}
         self._weights: dict[tuple, Floats] = {}
         self.key: tuple = ()
@@ -100,8 +100,8 @@ class Columns:
         wide = max(count, r)
         self.theta = np.zeros((count, wide))
         self.theta[:, :count] = np.diag(scale)
-        self.dbank = np.zeros((RATES + self.stages, main + base, wide))
-        self.dbank[:RATES - 1, :, :count] = fields
+        self.stored = np.zeros((self.slots, main + base, wide))
+        self.stored[: max(1, self.slots - 1), :, :count] = fields
         self.dnodes, self.dx = np.zeros((len(dnodes), wide)), np.zeros((m, wide))
         self.dnodes[:, :count], self.dx[:, :count] = dnodes, dx
         variance = np.zeros(wide)
@@ -111,15 +111,15 @@ class Columns:
     @property
     def fields(self) -> Floats:
         """(fields, r) columns of the fields."""
-        return self.dbank[Y_NOW]
+        return self.stored[Y_NOW]
 
     def _remap(self, record: Record, beta: Floats) -> None:
         """Carry the columns to another set of sections."""
         assert self.mesh is not None
-        slots, _, r = self.dbank.shape
-        rows = np.ascontiguousarray(self.dbank.transpose(0, 2, 1)).reshape(slots * r, -1)
+        slots, _, r = self.stored.shape
+        rows = np.ascontiguousarray(self.stored.transpose(0, 2, 1)).reshape(slots * r, -1)
         moved = remap_fields(self.model.n, rows, self.mesh, self.beta, record.mesh, beta)
-        self.dbank = np.ascontiguousarray(moved.reshape(slots, r, -1).transpose(0, 2, 1))
+        self.stored = np.ascontiguousarray(moved.reshape(slots, r, -1).transpose(0, 2, 1))
         self.key, self.mesh = record.key, record.mesh
 
     def propagate(self, records: tuple[Record, ...], par: Floats) -> bool:
@@ -142,16 +142,40 @@ class Columns:
                 self._work[work_key] = (
                     lanes, big, (np.zeros(main), np.zeros(base), np.zeros((main + base, columns))), np.zeros((m, m)),
                     np.zeros((m, columns)), np.zeros((len(big[8]) // L, columns)),
+                    np.zeros((RATES + self.stages, main + base, columns)),
                 )  # fmt: skip
-            lanes, big, work, inverse, dx, dnodes = self._work[work_key]
+            lanes, big, work, inverse, dx, dnodes, dbank = self._work[work_key]
+            dbank[: self.slots] = self.stored
             ok = step_tangent(
                 model.tubes, lanes, record.mesh, record.scheme.c0, record.scheme.weights, par.copy(), record.inputs, record.found,
-                record.before, record.rates, dpar, EPSILON, model.step, big, work, self.dbank, inverse, dx, dnodes,
+                record.before, record.rates, dpar, EPSILON, model.step, big, work, dbank, inverse, dx, dnodes,
             )  # fmt: skip
             if not ok:
                 return False
-            self.dx, self.dnodes, self.inverse = dx.copy(), dnodes.copy(), inverse.copy()
+            self.stored = dbank[: self.slots].copy()
+            self.dx, self.dnodes = dx.copy(), dnodes.copy()
         return True
+
+    def widen(self, count: int) -> None:
+        """Append ``count`` columns of zeros."""
+
+        def wide(array: Floats) -> Floats:
+            return np.concatenate([array, np.zeros((*array.shape[:-1], count))], axis=-1)
+
+        self.theta, self.stored, self.dnodes, self.dx = map(wide, (self.theta, self.stored, self.dnodes, self.dx))
+
+    def transform(self, T: Floats) -> None:
+        """Replace the columns V by V T."""
+        self.theta, self.stored, self.dnodes, self.dx = (x @ T for x in (self.theta, self.stored, self.dnodes, self.dx))
+
+    def snapshot(self) -> tuple:
+        """What :meth:`restore` needs; arrays are replaced by later steps, never written, so references do."""
+        return self.key, self.mesh, self.beta, self.theta.copy(), self.stored, self.dnodes, self.dx
+
+    def restore(self, snapshot: tuple) -> None:
+        """Go back to an earlier snapshot."""
+        self.key, self.mesh, self.beta, theta, self.stored, self.dnodes, self.dx = snapshot
+        self.theta = theta.copy()
 
     def weights(self) -> Floats:
         """Energy weights on the current sections."""

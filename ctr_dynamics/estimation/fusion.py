@@ -8,9 +8,7 @@ update of (a, b); (7) fields, parameters, kept tips and the shooting unknowns mo
 from __future__ import annotations
 
 import math
-from collections import deque
-from copy import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from filterpy.kalman import ExtendedKalmanFilter
@@ -21,8 +19,8 @@ from ctr_dynamics.model.model import Model
 from ctr_dynamics.model.simulator import Simulator, State, StepResult
 
 from .columns import Columns
-from .tip import Tip, between, tip_of
-from .tracker import DRIFT, STATES, TrackerModel, expected, registered, residual, sensitivity
+from .tip import TipWindow, tip_of
+from .tracker import DELAY, DRIFT, STATES, TrackerModel, expected, registered, residual, sensitivity
 from .uncertainty import bias_sigma, model_uncertainty
 
 Floats = NDArray[np.float64]
@@ -67,13 +65,14 @@ class Fusion:
         self.model: Model = simulator.model
         self.uncertainty = model_uncertainty(self.model)
         self.nominal = simulator.parameters.copy()
-        self.columns = Columns(self.model, self.uncertainty, options.rank, simulator.scheme.stages)
+        self.columns = Columns(self.model, self.uncertainty, options.rank, simulator.scheme)
         self.theta = np.zeros(len(self.uncertainty.names))
         self.bias = np.zeros(STATES)
-        self.tips: deque[Tip] = deque(maxlen=max(2, math.ceil(options.window / simulator.scheme.dt) + 2))
+        self.tips = TipWindow(math.ceil(options.window / simulator.scheme.dt) + 3)
         self.pi = np.zeros((0, 0))
         self.steps = 0
         self.force_sigma = options.force_sigma
+        self._gate = {dof: float(chi2.ppf(options.gate_probability, dof)) for dof in range(1, 7)}
 
     # -- start and prediction --
 
@@ -97,7 +96,8 @@ class Fusion:
             i = force.start + axis
             self.pi[i, i] = (self.options.force_sigma / size) ** 2
         self.steps = 0
-        self.tips.clear()
+        self.force_sigma = self.options.force_sigma
+        self.tips.clear(r)
         self._reduce()
         self._keep_tip(state, stamp)
 
@@ -139,15 +139,9 @@ class Fusion:
         c = self.columns
         r = c.theta.shape[1]
         wide = r + 3
-        size = self.force_sigma
-
-        def widen(array: Floats) -> Floats:
-            return np.concatenate([array, np.zeros((*array.shape[:-1], 3))], axis=-1)
-
-        c.theta, c.dbank, c.dnodes, c.dx = widen(c.theta), widen(c.dbank), widen(c.dnodes), widen(c.dx)
-        c.theta[self.uncertainty.force, r:] = size * np.eye(3)
-        for tip in self.tips:
-            tip.columns = widen(tip.columns)
+        c.widen(3)
+        self.tips.widen(3)
+        c.theta[self.uncertainty.force, r:] = self.force_sigma * np.eye(3)
         pi = np.zeros((wide + STATES, wide + STATES))
         keep = np.r_[0:r, wide : wide + STATES]
         pi[np.ix_(keep, keep)] = self.pi
@@ -181,14 +175,8 @@ class Fusion:
         pi[k:, :k] = pi[:k, k:].T
         pi[k:, k:] = self.pi[r:, r:]
         self.pi = pi
-        c.theta = c.theta @ T
-        slots = 2
-        dbank = np.zeros((*c.dbank.shape[:2], k))
-        dbank[:slots] = c.dbank[:slots] @ T
-        c.dbank = dbank
-        c.dnodes, c.dx = c.dnodes @ T, c.dx @ T
-        for tip in self.tips:
-            tip.columns = tip.columns @ T
+        c.transform(T)
+        self.tips.transform(T)
 
     def _apply_theta(self) -> None:
         """Write the estimated parameters and force into the simulator's block."""
@@ -203,24 +191,14 @@ class Fusion:
 
     def update(self, state: State, stamp: float, position: Floats, quaternion: Floats) -> Update:
         """Steps (4)-(7) with a reading of time stamp ``stamp`` (s): position (3,) m, quaternion (4,) wxyz, in the tracker's frame."""
-        time = stamp - self.tracker.delay - self.bias[9]
-        tip = self._tip_at(time)
-        if tip is None:
-            return Update(np.full(6, np.nan), np.full(6, np.nan), math.nan, 0, False, "outside the window of kept steps")
-        nu = residual(position, quaternion, *expected(self.tracker, self.bias, tip))
-        H = sensitivity(self.tracker, self.bias, tip)
-        mask = self.tracker.mask
-        nu, H, R = nu[mask], H[mask], np.diag(self.tracker.variance[mask])
-        S = H @ self.pi @ H.T + R
-        nis = float(nu @ np.linalg.solve(S, nu))
-        dof = int(mask.sum())
-        full, variance = np.full(6, np.nan), np.full(6, np.nan)
-        full[mask], variance[mask] = nu, np.diag(S)
-        if not math.isfinite(nis):
-            return Update(full, variance, nis, dof, False, "not finite")
-        self._adapt(nis / dof)
-        if nis > chi2.ppf(self.options.gate_probability, dof):
-            return Update(full, variance, nis, dof, False, "outside the gate")
+        innovation = self._innovation(stamp, position, quaternion)
+        if isinstance(innovation, Update):
+            return innovation
+        nu, H, R, compared = innovation
+        dof = compared.dof
+        self._adapt(compared.nis / dof)
+        if compared.nis > self._gate[dof]:
+            return replace(compared, reason="outside the gate")
         size = len(self.pi)
         ekf = ExtendedKalmanFilter(dim_x=size, dim_z=dof)
         ekf.P = self.pi
@@ -228,23 +206,42 @@ class Fusion:
         ekf.update(nu[:, None], HJacobian=lambda x: H, Hx=lambda x: np.zeros((dof, 1)))
         self.pi = 0.5 * (ekf.P + ekf.P.T)
         self._correct(state, ekf.x[:, 0])
-        return Update(full, variance, nis, dof, True, "")
+        return replace(compared, accepted=True)
+
+    def compare(self, stamp: float, position: Floats, quaternion: Floats) -> Update:
+        """The innovation of a reading that is not fused."""
+        innovation = self._innovation(stamp, position, quaternion)
+        return innovation if isinstance(innovation, Update) else replace(innovation[3], reason="fusion is off")
+
+    def _innovation(self, stamp: float, position: Floats, quaternion: Floats) -> Update | tuple[Floats, Floats, Floats, Update]:
+        """Step (4): masked innovation, H, R and its record; or the record alone where there is nothing to compare with."""
+        unknown = np.full(6, np.nan)
+        tip = self.tips.at(stamp - self.tracker.delay - self.bias[DELAY], self.simulator.scheme.dt)
+        if tip is None:
+            return Update(unknown, unknown, math.nan, 0, False, "outside the window of kept steps")
+        mask = self.tracker.mask
+        nu = residual(position, quaternion, *expected(self.tracker, self.bias, tip))[mask]
+        H = sensitivity(self.tracker, self.bias, tip)[mask]
+        R = np.diag(self.tracker.variance[mask])
+        S = H @ self.pi @ H.T + R
+        nis = float(nu @ np.linalg.solve(S, nu))
+        if not math.isfinite(nis):
+            return Update(unknown, unknown, math.nan, 0, False, "the innovation is not finite")
+        full, variance = unknown.copy(), unknown.copy()
+        full[mask], variance[mask] = nu, np.diag(S)
+        return nu, H, R, Update(full, variance, nis, int(mask.sum()), False, "")
+
+    def force_variance(self) -> Floats:
+        """(3,) variance of the estimated tip force, N^2."""
+        part = self.columns.theta[self.uncertainty.force]
+        r = part.shape[1]
+        return np.maximum(np.einsum("ij,jk,ik->i", part, self.pi[:r, :r], part), 0.0)
 
     def _adapt(self, ratio: float) -> None:
         """Raise the drive of the tip force while innovations are larger than predicted, lower it while they are smaller."""
         o = self.options
         size = self.force_sigma * math.exp(o.adaptation * (min(ratio, 10.0) - 1.0))
         self.force_sigma = min(max(size, o.force_sigma), o.force_sigma_max)
-
-    def _tip_at(self, time: float) -> Tip | None:
-        tips = self.tips
-        if not tips or time < tips[0].stamp - 1e-6 or time > tips[-1].stamp + self.simulator.scheme.dt:
-            return None
-        if len(tips) == 1:
-            return copy(tips[0])
-        i = int((time - tips[0].stamp) / self.simulator.scheme.dt)
-        i = min(max(i, 0), len(tips) - 2)
-        return between(tips[i], tips[i + 1], time)
 
     def _correct(self, state: State, x: Floats) -> None:
         """Step (7)."""
@@ -260,13 +257,28 @@ class Fusion:
         state.unknowns += shift
         state.earlier += shift
         state.nodes += (c.dnodes @ a).reshape(state.nodes.shape)
-        for tip in self.tips:
-            tip.shift(a)
+        self.tips.shift(a)
 
     # -- outputs --
 
     def tip_estimate(self) -> tuple[Floats, Floats, Floats, Floats]:
         """Fused tip now: position (3,) m, quaternion (4,) wxyz, twist (6,), covariance (12, 12) of pose and twist (base axes)."""
-        tip = self.tips[-1]
+        tip = self.tips.last
         position, quaternion, J = registered(self.tracker, self.bias, tip)
         return position, quaternion, np.concatenate([tip.velocity, tip.rate]), J @ self.pi @ J.T
+
+    # -- roll-back --
+
+    def snapshot(self) -> tuple:
+        """The filter's part of a state to which :meth:`restore` can return."""
+        return (
+            self.theta.copy(), self.bias.copy(), self.pi.copy(), self.steps, self.force_sigma, self.columns.snapshot(), self.tips.snapshot(),
+        )  # fmt: skip
+
+    def restore(self, snapshot: tuple) -> None:
+        """Return to a snapshot."""
+        theta, bias, pi, self.steps, self.force_sigma, columns, tips = snapshot
+        self.theta, self.bias, self.pi = theta.copy(), bias.copy(), pi.copy()
+        self.columns.restore(columns)
+        self.tips.restore(tips)
+        self._apply_theta()

@@ -28,14 +28,6 @@ class Tip:
     rate: Floats
     columns: Floats
 
-    def shift(self, a: Floats) -> None:
-        """Move the tip by the columns times ``a`` (r,)."""
-        d = self.columns @ a
-        self.position = self.position + d[0:3]
-        self.quaternion = multiply(from_vector(d[3:6]), self.quaternion)
-        self.velocity = self.velocity + d[6:9]
-        self.rate = self.rate + d[9:12]
-
 
 def tip_of(stamp: float, node: Floats, dnode: Floats, insertion_rate: float) -> Tip:
     """Tip from the last node's state (S,) and its columns (S, r); ``insertion_rate`` is d beta_1 / dt in m/s."""
@@ -77,3 +69,80 @@ def between(a: Tip, b: Tip, stamp: float) -> Tip:
         (1 - x) * a.rate + x * b.rate,
         columns,
     )
+
+
+class TipWindow:
+    """The tips of the last steps with their columns, so that a late sample is compared with the tip of its own time."""
+
+    def __init__(self, steps: int) -> None:
+        self.size = steps
+        self.clear(1)
+
+    def clear(self, columns: int) -> None:
+        """Forget all tips; further ones have ``columns`` columns."""
+        self.count = 0
+        self.stamps = np.zeros(self.size)
+        self.means = np.zeros((self.size, 13))  # position, quaternion, velocity, rate
+        self.columns = np.zeros((self.size, 12, columns))
+
+    def append(self, tip: Tip) -> None:
+        """Add the newest tip; the oldest one goes when the window is full."""
+        i = self.count % self.size
+        self.stamps[i] = tip.stamp
+        mean = self.means[i]
+        mean[0:3], mean[3:7], mean[7:10], mean[10:13] = tip.position, tip.quaternion, tip.velocity, tip.rate
+        self.columns[i] = tip.columns
+        self.count += 1
+
+    def _tip(self, number: int) -> Tip:
+        i = number % self.size
+        mean = self.means[i]
+        return Tip(self.stamps[i], mean[0:3], mean[3:7], mean[7:10], mean[10:13], self.columns[i])
+
+    @property
+    def last(self) -> Tip:
+        """The newest tip."""
+        return self._tip(self.count - 1)
+
+    def at(self, time: float, dt: float) -> Tip | None:
+        """Tip at ``time`` (s), at most one step ``dt`` ahead of the newest; None outside the window."""
+        if not self.count:
+            return None
+        first = max(0, self.count - self.size)
+        start = self.stamps[first % self.size]
+        if time < start - 1e-6 or time > self.last.stamp + dt:
+            return None
+        if self.count - first == 1:
+            return self.last
+        i = min(max(int((time - start) / dt), 0), self.count - first - 2) + first
+        return between(self._tip(i), self._tip(i + 1), time)
+
+    def transform(self, T: Floats) -> None:
+        """Replace all columns V by V T."""
+        self.columns = self.columns @ T
+
+    def widen(self, count: int) -> None:
+        """Append ``count`` columns of zeros: what enters now does not move the past."""
+        self.columns = np.concatenate([self.columns, np.zeros((*self.columns.shape[:2], count))], axis=2)
+
+    def shift(self, a: Floats) -> None:
+        """Move every kept tip by the columns times ``a`` (r,)."""
+        d = self.columns @ a
+        self.means[:, 0:3] += d[:, 0:3]
+        self.means[:, 7:13] += d[:, 6:12]
+        turn = d[:, 3:6]
+        w, v = self.means[:, 3:4], self.means[:, 4:7]
+        half = 0.5 * turn
+        scalar = np.sqrt(np.maximum(0.0, 1.0 - np.sum(half * half, axis=1, keepdims=True)))
+        new_w = scalar * w - np.sum(half * v, axis=1, keepdims=True)
+        new_v = scalar * v + w * half + np.cross(half, v)
+        self.means[:, 3:4], self.means[:, 4:7] = new_w, new_v
+
+    def snapshot(self) -> tuple:
+        """What :meth:`restore` needs."""
+        return self.count, self.stamps.copy(), self.means.copy(), self.columns.copy()
+
+    def restore(self, snapshot: tuple) -> None:
+        """Go back to an earlier snapshot."""
+        self.count = snapshot[0]
+        self.stamps, self.means, self.columns = (x.copy() for x in snapshot[1:])

@@ -2,7 +2,8 @@
 
 Every section keeps its own reference coordinate in [0, 1] with a fixed number of cells, so that fields are never interpolated across a
 jump of curvature while the actuators move; only the section lengths follow the translations. When a breakpoint passes another one
-or the base plate, the set of sections changes and :func:`remap` carries the fields over once.
+or the base plate, or a section has grown or shrunk so far that its cells no longer suit it, the set of sections changes and
+:func:`ctr_dynamics.model.simulator.remap_fields` carries the fields over once.
 """
 
 from __future__ import annotations
@@ -79,20 +80,38 @@ def breakpoints(tubes: Tubes, beta: np.ndarray) -> list[tuple[float, int, int]]:
     return sorted(points, key=lambda item: (item[0], -item[1]))
 
 
-def section_key(tubes: Tubes, beta: np.ndarray) -> tuple[tuple[int, int], ...]:
-    """The order of breakpoints: two actuator positions share a mesh exactly when this is equal."""
-    return tuple((i, j) for _, i, j in breakpoints(tubes, beta))
+Key = tuple[tuple[tuple[int, int], ...], tuple[int, ...]]  # order of breakpoints as (tube, segment), cells of each section
 
 
-def build_mesh(tubes: Tubes, beta: np.ndarray, nodes: int, base_cells: int = 4) -> Mesh:
-    """Sections for the actuator translations ``beta`` (N,) m with about ``nodes`` nodes from plate to tip."""
+def section_key(tubes: Tubes, beta: np.ndarray, nodes: int) -> Key:
+    """Order of the breakpoints and cells of the sections between them, for about ``nodes`` nodes from plate to tip."""
+    points = breakpoints(tubes, beta)
+    lengths = np.diff([0.0] + [s for s, _, _ in points])
+    cells = np.maximum(1, np.round((nodes - 1) * lengths / points[-1][0])).astype(int)
+    return tuple((i, j) for _, i, j in points), tuple(cells.tolist())
+
+
+def fits(key: Key, tubes: Tubes, beta: np.ndarray, nodes: int) -> bool:
+    """Whether the sections ``key`` still serve at ``beta``: same order of breakpoints, and no section with far too few or too many cells.
+
+    The bounds lie well outside the rounding of :func:`section_key`, so that a robot at a bound does not change its mesh to and fro.
+    """
+    points = breakpoints(tubes, beta)
+    order, cells = key
+    if order != tuple((i, j) for _, i, j in points):
+        return False
+    lengths = np.diff([0.0] + [s for s, _, _ in points])
+    wanted = (nodes - 1) * lengths / points[-1][0]
+    return all(w <= 1.8 * c and (c == 1 or w >= 0.5 * c) for w, c in zip(wanted, cells, strict=True))
+
+
+def build_mesh(tubes: Tubes, beta: np.ndarray, key: Key, base_cells: int = 4) -> Mesh:
+    """Sections ``key`` of :func:`section_key` for the actuator translations ``beta`` (N,) m."""
     n = len(tubes)
     points = breakpoints(tubes, beta)
     positions = np.array([0.0] + [s for s, _, _ in points])
     lengths = np.diff(positions)
-    cells = np.maximum(1, np.round((nodes - 1) * lengths / positions[-1])).astype(np.int64)
-    cells = np.where(lengths < 1e-9, 1, cells)
-    ends = np.array([beta[i] + segments[-1].end for i, segments in enumerate(tubes)])
+    cells = np.array(key[1], dtype=np.int64)
     present, active = [], [next(j for j, g in enumerate(t) if beta[i] + g.end > 0.0) for i, t in enumerate(tubes)]
     ust, remaining = [], n
     for k, (_, i, j) in enumerate(points):
@@ -116,11 +135,9 @@ def build_mesh(tubes: Tubes, beta: np.ndarray, nodes: int, base_cells: int = 4) 
         behind = [g for g in segments if beta[i] + g.start < 0.0]
         if behind:
             ust0[i] = behind[-1].curvature(-beta[i])
-            for p in range(base_points):
-                cell, stage = divmod(p, STAGES)
-                ell = -beta[i] * (cell + (_STAGE_XI[stage] if p < base_points - 1 else 0.0)) / base_cells
-                ust_base[i, p] = next(g for g in segments if ell <= g.end).curvature(ell)[2]
-    assert np.all(ends > 0)
+            edges = -beta[i] * np.arange(base_cells + 1) / base_cells
+            means = [_mean_twist(segments, a, b) for a, b in zip(edges[:-1], edges[1:], strict=True)]
+            ust_base[i] = np.repeat(means, STAGES).tolist() + [ust0[i, 2]]
     return Mesh(
         sec_cells=cells,
         sec_tubes=np.array(present, dtype=np.int64),
@@ -131,6 +148,17 @@ def build_mesh(tubes: Tubes, beta: np.ndarray, nodes: int, base_cells: int = 4) 
         ust_base=ust_base.ravel(),
         base_cells=base_cells,
     )
+
+
+def _mean_twist(segments: tuple[Segment, ...], start: float, end: float) -> float:
+    """Mean of u*_z (1/m) between two arc lengths of a tube, exact across segments, so that the twist behind the plate is."""
+    total = 0.0
+    for g in segments:
+        a, b = max(start, g.start) - g.start, min(end, g.end) - g.start
+        if b > a:
+            power = np.arange(1, g.coefficients.shape[1] + 1)
+            total += float(g.coefficients[2] @ ((b**power - a**power) / power))
+    return total / (end - start) if end > start else 0.0
 
 
 def point_count(mesh: Mesh) -> int:

@@ -6,7 +6,7 @@ import numpy as np
 
 from ctr_dynamics.model.kernels import workspace_rows
 from ctr_dynamics.model.layout import Layout
-from ctr_dynamics.model.mesh import Mesh, Segment, Tubes, build_mesh, node_count, point_count, section_key
+from ctr_dynamics.model.mesh import Key, Mesh, Segment, Tubes, build_mesh, fits, node_count, point_count, section_key
 from ctr_dynamics.model.newton import buffers, lanes_for
 from ctr_dynamics.robot import Robot
 
@@ -68,13 +68,26 @@ class Model:
         force, moment = stiffness / reach**2, stiffness / reach
         self.scale = np.array([force] * 3 + [moment] * (2 + n))
         self.step = np.array([moment] * n + [force] * 3 + [moment] * 2) * 1e-6
-        self._meshes: dict[tuple, Mesh] = {}
+        self._meshes: dict[Key, Mesh] = {}
+        # precurvature that varies within a tube's segments, or twists it behind the plate, moves over the cells with the tube
+        self.moving_precurvature = any(
+            segment.coefficients.shape[1] > 1 or segment.coefficients[2, 0] != segments[0].coefficients[2, 0]
+            for segments in self.segments
+            for segment in segments
+        )
 
-    def mesh(self, beta: np.ndarray) -> tuple[tuple, Mesh]:
-        """Key and mesh of the sections at the translations ``beta`` (N,) m; built once for each key."""
-        key = section_key(self.segments, beta)
+    def mesh(self, beta: np.ndarray, key: Key | None = None) -> tuple[Key, Mesh]:
+        """Key and mesh of the sections at the translations ``beta`` (N,) m; with ``key`` the sections are kept while they still suit.
+
+        Raises:
+            InputError: a tube would end behind the plate or beyond an inner one.
+        """
+        if key is None or not fits(key, self.segments, beta, self.nodes):
+            key = section_key(self.segments, beta, self.nodes)
+        if self.moving_precurvature:
+            return key, build_mesh(self.segments, beta, key, self.base_cells)
         if key not in self._meshes:
-            self._meshes[key] = build_mesh(self.segments, beta, self.nodes, self.base_cells)
+            self._meshes[key] = build_mesh(self.segments, beta, key, self.base_cells)
         return key, self._meshes[key]
 
     def buffers(self, mesh: Mesh, lanes: int) -> tuple[np.ndarray, ...]:

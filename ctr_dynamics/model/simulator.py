@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from ctr_dynamics.errors import InputError
-from ctr_dynamics.model.mesh import Mesh, node_positions, point_positions, section_key
+from ctr_dynamics.model.mesh import Mesh, node_positions, point_positions
 from ctr_dynamics.model.model import Model
 from ctr_dynamics.model.newton import CONVERGED, NOT_FINITE
 from ctr_dynamics.model.scheme import RATES, Y_BEFORE, Y_NOW, Scheme, make_scheme
@@ -169,35 +169,39 @@ class Simulator:
         n, stages = self.model.n, scheme.stages
         at_stages = [inputs_at(t + c * scheme.dt) for c in scheme.times]
         last = at_stages[-1]
+        bank, mesh = state.bank, state.mesh
         try:
-            if section_key(self.model.segments, last.beta) != state.key:
-                remap(self.model, state, last.beta)
-                fresh = True
+            key, now_mesh = self.model.mesh(last.beta, state.key)
         except InputError as error:
             return StepResult(False, str(error), 0, 0, 0)
+        if key != state.key:
+            bank = remap_fields(n, bank, mesh, state.inputs.beta, now_mesh, last.beta)
+            fresh = True
+        mesh = now_mesh
         inputs = np.empty((stages, 3 * n + 6))
         for i, now in enumerate(at_stages):
             inputs[i, :n], inputs[i, n : 2 * n], inputs[i, 2 * n : 3 * n] = now.alpha, now.alpha_rate, now.beta
             inputs[i, 3 * n : 3 * n + 3], inputs[i, 3 * n + 3 :] = now.force, now.torque
-        small, big = self._work(state.key, state.mesh)
+        small, big = self._work(key, mesh)
         guess = 2.0 * state.unknowns - state.earlier
-        before = state.bank[:RATES].copy() if record else state.bank
+        before = bank[:RATES].copy() if record else bank
         found = np.empty_like(guess)
         outcome, iterations, sweeps, jacobians = step(
-            self.model.tubes, self.model.lane, self.model.jacobian_lanes, state.mesh, scheme.c0, scheme.weights, self.parameters,
-            inputs, state.bank, guess, found, state.inverse, fresh, small, big, self.model.scale, self.model.step,
+            self.model.tubes, self.model.lane, self.model.jacobian_lanes, mesh, scheme.c0, scheme.weights, self.parameters,
+            inputs, bank, guess, found, state.inverse, fresh, small, big, self.model.scale, self.model.step,
             self.tolerance, self.limit,
         )  # fmt: skip
         state.usable = outcome == CONVERGED
         if outcome != CONVERGED:
             return StepResult(False, OUTCOMES[outcome], iterations, sweeps, jacobians)
+        state.key, state.mesh, state.bank = key, mesh, bank
         state.earlier, state.unknowns = state.unknowns, found
         state.nodes = small[6].reshape(-1, 16 + 3 * n).copy()
         state.inputs = last
         records: tuple[Record, ...] = ()
         if record:
-            rates = state.bank[RATES : RATES + stages].copy()
-            records = (Record(scheme, state.key, state.mesh, before, rates, inputs, found.copy()),)
+            rates = bank[RATES : RATES + stages].copy()
+            records = (Record(scheme, key, mesh, before, rates, inputs, found.copy()),)
         return StepResult(True, "ok", iterations, sweeps, jacobians, records=records)
 
     def _work(self, key: tuple, mesh: Mesh) -> tuple:
@@ -212,21 +216,13 @@ class Simulator:
         return node_positions(state.mesh, state.inputs.beta)
 
 
-def remap(model: Model, state: State, beta: np.ndarray) -> None:
-    """Carry the stored fields over to the sections at ``beta`` (N,) m: by cubic interpolation inside each old section, never across one.
-
-    Raises:
-        InputError: a tube would end behind the plate or beyond an inner one.
-    """
-    key, mesh = model.mesh(beta)
-    state.bank = remap_fields(model.n, state.bank, state.mesh, state.inputs.beta, mesh, beta)
-    state.key, state.mesh = key, mesh
-
-
 def remap_fields(
     n: int, bank: np.ndarray, old: Mesh, old_beta: np.ndarray, new: Mesh, new_beta: np.ndarray
 ) -> np.ndarray:
-    """Fields (rows, fields) of the sections ``old`` at ``old_beta`` as fields of the sections ``new`` at ``new_beta``."""
+    """Fields (rows, fields) of the sections ``old`` at ``old_beta`` as fields of the sections ``new`` at ``new_beta``.
+
+    By interpolation inside each old section, never across one. Sections that are the same but for their cells keep their reference coordinate.
+    """
     old_s, old_section = point_positions(old, old_beta)
     new_s, new_section = point_positions(new, new_beta)
     F = 7 + 2 * n
@@ -237,11 +233,16 @@ def remap_fields(
     result[:, len(new_s) * F :] = bank[:, main:]
     fields = bank[:, :main].reshape(len(bank), -1, F)
     target = result[:, : len(new_s) * F].reshape(len(bank), -1, F)
+    same = np.array_equal(old.bp_tube, new.bp_tube) and np.array_equal(old.bp_offset, new.bp_offset)
     for k in range(len(new.sec_cells)):
         where = np.flatnonzero(new_section == k)
         s = new_s[where] * tip_old / tip_new
+        if same:
+            there = old_s[old_section == k]
+            span = max(new_s[where][-1] - new_s[where][0], 1e-15)
+            s = there[0] + (new_s[where] - new_s[where][0]) / span * (there[-1] - there[0])
         middle = 0.5 * (s[0] + s[-1])
-        source = next((j for j, end in enumerate(ends) if middle <= end + 1e-12), len(ends) - 1)
+        source = k if same else next((j for j, end in enumerate(ends) if middle <= end + 1e-12), len(ends) - 1)
         points = np.flatnonzero(old_section == source)
         # stage points at a cell's start, its two middles and its end: the distinct abscissae are starts, middles and the last end
         distinct = np.concatenate([points[i:-1:4] for i in (0, 1)] + [points[-1:]])

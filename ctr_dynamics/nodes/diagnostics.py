@@ -4,12 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from ctr_dynamics.estimation.health import Status
-from ctr_dynamics.nodes.stepping import CLOCK_LIMIT_NS
+from ctr_dynamics.estimation.outputs import ERROR, OK, WARN, Status
+from ctr_dynamics.nodes.stepping import StampClock
 from ctr_dynamics.nodes.timing import LATE_NS, VERY_LATE_NS, StepTiming
-
-OK, WARN, ERROR, STALE = range(4)
-HARDWARE_ID = "ctr"
 
 
 def timing_status(timing: StepTiming, faults: int, last_fault: str) -> Status:
@@ -51,24 +48,20 @@ def timing_status(timing: StepTiming, faults: int, last_fault: str) -> Status:
     return Status("timing", OK, f"{timing.steps} steps on time", values)
 
 
-def clock_status(offset_ns: int, agree: bool, now_ns: int, use_sim_time: bool, policy: str) -> Status:
+def clock_status(clock: StampClock, now_ns: int, use_sim_time: bool) -> Status:
     """Whether the stamps of the joints and the node's clock are of one time."""
-    values = {
-        "node clock minus joint stamp (s)": f"{offset_ns * 1e-9:.4f}",
-        "use_sim_time": str(use_sim_time),
-    }
+    values = {"offset (s)": f"{clock.offset_ns * 1e-9:.4f}", "use_sim_time": str(use_sim_time)}
     if now_ns <= 0:
         return Status(
-            "clock", WARN, "use_sim_time is set and no /clock has arrived; steps follow the inputs", values
+            "clock", WARN, "use_sim_time is set, no /clock has come; steps follow the joints", values
         )
-    if not agree:
-        side = "behind" if offset_ns > 0 else "ahead of"
+    if not clock.agrees:
+        side = "behind" if clock.offset_ns > 0 else "ahead of"
         return Status(
             "clock",
             WARN,
-            f"joint stamps are {abs(offset_ns) * 1e-9:.3f} s {side} the node's clock, limit "
-            f"{CLOCK_LIMIT_NS * 1e-9:g} s: steps follow the inputs instead of the policy '{policy}'; "
-            "synchronise the clocks or set use_sim_time",
+            f"joint stamps are {abs(clock.offset_ns) * 1e-9:.3f} s {side} the node's clock, limit "
+            f"{clock.limit_ns * 1e-9:g} s: steps go by the stamps; synchronise clocks or set use_sim_time",
             values,
         )
     return Status("clock", OK, "joint stamps and the node's clock agree", values)

@@ -34,6 +34,7 @@ from ctr_dynamics.nodes.declaration import declare, watch
 from ctr_dynamics.nodes.naming import NAME, NAMESPACE, message_class, node_topic
 from ctr_dynamics.nodes.outputs import Outputs
 from ctr_dynamics.nodes.recorder import Recorder
+from ctr_dynamics.nodes.rehearsal import rehearse
 from ctr_dynamics.nodes.spinning import spin_until, stop_on_signals
 from ctr_dynamics.nodes.stepping import StepLoop
 from ctr_dynamics.nodes.timing import StepTiming
@@ -73,7 +74,9 @@ class EstimatorNode(Node):
             self,
             qos.profile(self.settings["qos.publisher_reliability"], self.settings["qos.publisher_depth"]),
             self._qos_faults,
-            StepEncoder(self.settings["output.frame_id"], self._robot.name),
+            StepEncoder(
+                self.settings["output.frame_id"], self._robot.name, self.settings["output.backbone_every"]
+            ),
             self.recorder.put if self.recorder else None,
         )
         self._now_ns = self._clock_source()
@@ -104,6 +107,7 @@ class EstimatorNode(Node):
         self.get_logger().info("compiling the kernels (seconds with a filled cache, minutes without)")
         begin = time.perf_counter()
         model.warmup()
+        rehearse(self._robot, self.settings)
         self.get_logger().info(f"kernels ready after {time.perf_counter() - begin:.1f} s")
 
     def _open_recorder(self) -> Recorder | None:
@@ -164,9 +168,9 @@ class EstimatorNode(Node):
         except CdrError as error:
             self._note_undecodable(topics.JOINT_STATES, error)
             return
-        self.loop.clock_check.sample(message.stamp_ns, arrival_ns)
-        self.timing.clocks_agree = self.loop.clock_check.agree
-        self.timing.arrived(message.stamp_ns, arrival_ns)
+        clock = self.loop.stamp_clock
+        clock.sample(message.stamp_ns, arrival_ns)
+        self.timing.arrived(message.stamp_ns, clock.at(arrival_ns))
         self._estimator.add_joint_state(message.stamp_ns, message.names, message.positions)
 
     def _take_tracker(self, data: bytes, arrival_ns: int) -> None:
@@ -206,13 +210,10 @@ class EstimatorNode(Node):
         self.outputs.diagnostics(max(now_ns, 0), self._statuses(now_ns))
 
     def _statuses(self, now_ns: int) -> list[Any]:
-        check = self.loop.clock_check
         return [
             *self._estimator.health.statuses(),
             diagnostics.timing_status(self.timing, self.loop.faults, self.loop.last_fault),
-            diagnostics.clock_status(
-                check.offset_ns, check.agree, now_ns, self._use_sim_time, self.timing.policy
-            ),
+            diagnostics.clock_status(self.loop.stamp_clock, now_ns, self._use_sim_time),
             diagnostics.topics_status(self._qos_faults.by_topic, self._undecodable),
         ]
 
@@ -289,13 +290,15 @@ class EstimatorNode(Node):
         self._prepared = None
         self.settings = settings
         if fresh is not None:
-            self.loop.put(partial(self._swap, fresh))
+            self.loop.put(partial(self._swap, fresh, settings))
             self.get_logger().info(f"{', '.join(sorted(changes))} changed: the estimator starts anew")
         elif "filter.enabled" in changes:
             self.loop.put(lambda: self._estimator.set_fusion(settings["filter.enabled"]))
 
-    def _swap(self, estimator: Estimator) -> None:
+    def _swap(self, estimator: Estimator, settings: Settings) -> None:
         self._estimator = estimator
+        self.timing.policy = settings["output.policy"]
+        self.timing.input_timeout_ns = round(settings["input_timeout_s"] * 1e9)
         self.loop.swap(estimator)
 
     # End.

@@ -10,8 +10,7 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile
 
 from ctr_dynamics.messages import topics
-from ctr_dynamics.messages.encode import OutputStatus, StepEncoder, encode_diagnostics
-from ctr_dynamics.nodes.diagnostics import ERROR, OK
+from ctr_dynamics.messages.encode import StepEncoder, encode_diagnostics
 from ctr_dynamics.nodes.naming import message_class, node_topic
 from ctr_dynamics.nodes.qos import QosFaults
 
@@ -67,12 +66,8 @@ class Outputs:
         self.last_stamp_ns = None
 
     def diagnostics(self, stamp_ns: int, statuses: list[Any]) -> None:
-        """Publish /diagnostics, led by the status of the outputs."""
-        if self.valid:
-            output = OutputStatus("output", OK, "valid", {})
-        else:
-            output = OutputStatus("output", ERROR, self.reason or "outputs are invalid", {})
-        data = encode_diagnostics(stamp_ns, [output, *statuses], self._encoder.hardware_id)
+        """Publish /diagnostics."""
+        data = encode_diagnostics(stamp_ns, statuses, self._encoder.hardware_id)
         self._send(topics.DIAGNOSTICS, stamp_ns, data)
 
     def _send(self, topic: str, stamp_ns: int, data: bytes) -> None:

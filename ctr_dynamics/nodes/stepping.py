@@ -56,24 +56,40 @@ class Call:
         self.done.set()
 
 
-class ClockCheck:
-    """Whether the joint stamps belong to the node's clock: three successive ones beyond the limit say no."""
+class StampClock:
+    """Time on the clock of the joint stamps, from the node's clock.
+
+    The two are one clock as long as stamps arrive within `limit_ns` of their own time. Otherwise the smallest
+    difference so far is taken as that of the clocks, so that steps still follow real time. One stamp that is
+    wildly off changes nothing, three in a row do.
+    """
 
     def __init__(self, limit_ns: int = CLOCK_LIMIT_NS) -> None:
         self.limit_ns = limit_ns
         self.offset_ns = 0
-        self.agree = True
+        self.agrees = True
+        self._known = False
         self._streak = 0
 
-    def sample(self, stamp_ns: int, now_ns: int) -> None:
-        self.offset_ns = now_ns - stamp_ns
-        if (abs(self.offset_ns) <= self.limit_ns) == self.agree:
-            self._streak = 0
-            return
-        self._streak += 1
-        if self._streak >= 3:
-            self.agree = not self.agree
-            self._streak = 0
+    def sample(self, stamp_ns: int, arrival_ns: int) -> None:
+        """A joint state with that stamp arrived at that time of the node's clock."""
+        offset = arrival_ns - stamp_ns
+        if self._known and abs(offset - self.offset_ns) > self.limit_ns:
+            self._streak += 1
+            if self._streak < 3:
+                return
+        self._streak = 0
+        self.agrees = abs(offset) <= self.limit_ns
+        if self.agrees:
+            offset = 0
+        elif self._known and abs(offset - self.offset_ns) <= self.limit_ns:
+            offset = min(offset, self.offset_ns)
+        self.offset_ns = offset
+        self._known = True
+
+    def at(self, now_ns: int) -> int:
+        """The stamps' time at a time of the node's clock."""
+        return now_ns - self.offset_ns
 
 
 class StepLoop(threading.Thread):
@@ -83,7 +99,7 @@ class StepLoop(threading.Thread):
         estimator: see `Steps`; touched by this thread alone once started.
         publish: called with every step in order of its stamp; returns False when the stamp was withheld.
         housekeeping: called after each round with the current time; publishes diagnostics when they are due.
-        clock_ns: the current time of the clock that stamps the messages, 0 while it has none.
+        clock_ns: the node's current time, 0 while it has none.
         timing: the account of punctuality.
         log_error: takes one line for the log.
         wall: whether that clock runs at the rate of the wall clock, so that one may sleep until a stamp.
@@ -102,7 +118,7 @@ class StepLoop(threading.Thread):
         super().__init__(name="stepping", daemon=True)
         self.estimator = estimator
         self.timing = timing
-        self.clock_check = ClockCheck()
+        self.stamp_clock = StampClock()
         self.inbox: deque[Callable[[], None]] = deque()
         self.faults = 0
         self.last_fault = ""
@@ -188,15 +204,13 @@ class StepLoop(threading.Thread):
                 f"fault in the stepping thread, the estimator starts anew\n{traceback.format_exc()}"
             )
             self.reset()
-        now_ns = self._clock_ns()
-        self._housekeeping(now_ns)
-        self._collect(now_ns)
+        self._housekeeping(self._clock_ns())
+        self._collect()
 
     def _advance(self) -> None:
         self._took_steps = False
         while not self._stopping:
-            now_ns = self._clock_ns()
-            until_ns, more = self._until(now_ns)
+            until_ns, more = self._until(self._now_ns())
             begin = time.perf_counter_ns()
             steps = self.estimator.advance(until_ns)
             self.timing.advanced(len(steps), time.perf_counter_ns() - begin)
@@ -206,7 +220,7 @@ class StepLoop(threading.Thread):
                     self.timing.restarted()  # the estimator has started anew by itself
                 self._last = (step.k, step.stamp_ns)
                 if self._publish(step):
-                    self.timing.published(step.k, step.stamp_ns, self._clock_ns())
+                    self.timing.published(step.k, step.stamp_ns, self._now_ns())
                 else:
                     self.timing.withheld += 1
             if not more or not steps or self.inbox:
@@ -214,13 +228,19 @@ class StepLoop(threading.Thread):
                     self._wake.set()
                 return
 
+    def _now_ns(self) -> int:
+        """Time on the clock of the stamps; 0 while there is no clock."""
+        now_ns = self._clock_ns()
+        return self.stamp_clock.at(now_ns) if now_ns > 0 else 0
+
     def _until(self, now_ns: int) -> tuple[int | None, bool]:
         """The time up to which to advance, and whether that leaves due steps for a next slice."""
-        if now_ns <= 0 or not self.clock_check.agree:
-            return None, False  # without a usable clock only what the inputs cover is taken
-        if self._last is None:
+        if now_ns <= 0:
+            return None, False  # without a clock only what the inputs cover is taken
+        taken_ns = self._last[1] if self._last is not None else self.estimator.t0_ns
+        if taken_ns is None:
             return now_ns, False
-        behind_ns = now_ns - self._last[1]
+        behind_ns = now_ns - taken_ns
         if behind_ns > CATCH_UP_NS:
             self._log_error(
                 f"steps are {behind_ns * 1e-9:.1f} s behind, limit {CATCH_UP_NS * 1e-9:g} s: "
@@ -229,7 +249,7 @@ class StepLoop(threading.Thread):
             self.reset()
             return now_ns, False
         if behind_ns > SLICE_STEPS * STEP_NS:
-            return self._last[1] + SLICE_STEPS * STEP_NS, True
+            return taken_ns + SLICE_STEPS * STEP_NS, True
         return now_ns, False
 
     def _sleep(self) -> None:
@@ -239,23 +259,23 @@ class StepLoop(threading.Thread):
         due_ns = self._next_due_ns()
         if due_ns is not None and self._wall:
             # Due and not taken: the estimator is waiting for an input. Look again soon, but do not spin.
-            wait_ns = min(due_ns - self._clock_ns(), IDLE_NS) if self._took_steps else RETRY_NS
+            wait_ns = min(due_ns - self._now_ns(), IDLE_NS) if self._took_steps else RETRY_NS
         if wait_ns > 0:
             self._wake.wait(wait_ns * 1e-9)
 
     def _next_due_ns(self) -> int | None:
         """When the next step falls due at the latest; None when only a message can make one due."""
-        if not self.clock_check.agree or self.estimator.t0_ns is None or self._last is None:
+        if self.estimator.t0_ns is None or self._last is None:
             return None
         timeout_ns = 0 if self.timing.policy == "predict" else self.timing.input_timeout_ns
         return self._last[1] + STEP_NS + timeout_ns
 
-    def _collect(self, now_ns: int) -> None:
+    def _collect(self) -> None:
         now = time.monotonic_ns()
         if now < self._next_collection_ns:
             return
         due_ns = self._next_due_ns()
-        tight = self._wall and due_ns is not None and due_ns - now_ns < COLLECT_SLACK_NS
+        tight = self._wall and due_ns is not None and due_ns - self._now_ns() < COLLECT_SLACK_NS
         if tight and now < self._next_collection_ns + COLLECT_NS:
             return  # a longer pause may come, but do not wait for it for ever
         gc.collect()

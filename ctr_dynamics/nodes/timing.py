@@ -57,13 +57,10 @@ class StepTiming:
 
     Steps that fall due while the start is still being solved (the static equilibrium of the first joints) are
     counted apart as `start`: the node cannot publish before it has a state.
-
-    While `clocks_agree` is False (stamps far from the node's clock) only arrivals count: see `stepping`.
     """
 
     def __init__(self, policy: str, input_timeout_ns: int) -> None:
         self.policy = policy
-        self.clocks_agree = True
         self.input_timeout_ns = input_timeout_ns
         self.lateness = Histogram()
         self.step_time = Histogram()
@@ -126,12 +123,12 @@ class StepTiming:
         return lateness
 
     def _due_ns(self, stamp_ns: int, now_ns: int) -> int:
-        if self.policy == "predict" and self.clocks_agree:
+        if self.policy == "predict":
             return stamp_ns
         while self._arrivals and self._arrivals[0][0] < stamp_ns:
             self._arrivals.popleft()
         covered_ns = self._arrivals[0][1] if self._arrivals else now_ns
-        return min(covered_ns, stamp_ns + self.input_timeout_ns) if self.clocks_agree else covered_ns
+        return min(covered_ns, stamp_ns + self.input_timeout_ns)
 
     def report(self) -> dict[str, Any]:
         """Everything as JSON-able numbers; durations in ms."""

@@ -1,0 +1,65 @@
+"""The backbone as it is published: one row a node, base to tip."""
+
+import math
+
+import numpy as np
+from numba import njit
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def backbone_rows(s, nodes, fields, points, n, insertion_rate, turn, shift, dnodes, pi, rows):
+    """Fill ``rows`` (P, 15) float32: s, x, y, z, qx, qy, qz, qw, vx, vy, vz, ux, uy, uz, sd.
+
+    ``nodes`` (P, S) states; ``fields`` (fields,) with ``points`` (P,) the point of each node; ``turn`` (3, 3) and ``shift`` (3,) the estimated
+    registration; ``dnodes`` (P * S, r) columns of the states and ``pi`` their coefficients' covariance. sd is the deviation of the
+    position per axis, in m: the root of the third of the trace.
+    """
+    S = nodes.shape[1]
+    F = 7 + 2 * n
+    r = dnodes.shape[1]
+    for i in range(len(nodes)):
+        a, b, c, d = nodes[i, 3], nodes[i, 4], nodes[i, 5], nodes[i, 6]
+        norm = math.sqrt(a * a + b * b + c * c + d * d)
+        a, b, c, d = a / norm, b / norm, c / norm, d / norm
+        r00, r01, r02 = 1 - 2 * (c * c + d * d), 2 * (b * c - a * d), 2 * (b * d + a * c)
+        r10, r11, r12 = 2 * (b * c + a * d), 1 - 2 * (b * b + d * d), 2 * (c * d - a * b)
+        r20, r21, r22 = 2 * (b * d - a * c), 2 * (c * d + a * b), 1 - 2 * (b * b + c * c)
+        qx, qy, qz = nodes[i, 7], nodes[i, 8], nodes[i, 9] + insertion_rate
+        x, y, z = nodes[i, 0], nodes[i, 1], nodes[i, 2]
+        rows[i, 0] = s[i]
+        for k in range(3):
+            rows[i, 1 + k] = turn[k, 0] * x + turn[k, 1] * y + turn[k, 2] * z + shift[k]
+        # the registration's rotation is a fraction of a degree: q_turn h to first order, normalised
+        ex, ey, ez = 0.5 * turn[2, 1], 0.5 * turn[0, 2], 0.5 * turn[1, 0]
+        w = a - ex * b - ey * c - ez * d
+        rows[i, 4] = b + ex * a + ey * d - ez * c
+        rows[i, 5] = c + ey * a + ez * b - ex * d
+        rows[i, 6] = d + ez * a + ex * c - ey * b
+        rows[i, 7] = w
+        scale = 1.0 / math.sqrt(1.0 + ex * ex + ey * ey + ez * ez)
+        for k in range(4, 8):
+            rows[i, k] *= scale
+        rows[i, 8] = r00 * qx + r01 * qy + r02 * qz
+        rows[i, 9] = r10 * qx + r11 * qy + r12 * qz
+        rows[i, 10] = r20 * qx + r21 * qy + r22 * qz
+        base = points[i] * F
+        for k in range(3):
+            rows[i, 11 + k] = fields[base + 6 + k]
+        variance = 0.0
+        for axis in range(3):
+            row = i * S + axis
+            for p in range(r):
+                total = 0.0
+                for q in range(r):
+                    total += pi[p, q] * dnodes[row, q]
+                variance += total * dnodes[row, p]
+        rows[i, 14] = math.sqrt(max(variance, 0.0) / 3.0)
+
+
+def node_points(sec_cells: np.ndarray) -> np.ndarray:
+    """(P,) number of the point at which each node's fields stand: a cell's first stage, and the section's end."""
+    points, start = [], 0
+    for cells in sec_cells:
+        points.extend(start + 4 * np.arange(cells + 1))
+        start += 4 * int(cells) + 1
+    return np.array(points)

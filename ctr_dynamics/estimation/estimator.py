@@ -1,0 +1,672 @@
+"""The estimator: input signals in, one output for every 3 ms stamp out. No ROS, no clock; the node, replay and diagnosis use this door.
+
+Two runs of the model go side by side: the fused one, which the filter corrects, and the model alone. Steps are taken when their joints are
+known (``wait``) or on time with extrapolated joints (``predict``); what comes later is applied by returning to a kept state and stepping again.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from array import array
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ctr_dynamics.errors import InputError
+from ctr_dynamics.model.mesh import node_positions
+from ctr_dynamics.model.model import Model
+from ctr_dynamics.model.scheme import make_scheme
+from ctr_dynamics.model.simulator import Inputs, InputsAt, Simulator, State, StepResult
+from ctr_dynamics.model.statics import Statics
+from ctr_dynamics.parameters import Settings, axes_mask
+from ctr_dynamics.robot import Robot
+
+from .backbone import backbone_rows, node_points
+from .fusion import Fusion, FusionOptions
+from .health import Health
+from .modes import ModalBasis, input_vector, modal_basis
+from .outputs import Innovation, Modes, SolverStats, StepOutput
+from .rotations import conjugate, from_vector, matrix
+from .signals import Signal, finite, joint_order
+from .tip import TipWindow, tip_of
+from .tracker import ROTATION, TRANSLATION, registered, tracker_model
+
+Floats = NDArray[np.float64]
+DT_NS = 3_000_000
+LOAD_GRACE_NS = 100_000_000  # a first load that comes this soon after the joints is there from the start
+MODES_EVERY = 66  # steps between refreshes of the vibration modes
+MAX_FAILURES = 10  # steps in a row that may fail before the model starts anew at rest
+MAX_BEHIND = 1000  # steps to catch up at once; beyond, the model starts anew
+
+
+@dataclass
+class Sample:
+    """A tracker pose on its way into the filter; ``fused_k`` is the step after which it was used."""
+
+    stamp_ns: int
+    position: Floats
+    quaternion: Floats
+    late_s: float
+    fused_k: int | None = None
+
+
+@dataclass(frozen=True)
+class Kept:
+    """The whole estimator after step ``k``."""
+
+    k: int
+    fused: State
+    alone: State
+    fusion: tuple
+    alone_tips: tuple
+
+
+class Estimator:
+    """Dynamic model and filter of one robot, driven by stamped inputs.
+
+    Args:
+        robot: from a robot file.
+        settings: the parameter table's values.
+    """
+
+    def __init__(self, robot: Robot, settings: Settings) -> None:
+        self.robot, self.settings = robot, settings
+        self.model = Model(robot, nodes=int(settings["model.nodes"]))
+        dt = DT_NS * 1e-9
+        scheme = make_scheme(str(settings["model.scheme"]), dt, float(settings["model.alpha"]))
+        tolerance = float(settings["model.tolerance"])
+        self.simulator = Simulator(self.model, scheme, tolerance)
+        self.reference = Simulator(self.model, scheme, tolerance)
+        self.window_ns = round(float(settings["filter.window_s"]) * 1e9)
+        self.tracker = tracker_model(
+            robot,
+            delay=float(settings["tracker.delay_s"]),
+            lever=np.array(settings["tracker.lever_arm_m"]),
+            rotation=np.array(settings["tracker.registration_rotation_rad"]),
+            translation=np.array(settings["tracker.registration_translation_m"]),
+            mask=axes_mask(str(settings["tracker.axes"])),
+        )
+        self.fusion = Fusion(
+            self.simulator,
+            self.tracker,
+            FusionOptions(
+                rank=int(settings["filter.rank"]),
+                gate_probability=float(settings["filter.gate_probability"]),
+                force_sigma=float(settings["filter.tip_force_sigma_N"]),
+                force_sigma_max=float(settings["filter.tip_force_sigma_max_N"]),
+                adaptation=float(settings["filter.adaptation"]),
+                force_time=float(settings["filter.tip_force_time_s"]),
+                window=float(settings["filter.window_s"]),
+            ),
+        )
+        self._offset_rows = [
+            (i, self.fusion.uncertainty.names.index(f"encoder_offset.tube{i + 1}"))
+            for i in range(self.model.n)
+            if f"encoder_offset.tube{i + 1}" in self.fusion.uncertainty.names
+        ]
+        self._nominal_offset = robot.encoders.offset.value
+        self.step_times_s = array("d")
+        self._clear()
+        self.health = Health()
+        self.health.fusing = self._fusing = bool(settings["filter.enabled"])
+
+    def _clear(self) -> None:
+        n = self.model.n
+        self.t0_ns: int | None = None
+        self.k = -1
+        self._joints, self._load = Signal(2 * n), Signal(6)
+        self._samples: list[Sample] = []
+        self._kept: deque[Kept] = deque()
+        self._return_to: int | None = None  # ns: inputs from here on have changed
+        self._fused: State | None = None
+        self._alone: State | None = None
+        self._alone_tips = TipWindow(self.fusion.tips.size)
+        self._innovations: list[Innovation] = []
+        self._failures = 0
+        self._modes: ModalBasis | None = None
+        self._modes_k = -MODES_EVERY
+        self._backwards = 0
+        self._squares = [0.0, 0.0]
+        self._residuals = 0
+        self._rows: dict[tuple, tuple[Floats, NDArray[np.int64]]] = {}
+
+    # -- inputs --
+
+    def add_joint_state(self, stamp_ns: int, names: Sequence[str], positions: Sequence[float]) -> None:
+        """Take in a joint state: ``tubeN_rotation`` (rad) and ``tubeN_translation`` (m, negative) by name. Wrong ones are counted, not raised."""
+        order = joint_order(names, self.model.n)
+        if isinstance(order, str):
+            self.health.note("joints", "names", order)
+            return
+        if len(positions) < len(names):
+            self.health.note("joints", "positions", f"joint state has {len(positions)} positions for {len(names)} names; give one each")
+            return
+        value = np.array([positions[i] for i in order], dtype=float)
+        n = self.model.n
+        if not finite(value):
+            self.health.note("joints", "not finite", f"joint state at {stamp_ns} ns holds a value that is not finite; it was left out")
+            return
+        reason = self.robot.actuator_problem(value[n:], value[:n])
+        if reason:
+            self.health.note("joints", "out of range", f"{reason}; the joint state was left out")
+            return
+        if self._joints.stamps and stamp_ns < self._joints.stamps[-1] - self.window_ns:
+            self._backwards += 1
+            back = (self._joints.stamps[-1] - stamp_ns) * 1e-9
+            self.health.note("joints", "time ran backwards", f"stamp {back:.3f} s before the last, limit {self.window_ns * 1e-9:g} s")
+            if self._backwards >= 3:  # not a stray sample: the clock or the bag began anew
+                self.reset()
+                self.health.restarts += 1
+            return
+        self._backwards = 0
+        last = self._joints.stamps[-1] if self._joints.stamps else None
+        taken = self._stamp(self.k)
+        if last is not None and taken is not None and last < taken < stamp_ns and taken - last > self._timeout_ns:
+            # steps were taken with the held value: go on from there, not from a straight line over the gap
+            self._joints.add(taken, self._joints.values[-1])
+        kind = self._joints.add(stamp_ns, value)
+        if kind == "duplicate":
+            self.health.note("joints", "duplicate stamp", f"a second joint state of {stamp_ns} ns; the first one counts")
+            return
+        if self.t0_ns is None:
+            self.t0_ns = stamp_ns
+            return
+        i = self._joints.stamps.index(stamp_ns) if kind == "late" else len(self._joints.stamps) - 1
+        self._changed(self._joints.stamps[i - 1] if i else stamp_ns)
+
+    def add_tracker_pose(
+        self, stamp_ns: int, position: Sequence[float], quaternion_xyzw: Sequence[float], frame_id: str = ""
+    ) -> None:
+        """Take in a tracker pose (m, x y z w) of its header's stamp."""
+        frame = str(self.settings["output.frame_id"])
+        if frame_id and frame_id.lstrip("/") != frame:
+            self.health.note(
+                "tracker", "other frame", f"pose in frame '{frame_id}', expected '{frame}'; register the tracker or rename its frame"
+            )
+            self.health.dropped += 1
+            return
+        if not (finite(position) and finite(quaternion_xyzw)):
+            self.health.note("tracker", "not finite", f"pose at {stamp_ns} ns holds a value that is not finite; it was left out")
+            self.health.dropped += 1
+            return
+        x, y, z, w = quaternion_xyzw
+        norm = math.sqrt(x * x + y * y + z * z + w * w)
+        if not 0.9 <= norm <= 1.1:
+            self.health.note("tracker", "quaternion", f"norm {norm:.3g} is outside 0.9 to 1.1; send unit quaternions; the pose was left out")
+            self.health.dropped += 1
+            return
+        if abs(norm - 1.0) > 1e-3:
+            self.health.note("tracker", "quaternion normalised", f"norm {norm:.4f}, limit 1 +- 0.001")
+        if any(s.stamp_ns == stamp_ns for s in self._samples[-50:]):
+            self.health.note("tracker", "duplicate stamp", f"a second pose of {stamp_ns} ns; the first one counts")
+            self.health.dropped += 1
+            return
+        taken = self._stamp(self.k)
+        late = max(0.0, (taken - stamp_ns) * 1e-9) if taken is not None else 0.0
+        if late > self.window_ns * 1e-9:
+            self.health.note("tracker", "too late", f"pose came {late:.3f} s after its stamp, limit {self.window_ns * 1e-9:g} s")
+            self.health.dropped += 1
+            return
+        if late > 2 * DT_NS * 1e-9:
+            self.health.late += 1
+        quaternion = np.array([w, x, y, z]) / norm
+        self._samples.append(Sample(stamp_ns, np.array(position, dtype=float), quaternion, late))
+        self._samples.sort(key=lambda s: s.stamp_ns)
+
+    def add_tip_load(self, stamp_ns: int, force: Sequence[float], torque: Sequence[float], frame_id: str = "") -> None:
+        """Take in a known wrench on the tip (N, N m about the tip point, ``ctr_base`` axes)."""
+        frame = str(self.settings["output.frame_id"])
+        if frame_id and frame_id.lstrip("/") != frame:
+            self.health.note("load", "other frame", f"load in frame '{frame_id}', expected '{frame}'; send it in base axes")
+            return
+        if not (finite(force) and finite(torque)):
+            self.health.note("load", "not finite", f"load at {stamp_ns} ns holds a value that is not finite; it was left out")
+            return
+        first = not self._load.stamps
+        kind = self._load.add(stamp_ns, np.array([*force, *torque], dtype=float))
+        if kind == "duplicate":
+            self.health.note("load", "duplicate stamp", f"a second load of {stamp_ns} ns; the first one counts")
+        elif first:
+            if self.t0_ns is not None and stamp_ns - self.t0_ns <= LOAD_GRACE_NS:
+                self._changed(self.t0_ns)
+            else:
+                self._load.stamps.insert(0, stamp_ns - 1)
+                self._load.values.insert(0, np.zeros(6))
+                self._changed(stamp_ns)
+        else:
+            i = self._load.stamps.index(stamp_ns)
+            if i and (kind == "late" or not np.array_equal(self._load.values[i], self._load.values[i - 1])):
+                self._changed(self._load.stamps[i - 1])
+
+    def _changed(self, from_ns: int) -> None:
+        """Steps after ``from_ns`` were taken with other inputs than are known now."""
+        taken = self._stamp(self.k)
+        if taken is not None and from_ns < taken and self._fused is not None:
+            self._return_to = from_ns if self._return_to is None else min(self._return_to, from_ns)
+
+    # -- time --
+
+    @property
+    def _timeout_ns(self) -> int:
+        return round(float(self.settings["input_timeout_s"]) * 1e9)
+
+    @property
+    def _predicting(self) -> bool:
+        return self.settings["output.policy"] == "predict"
+
+    def _stamp(self, k: int) -> int | None:
+        return None if self.t0_ns is None or k < 0 else self.t0_ns + k * DT_NS
+
+    def _due(self, k: int, now_ns: int | None) -> bool:
+        stamp = self._stamp(k)
+        if stamp is None:
+            return False
+        if stamp <= self._joints.stamps[-1]:
+            return True
+        if now_ns is None:
+            return False
+        return stamp <= now_ns if self._predicting else stamp <= now_ns - self._timeout_ns
+
+    def advance(self, now_ns: int | None = None) -> list[StepOutput]:
+        """Take every step that is due. ``now_ns``: time on the stamps' clock; None takes only steps that the joints cover."""
+        if self.t0_ns is None:
+            return []
+        self._skip_ahead(now_ns)
+        outputs: list[StepOutput] = []
+        while self._due(self.k + 1, now_ns):
+            begin = time.perf_counter()
+            if self._return_to is not None:
+                self._go_back()
+            self.k += 1
+            outputs.append(self._take(self.k))
+            self.step_times_s.append(time.perf_counter() - begin)
+        return outputs
+
+    def finish(self) -> list[StepOutput]:
+        """Steps up to the last joint stamp."""
+        return self.advance(None)
+
+    def reset(self) -> None:
+        """Forget everything and wait for the next complete joint state. Counters stay."""
+        self._clear()
+        self.fusion.theta[:] = 0.0
+        self.fusion._apply_theta()
+        self.health.problem = "waiting for the first complete joint state"
+        self.health.recent.clear()
+
+    def set_fusion(self, on: bool) -> None:
+        """Use tracker samples, or let the model run alone; samples are compared all the same."""
+        self._fusing = self.health.fusing = on
+
+    def _skip_ahead(self, now_ns: int | None) -> None:
+        """Start anew at the newest joints when more steps are due than can be caught up with."""
+        assert self.t0_ns is not None
+        until = self._joints.stamps[-1] if now_ns is None or not self._predicting else max(now_ns, self._joints.stamps[-1])
+        behind = (until - self.t0_ns) // DT_NS - self.k
+        if behind <= MAX_BEHIND or self.k < 0 or len(self._joints.stamps) < 2:
+            return
+        if self._joints.stamps[-1] - self._joints.stamps[-2] <= MAX_BEHIND * DT_NS:
+            return  # a long call without a gap: take every step
+        newest = self._joints.stamps[-1]
+        self.health.note("joints", "gap", f"{behind * DT_NS * 1e-9:.1f} s without joints; the model starts anew at rest")
+        self.health.restarts += 1
+        self.k = (newest - self.t0_ns) // DT_NS - 1
+        self._fused = self._alone = None
+        self._kept.clear()
+        self._return_to = None
+
+    # -- steps --
+
+    def _inputs(self, corrected: bool) -> InputsAt:
+        """Actuators and load at a time (s from t0), with the estimated offsets and force for the fused run."""
+        n, t0 = self.model.n, self.t0_ns
+        assert t0 is not None
+        extrapolate = self._timeout_ns if self._predicting else 0
+        joints, load = self._joints, self._load
+        offset = np.full(n, self._nominal_offset)
+        force = np.zeros(3)
+        if corrected:
+            for i, row in self._offset_rows:
+                offset[i] += self.fusion.theta[row]
+            force = self.fusion.theta[self.fusion.uncertainty.force]
+
+        def at(t: float) -> Inputs:
+            time_ns = t0 + round(t * 1e9)
+            value, rate = joints.at(time_ns, extrapolate)
+            wrench = load.at(time_ns)[0] if load.stamps else _NO_LOAD
+            return Inputs(value[:n] + offset, rate[:n], value[n:], rate[n:], wrench[:3] + force, wrench[3:])
+
+        return at
+
+    def _start(self, k: int) -> str:
+        """Both runs at rest at step ``k``; returns the reason when there is no equilibrium."""
+        t = k * DT_NS * 1e-9
+        self.fusion.theta[:] = 0.0
+        self.fusion._apply_theta()
+        try:
+            self._fused = self.simulator.rest(self._inputs(False)(t))
+        except InputError as error:
+            self._fused = self._alone = None
+            return str(error)
+        self._fused.inputs = _standing(self._fused.inputs)
+        self._alone = self._fused.copy()
+        self.fusion.start(self._fused, t)
+        self._alone_tips.clear(1)
+        self._keep_alone_tip(t)
+        self._modes, self._modes_k = None, k - MODES_EVERY
+        for sample in self._samples:
+            sample.fused_k = None
+        self._kept.clear()
+        self._keep(k)
+        return ""
+
+    def _take(self, k: int) -> StepOutput:
+        """Take step ``k`` and describe it."""
+        self.health.steps += 1
+        if self._fused is None:
+            reason = self._start(k)
+            if reason:
+                self.health.failed("no static equilibrium")
+                return self._invalid(k, reason)
+            return self._output(k, StepResult(True, "at rest", 0, 0, 0))
+        result = self._step(k)
+        self.health.sweeps += result.sweeps
+        if not result.ok:
+            self.health.failed(result.reason)
+            self._failures += 1
+            if self._failures >= MAX_FAILURES:
+                self._failures = 0
+                self._fused = None
+                self.health.restarts += 1
+            return self._invalid(k, f"step failed: {result.reason}")
+        self._failures = 0
+        return self._output(k, result)
+
+    def _step(self, k: int, again: bool = False) -> StepResult:
+        """Both runs from step k - 1 to k, and every sample that has become due."""
+        assert self._fused is not None and self._alone is not None
+        before, t = (k - 1) * DT_NS * 1e-9, k * DT_NS * 1e-9
+        result = self.simulator.step(self._fused, before, self._inputs(True), record=True)
+        if not result.ok:
+            return result
+        if result.substeps > 1:
+            self.health.substeps += 1
+        alone = self.reference.step(self._alone, before, self._inputs(False))
+        if not alone.ok:
+            return alone
+        self._keep_alone_tip(t)
+        if not self.fusion.predict(self._fused, result, t):
+            self.health.note("tracker", "tangent", "the step could not be linearised; the covariance was held")
+        self._fuse(k, t)
+        self._keep(k)
+        return result
+
+    def _keep_alone_tip(self, t: float) -> None:
+        assert self._alone is not None
+        S = self._alone.nodes.shape[1]
+        tip = tip_of(t, self._alone.nodes[-1], np.zeros((S, 1)), float(self._alone.inputs.beta_rate[0]))
+        self._alone_tips.append(tip)
+
+    def _fuse(self, k: int, t: float) -> None:
+        """Samples whose own time is now past."""
+        assert self._fused is not None and self.t0_ns is not None
+        for sample in self._samples:
+            if sample.fused_k is not None:
+                continue
+            time_s = (sample.stamp_ns - self.t0_ns) * 1e-9
+            if time_s - self.tracker.delay > t + 1e-9:
+                continue
+            sample.fused_k = k
+            self._compare(sample, time_s)
+            if self._fusing:
+                update = self.fusion.update(self._fused, time_s, sample.position, sample.quaternion)
+            else:
+                update = self.fusion.compare(time_s, sample.position, sample.quaternion)
+            if update.dof:
+                self.health.measured(update.nis, update.dof, update.accepted)
+            else:
+                self.health.dropped += 1
+                self.health.note("tracker", "outside the window", f"pose of t = {time_s:.3f} s at step {k}: {update.reason}")
+            self._innovations.append(
+                Innovation(
+                    sample.stamp_ns, update.residual, update.variance, update.nis, update.dof, update.accepted, sample.late_s, update.reason
+                )
+            )
+        limit = self.t0_ns + k * DT_NS - 2 * self.window_ns - 300_000_000
+        while self._samples and self._samples[0].stamp_ns < limit:
+            self._samples.pop(0)
+        self.health.force_sigma = self.fusion.force_sigma
+
+    def _compare(self, sample: Sample, time_s: float) -> None:
+        """Residuals of the published outputs against a sample, before its update."""
+        dt = DT_NS * 1e-9
+        fused = self.fusion.tips.at(time_s - self.tracker.delay, dt)
+        alone = self._alone_tips.at(time_s - self.tracker.delay, dt)
+        if fused is None or alone is None:
+            return
+        position, _ = self.tracker.to_base(sample.position, sample.quaternion)
+        estimate = registered(self.tracker, self.fusion.bias, fused)[0]
+        self._squares[0] += float(np.sum((position - alone.position) ** 2))
+        self._squares[1] += float(np.sum((position - estimate) ** 2))
+        self._residuals += 1
+
+    # -- roll-back --
+
+    def _keep(self, k: int) -> None:
+        """Remember the whole state after step ``k``, for as long as inputs may come late."""
+        if not self._predicting and k % 8:
+            return
+        assert self._fused is not None and self._alone is not None
+        self._kept.append(Kept(k, self._fused.copy(), self._alone.copy(), self.fusion.snapshot(), self._alone_tips.snapshot()))
+        oldest = k - self.window_ns // DT_NS - 9
+        while len(self._kept) > 1 and self._kept[1].k <= oldest:
+            self._kept.popleft()
+        assert self.t0_ns is not None
+        horizon = self.t0_ns + self._kept[0].k * DT_NS
+        self._joints.forget(horizon)
+        self._load.forget(horizon)
+
+    def _go_back(self) -> None:
+        """Return to the last kept state before the changed inputs and step again, silently, to where the estimator was."""
+        from_ns, self._return_to = self._return_to, None
+        assert from_ns is not None and self.t0_ns is not None
+        reached = self.k
+        usable = [kept for kept in self._kept if self.t0_ns + kept.k * DT_NS <= from_ns]
+        if not usable and self._kept and self._kept[0].k == 0:
+            if self._start(0):
+                return
+            k = 0
+        elif self._kept:
+            kept = usable[-1] if usable else self._kept[0]
+            while self._kept and self._kept[-1].k > kept.k:
+                self._kept.pop()
+            k = kept.k
+            self._fused, self._alone = kept.fused.copy(), kept.alone.copy()
+            self.fusion.restore(kept.fusion)
+            self._alone_tips.restore(kept.alone_tips)
+            for sample in self._samples:
+                if sample.fused_k is not None and sample.fused_k > k:
+                    sample.fused_k = None
+        else:
+            return
+        before = (len(self._innovations), self.health.nis_sum)
+        counters = self._frozen()
+        for again in range(k + 1, reached + 1):
+            self.health.rolled_back += 1
+            result = self._step(again, again=True)
+            if not result.ok:
+                self.health.failed(result.reason)
+                self._fused = None
+                break
+        self._thaw(counters, before[0], k)
+
+    def _frozen(self) -> tuple:
+        h = self.health
+        return (h.nis_count, h.nis_sum, h.nis_dof, h.accepted, h.rejected, h.dropped, list(h.recent), list(self._squares), self._residuals)
+
+    def _thaw(self, counters: tuple, innovations: int, k: int) -> None:
+        """Samples that were counted when they were first fused are not counted again."""
+        h = self.health
+        repeated = {i.stamp_ns for i in self._reported}
+        fresh = [i for i in self._innovations[innovations:] if i.stamp_ns not in repeated]
+        del self._innovations[innovations:]
+        (h.nis_count, h.nis_sum, h.nis_dof, h.accepted, h.rejected, h.dropped, recent, self._squares, self._residuals) = counters
+        h.recent.clear()
+        h.recent.extend(recent)
+        for innovation in fresh:
+            if innovation.dof:
+                h.measured(innovation.nis, innovation.dof, innovation.accepted)
+            self._innovations.append(innovation)
+
+    @property
+    def _reported(self) -> deque[Innovation]:
+        if not hasattr(self, "_reported_store"):
+            self._reported_store: deque[Innovation] = deque(maxlen=200)
+        return self._reported_store
+
+    # -- outputs --
+
+    def _take_innovations(self) -> list[Innovation]:
+        innovations, self._innovations = self._innovations, []
+        self._reported.extend(innovations)
+        return innovations
+
+    def _invalid(self, k: int, reason: str) -> StepOutput:
+        self.health.problem = reason
+        nan3, nan4, nan6 = np.full(3, np.nan), np.full(4, np.nan), np.full(6, np.nan)
+        stamp = self._stamp(k)
+        assert stamp is not None
+        return StepOutput(
+            stamp, k, False, reason, nan3, nan4, np.full((6, 6), np.nan), nan6, np.full((6, 6), np.nan), nan3, nan4,
+            np.zeros((0, 15), np.float32), Modes.none(), nan3, nan3, self._take_innovations(), SolverStats(0, 0, reason),
+        )  # fmt: skip
+
+    def _problem(self, k: int) -> str:
+        """Why the output of step ``k`` cannot be trusted; empty when it can."""
+        stamp = self._stamp(k)
+        assert stamp is not None
+        age = (stamp - self._joints.stamps[-1]) * 1e-9
+        limit = self._timeout_ns * 1e-9
+        if age > limit:
+            return f"joint states are missing: the last is {age:.3f} s old, limit {limit:g} s"
+        if self._fusing and self.health.rejecting:
+            return "the tracker contradicts the model: nearly all samples of the last second are outside the gate"
+        return ""
+
+    def _output(self, k: int, result: StepResult) -> StepOutput:
+        assert self._fused is not None and self._alone is not None
+        stamp = self._stamp(k)
+        assert stamp is not None
+        position, quaternion, twist, covariance = self.fusion.tip_estimate()
+        force = self.fusion.uncertainty.force
+        variance = self.fusion.force_variance()
+        alone = self._alone_tips.last
+        predicted_q = alone.quaternion.copy()
+        numbers = (position, quaternion, twist, covariance, alone.position, predicted_q, self.fusion.theta[force], variance)
+        if not all(np.all(np.isfinite(x)) for x in numbers):
+            self._fused = None
+            self.health.failed("not finite")
+            self.health.restarts += 1
+            return self._invalid(k, "the estimate is not finite; the model starts anew at rest")
+        problem = self._problem(k)
+        self.health.problem = problem
+        return StepOutput(
+            stamp, k, not problem, problem, position, quaternion, covariance[:6, :6], twist, covariance[6:, 6:],
+            alone.position.copy(), predicted_q, self._backbone(), self._measure_modes(k), self.fusion.theta[force].copy(),
+            np.sqrt(variance), self._take_innovations(), SolverStats(result.iterations, result.sweeps, result.reason),
+        )  # fmt: skip
+
+    def _backbone(self) -> NDArray[np.float32]:
+        state = self._fused
+        assert state is not None
+        bias = self.fusion.bias
+        back = matrix(conjugate(self.tracker.rotation))
+        turn = matrix(from_vector(back @ bias[ROTATION]))
+        key = (state.key, tuple(state.inputs.beta))
+        if key not in self._rows:
+            if len(self._rows) > 8:
+                self._rows.clear()
+            self._rows[key] = (node_positions(state.mesh, state.inputs.beta), node_points(state.mesh.sec_cells))
+        s, points = self._rows[key]
+        rows = np.empty((len(state.nodes), 15), np.float32)
+        c = self.fusion.columns
+        r = c.theta.shape[1]
+        backbone_rows(
+            s, state.nodes, state.fields, points, self.model.n, float(state.inputs.beta_rate[0]), turn, back @ bias[TRANSLATION],
+            c.dnodes, np.ascontiguousarray(self.fusion.pi[:r, :r]), rows,
+        )  # fmt: skip
+        return rows
+
+    def _measure_modes(self, k: int) -> Modes:
+        state = self._fused
+        assert state is not None
+        inputs = state.inputs
+        if k - self._modes_k >= MODES_EVERY or (self._modes is not None and self._modes.key != state.key):
+            self._modes_k = k
+            par = self.simulator.parameters.copy()
+            layout = self.model.layout
+            equilibrium = Statics(self.model, 1e-6).solve(
+                inputs.beta, inputs.alpha, inputs.force, inputs.torque, guess=state.unknowns[-1], parameters=par
+            )
+            self._modes = None
+            if equilibrium.converged:
+                par[layout["alpha"]], par[layout["beta"]], par[layout["alpha_rate"]] = inputs.alpha, inputs.beta, 0.0
+                par[layout["force"]], par[layout["torque"]] = inputs.force, inputs.torque
+                self._modes = modal_basis(self.model, equilibrium, par, inputs.beta)
+        if self._modes is None:
+            return Modes.none()
+        return self._modes.measure(state.fields, input_vector(inputs.alpha, inputs.beta, inputs.force, inputs.torque))
+
+    def snapshot(self) -> dict[str, Any]:
+        """Where the estimator stands, for a file."""
+        f = self.fusion
+        names = f.uncertainty.names
+        r = f.columns.theta.shape[1] if self._fused is not None else 0
+        deviation = np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", f.columns.theta, f.pi[:r, :r], f.columns.theta), 0.0)) if r else None
+        return {
+            "k": self.k,
+            "stamp_ns": self._stamp(self.k),
+            "problem": self.health.problem,
+            "parameters": {
+                name: {"value": float(f.theta[i]), "sigma": float(deviation[i]) if deviation is not None else None}
+                for i, name in enumerate(names)
+            },
+            "tracker_bias": [float(x) for x in f.bias],
+            "tip_force_drive_N": f.force_sigma,
+            "statuses": [{"name": s.name, "level": s.level, "message": s.message, "values": s.values} for s in self.health.statuses()],
+        }
+
+    def summary(self) -> dict[str, Any]:
+        """The estimator's part of a replay's summary."""
+        h, count = self.health, self._residuals
+        rms = [math.sqrt(square / count) if count else None for square in self._squares]
+        return {
+            "steps": h.steps,
+            "residual_rms_m": {"predicted": rms[0], "fused": rms[1] if self._fusing else None},
+            "nis": h.nis_summary(),
+            "rejected": h.rejected,
+            "late": h.late,
+            "dropped": h.dropped,
+            "solver": {
+                "failures": h.failures,
+                "reasons": dict(h.reasons),
+                "restarts": h.restarts,
+                "substeps": h.substeps,
+                "sweeps_per_step": h.sweeps / h.steps if h.steps else 0.0,
+                "steps_taken_again": h.rolled_back,
+            },
+        }
+
+
+_NO_LOAD = np.zeros(6)
+
+
+def _standing(inputs: Inputs) -> Inputs:
+    """The same actuators at rest."""
+    zero = np.zeros_like(inputs.alpha)
+    return Inputs(inputs.alpha, zero, inputs.beta, zero, inputs.force, inputs.torque)

@@ -1,0 +1,148 @@
+"""Health of the estimator: counters of everything odd, turned into statuses by plain functions of numbers; no wall clock."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from dataclasses import dataclass, field
+
+from scipy.stats import chi2
+
+from .outputs import ERROR, OK, WARN, Status
+
+
+@dataclass
+class Counter:
+    """How often something happened, and its last occurrence in words."""
+
+    count: int = 0
+    last: str = ""
+
+    def add(self, what: str) -> None:
+        """Count one."""
+        self.count += 1
+        self.last = what
+
+
+@dataclass
+class Health:
+    """Counters and running figures of the estimator.
+
+    ``joints``, ``tracker``, ``load``: input problems by kind. ``nis_sum``, ``nis_dof``, ``nis_count``: over all samples that reached the gate.
+    ``recent``: (nis / dof, accepted) of the last second's samples.
+    """
+
+    joints: dict[str, Counter] = field(default_factory=dict)
+    tracker: dict[str, Counter] = field(default_factory=dict)
+    load: dict[str, Counter] = field(default_factory=dict)
+    problem: str = "waiting for the first complete joint state"
+    steps: int = 0
+    failures: int = 0
+    reasons: dict[str, int] = field(default_factory=dict)
+    restarts: int = 0
+    rejected: int = 0
+    late: int = 0
+    dropped: int = 0
+    accepted: int = 0
+    nis_sum: float = 0.0
+    nis_dof: int = 0
+    nis_count: int = 0
+    recent: deque[tuple[float, bool]] = field(default_factory=lambda: deque(maxlen=40))
+    sweeps: int = 0
+    substeps: int = 0
+    rolled_back: int = 0
+    fusing: bool = True
+    force_sigma: float = 0.0
+
+    def note(self, group: str, kind: str, what: str) -> None:
+        """Count an input problem of ``kind`` in ``group`` (joints, tracker or load)."""
+        getattr(self, group).setdefault(kind, Counter()).add(what)
+
+    def failed(self, reason: str) -> None:
+        """Count a failed step."""
+        self.failures += 1
+        self.reasons[reason] = self.reasons.get(reason, 0) + 1
+
+    def measured(self, nis: float, dof: int, accepted: bool) -> None:
+        """Count a tracker sample that reached the gate."""
+        self.nis_count += 1
+        self.nis_sum += nis
+        self.nis_dof += dof
+        self.recent.append((nis / dof, accepted))
+        if accepted:
+            self.accepted += 1
+        else:
+            self.rejected += 1
+
+    @property
+    def rejecting(self) -> bool:
+        """Whether nearly all recent samples were refused: the tracker and the model do not describe the same robot."""
+        return len(self.recent) >= 20 and sum(accepted for _, accepted in self.recent) < 0.2 * len(self.recent)
+
+    def nis_summary(self) -> dict[str, float | int | bool | None]:
+        """Mean NIS per degree of freedom with the 95 % band of that mean for a consistent filter."""
+        if not self.nis_dof:
+            return {"mean": None, "dof": 0, "lower95": None, "upper95": None, "within": None}
+        mean = self.nis_sum / self.nis_dof
+        lower, upper = (float(chi2.ppf(p, self.nis_dof)) / self.nis_dof for p in (0.025, 0.975))
+        return {"mean": mean, "dof": self.nis_dof, "lower95": lower, "upper95": upper, "within": lower <= mean <= upper}
+
+    def statuses(self) -> list[Status]:
+        """One status a part."""
+        return [self._output(), self._solver(), self._inputs("joints"), self._tracker(), self._inputs("load"), self._consistency()]
+
+    def _output(self) -> Status:
+        return Status("output", ERROR if self.problem else OK, self.problem or "valid", {"steps": str(self.steps)})
+
+    def _solver(self) -> Status:
+        values = {
+            "failures": str(self.failures),
+            "restarts": str(self.restarts),
+            "steps in substeps": str(self.substeps),
+            "steps taken again": str(self.rolled_back),
+            "sweeps per step": f"{self.sweeps / self.steps:.1f}" if self.steps else "0",
+        }
+        values.update({f"failed: {reason}": str(count) for reason, count in self.reasons.items()})
+        if self.failures:
+            return Status("solver", WARN, f"{self.failures} steps failed; the last reason is in the values", values)
+        return Status("solver", OK, "ok", values)
+
+    def _inputs(self, group: str) -> Status:
+        counters: dict[str, Counter] = getattr(self, group)
+        values = {kind: f"{c.count}, last: {c.last}" for kind, c in counters.items()}
+        if counters:
+            worst = max(counters.items(), key=lambda item: item[1].count)
+            return Status(group, WARN, f"{worst[0]} ({worst[1].count}): {worst[1].last}", values)
+        return Status(group, OK, "ok", values)
+
+    def _tracker(self) -> Status:
+        status = self._inputs("tracker")
+        values = {
+            **status.values,
+            "accepted": str(self.accepted),
+            "rejected": str(self.rejected),
+            "late": str(self.late),
+            "dropped": str(self.dropped),
+            "fusion": "on" if self.fusing else "off",
+        }
+        if self.rejecting:
+            refused = sum(not accepted for _, accepted in self.recent)
+            message = (
+                f"{refused} of the last {len(self.recent)} samples are outside the gate (limit 80 %): "
+                "check the tracker's frame, units, stamps and the robot file"
+            )
+            return Status("tracker", ERROR, message, values)
+        return Status("tracker", status.level, status.message, values)
+
+    def _consistency(self) -> Status:
+        values = {"force deviation N": f"{self.force_sigma:.4g}"}
+        if not self.recent:
+            return Status("consistency", OK, "no samples yet", values)
+        mean = sum(ratio for ratio, _ in self.recent) / len(self.recent)
+        # the samples of one second: white for a consistent filter, 6 degrees of freedom each
+        limit = 1.0 + 4.0 * math.sqrt(2.0 / (6.0 * len(self.recent)))
+        values["nis per dof, last second"] = f"{mean:.2f}"
+        if mean > limit:
+            message = f"mean NIS {mean:.2f} per degree of freedom, limit {limit:.2f}: the model misses an effect, or the noise is larger than stated"
+            return Status("consistency", WARN, message, values)
+        return Status("consistency", OK, f"mean NIS {mean:.2f} per degree of freedom", values)

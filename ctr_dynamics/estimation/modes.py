@@ -1,0 +1,181 @@
+"""Slowest vibration modes about the current equilibrium, and how much of each the robot is in now.
+
+One backward Euler step of size h maps a perturbation of the fields by (1 - h A)^-1 with A the linearised dynamics, so block Arnoldi on the tangent
+of that step is shift-invert Arnoldi with the shift 1/h: the slowest modes come out first. For an eigenvalue lambda of the step, mu = (1 - 1/lambda) / h.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ctr_dynamics.model.model import Model
+from ctr_dynamics.model.newton import lanes_for
+from ctr_dynamics.model.statics import Equilibrium
+from ctr_dynamics.model.tangent import linearise
+
+from .columns import field_weights
+from .outputs import Modes
+from .rotations import matrix
+
+Floats = NDArray[np.float64]
+SHIFT_STEP = 0.01  # s: the shift 100 / s lies among the slow bending modes
+BLOCK = 8
+ROUNDS = 2
+MAX_DAMPING = 0.7  # more is no vibration
+
+
+@dataclass(frozen=True)
+class ModalBasis:
+    """Modes about one equilibrium.
+
+    Attributes:
+        frequency_hz, damping: (m,). exponent: (m,) complex mu in 1/s.
+        readout: (m, fields) complex: modal coordinate z = readout (y - rest) such that the tip's displacement along the mode's main direction is
+            2 Re z and its speed 2 Re(mu z).
+        rest: (fields,) fields of the equilibrium; inputs (3N + 6,): actuators and load there, as :func:`input_vector` orders them.
+        follow: (fields, 2N + 6) how the equilibrium's fields move with alpha, beta, force and torque.
+        direction: (m, 3) unit, main direction of the tip's motion in ``ctr_base``.
+    """
+
+    key: tuple
+    frequency_hz: Floats
+    damping: Floats
+    exponent: NDArray[np.complex128]
+    readout: NDArray[np.complex128]
+    rest: Floats
+    direction: Floats
+    inputs: Floats
+    follow: Floats
+
+    def measure(self, fields: Floats, inputs: Floats) -> Modes:
+        """Amplitude and rate of each mode in ``fields`` (fields,) at the actuators and load ``inputs`` (2N + 6,)."""
+        z = self.readout @ (fields - self.rest) - self.readout_follow @ (inputs - self.inputs)
+        return Modes(self.frequency_hz, self.damping, 2.0 * z.real, 2.0 * (self.exponent * z).real)
+
+    @cached_property
+    def readout_follow(self) -> NDArray[np.complex128]:
+        """(m, 2N + 6) modal coordinates of the moving equilibrium."""
+        return self.readout @ self.follow
+
+
+def input_vector(alpha: Floats, beta: Floats, force: Floats, torque: Floats) -> Floats:
+    """(2N + 6,) alpha, beta, force and torque in one vector."""
+    return np.concatenate([alpha, beta, force, torque])
+
+
+def _follow(model: Model, equilibrium: Equilibrium, par: Floats) -> Floats | None:
+    """d(equilibrium's fields)/d(alpha, beta, force, torque), (fields, 2N + 6)."""
+    n, layout = model.n, model.layout
+    rows = np.concatenate([layout.rows(name) for name in ("alpha", "beta", "force", "torque")])
+    m, count = 5 + n, len(rows)
+    lanes = lanes_for(1 + m + count)
+    L = 8 * len(lanes)
+    big = model.buffers(equilibrium.mesh, L)
+    main, base = len(big[4]) // L, len(big[5]) // L
+    scale = np.array([1e-2] * n + [1e-4] * n + [1e-4] * 3 + [1e-6] * 3)
+    dpar = np.zeros((layout.size, count))
+    dpar[rows, range(count)] = scale
+    fields, nodes = np.zeros((main + base, count)), np.zeros((equilibrium.nodes.size, count))
+    ok = linearise(
+        model.tubes, lanes, equilibrium.mesh, 0.0, par, dpar, equilibrium.x, np.zeros(main), np.zeros(base),
+        np.zeros((main + base, count)), 1e-3, model.step, big, np.zeros((m, m)), np.zeros((m, count)), fields, nodes,
+    )  # fmt: skip
+    return fields / scale if ok else None
+
+
+def modal_basis(model: Model, equilibrium: Equilibrium, par: Floats, beta: Floats, count: int = 4) -> ModalBasis | None:
+    """The ``count`` slowest modes about ``equilibrium`` with the parameter block ``par`` (NP,), actuators and load included; None if there are none.
+
+    Friction enters as its slope at rest.
+    """
+    mesh = equilibrium.mesh
+    n, m = model.n, 5 + model.n
+    lanes = lanes_for(1 + m + BLOCK)
+    L = 8 * len(lanes)
+    big = model.buffers(mesh, L)
+    main, base = len(big[4]) // L, len(big[5]) // L
+    size = main + base
+    c0 = 1.0 / SHIFT_STEP
+    hist = -c0 * equilibrium.fields
+    inverse, dx = np.zeros((m, m)), np.zeros((m, BLOCK))
+    dfields, dnodes = np.zeros((size, BLOCK)), np.zeros((equilibrium.nodes.size, BLOCK))
+    weights = np.sqrt(field_weights(model, mesh, beta))
+
+    def apply(columns: Floats, dpar: Floats) -> Floats | None:
+        scale = 1e-4
+        ok = linearise(
+            model.tubes, lanes, mesh, c0, par, dpar, equilibrium.x, hist[:main], hist[main:], -c0 * scale * columns, 1e-3, model.step,
+            big, inverse, dx, dfields, dnodes,
+        )  # fmt: skip
+        return dfields / scale if ok else None
+
+    # start: responses to a force and a moment on the tip and a turn of each actuator
+    layout = model.layout
+    dpar = np.zeros((layout.size, BLOCK))
+    for i in range(3):
+        dpar[layout["force"].start + i, i] = 1e-6
+        dpar[layout["torque"].start + i, 3 + i] = 1e-8
+    for i in range(min(n, BLOCK - 6)):
+        dpar[layout["torsional_stiffness"].start + i, 6 + i] = 1e-4 * par[layout["torsional_stiffness"].start + i]
+    start = apply(np.zeros((size, BLOCK)), dpar)
+    if start is None:
+        return None
+    dpar[:] = 0.0
+    basis: list[Floats] = []
+    images: list[Floats] = []
+    block = start
+    tip_rows = slice(main - (7 + 2 * n), main)
+    for _ in range(ROUNDS):
+        weighted = weights[:, None] * block
+        for _ in range(2):
+            for q in basis:
+                weighted = weighted - q @ (q.T @ weighted)
+        q, triangle = np.linalg.qr(weighted)
+        keep = np.abs(np.diag(triangle)) > 1e-9 * np.abs(np.diag(triangle)).max()
+        q = np.where(keep, q, 0.0)
+        image = apply(np.where(weights[:, None] > 0, q / np.maximum(weights, 1e-300)[:, None], 0.0), dpar)
+        if image is None:
+            return None
+        basis.append(q)
+        images.append(image)
+        block = image
+    Q, image = np.concatenate(basis, axis=1), np.concatenate(images, axis=1)
+    reduced = Q.T @ (weights[:, None] * image)
+    values, right = np.linalg.eig(reduced)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        mu = (1.0 - 1.0 / values) / SHIFT_STEP
+    left = np.linalg.pinv(right)
+    wanted = np.isfinite(mu) & (mu.imag > 1.0) & (-mu.real < MAX_DAMPING * np.abs(mu)) & (mu.real < 0.05 * np.abs(mu))
+    order = [int(i) for i in np.flatnonzero(wanted)[np.argsort(np.abs(mu[wanted]))]][:count]
+    follow = _follow(model, equilibrium, par)
+    if not order or follow is None:
+        return None
+    R = matrix(equilibrium.tip_quaternion)
+    readout, direction = [], []
+    for i in order:
+        shape = image @ right[:, i] / values[i]  # the mode on all points, weighted or not
+        velocity = R @ shape[tip_rows][0:3]
+        displacement = velocity / mu[i]
+        # main direction: of the largest real part over the phase
+        spread = np.stack([displacement.real, displacement.imag], axis=1)
+        axis = np.linalg.svd(spread, full_matrices=False)[0][:, 0]
+        axis = axis * (1.0 if axis[np.argmax(np.abs(axis))] > 0 else -1.0)
+        readout.append((left[i] @ Q.T) * weights * (axis @ displacement))
+        direction.append(axis)
+    chosen = mu[order]
+    return ModalBasis(
+        equilibrium.key,
+        np.abs(chosen.imag) / (2 * np.pi),
+        -chosen.real / np.abs(chosen),
+        chosen,
+        np.array(readout),
+        equilibrium.fields,
+        np.array(direction),
+        input_vector(par[layout["alpha"]], beta, par[layout["force"]], par[layout["torque"]]),
+        follow,
+    )
+

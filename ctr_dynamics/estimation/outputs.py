@@ -1,0 +1,93 @@
+"""What the estimator gives out: plain numbers, no ROS types."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+
+OK, WARN, ERROR = 0, 1, 2
+
+
+@dataclass(frozen=True)
+class Modes:
+    """Slowest vibration modes: frequency_hz (m,), damping ratio (m,), amplitude (m,) m and rate (m,) m/s of the tip's motion in each."""
+
+    frequency_hz: Floats
+    damping: Floats
+    amplitude: Floats
+    rate: Floats
+
+    @classmethod
+    def none(cls) -> Modes:
+        """No modes known."""
+        empty = np.zeros(0)
+        return cls(empty, empty, empty, empty)
+
+
+@dataclass(frozen=True)
+class Innovation:
+    """A processed tracker sample: residual (6,) and its predicted variance (6,) (position m in the tracker's axes, rotation rad in the
+    sensor's), NIS, degrees of freedom, whether it was fused, how late it came (s), and why it was not fused."""
+
+    stamp_ns: int
+    residual: Floats
+    variance: Floats
+    nis: float
+    dof: int
+    accepted: bool
+    delay_s: float
+    reason: str = ""
+
+
+@dataclass(frozen=True)
+class SolverStats:
+    """Work of one step."""
+
+    iterations: int
+    sweeps: int
+    outcome: str
+
+
+@dataclass(frozen=True)
+class StepOutput:
+    """Everything that is published for one stamp; ``ctr_base``, SI units.
+
+    Attributes:
+        tip_position (3,), tip_quaternion_wxyz (4,), tip_covariance (6, 6): x, y, z, rx, ry, rz about the base axes.
+        tip_velocity (6,): d/dt of the tip point (insertion included) and angular velocity, with its covariance (6, 6).
+        predicted_position, predicted_quaternion_wxyz: the model alone, never corrected.
+        backbone: float32 (P, 15): s, x, y, z, qx, qy, qz, qw, vx, vy, vz, ux, uy, uz, sd.
+        disturbance_force, disturbance_sigma (3,): N, base axes.
+    """
+
+    stamp_ns: int
+    k: int
+    valid: bool
+    reason: str
+    tip_position: Floats
+    tip_quaternion_wxyz: Floats
+    tip_covariance: Floats
+    tip_velocity: Floats
+    tip_velocity_covariance: Floats
+    predicted_position: Floats
+    predicted_quaternion_wxyz: Floats
+    backbone: NDArray[np.float32]
+    modes: Modes
+    disturbance_force: Floats
+    disturbance_sigma: Floats
+    innovations: list[Innovation] = field(default_factory=list)
+    solver: SolverStats = SolverStats(0, 0, "")
+
+
+@dataclass(frozen=True)
+class Status:
+    """One line of health: level 0 ok, 1 warning, 2 error."""
+
+    name: str
+    level: int
+    message: str
+    values: dict[str, str]

@@ -1,0 +1,85 @@
+"""Input signals in time: joints and tip load, linear between stamps, held or extrapolated after the last, with everything odd counted.
+
+Stamps are integer nanoseconds; times handed to the model are seconds from the first complete joint state.
+"""
+
+from __future__ import annotations
+
+import bisect
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+
+
+class Signal:
+    """A vector sampled at stamps, kept for as long as steps may still be taken again.
+
+    Attributes:
+        stamps: int ns, increasing; values: one (size,) array each.
+    """
+
+    def __init__(self, size: int) -> None:
+        self.size = size
+        self.stamps: list[int] = []
+        self.values: list[Floats] = []
+
+    def add(self, stamp_ns: int, value: Floats) -> str:
+        """Insert a sample: "new" (after all others), "late" (between others), or "duplicate" (that stamp is known; kept as it was)."""
+        if not self.stamps or stamp_ns > self.stamps[-1]:
+            self.stamps.append(stamp_ns)
+            self.values.append(value)
+            return "new"
+        i = bisect.bisect_left(self.stamps, stamp_ns)
+        if self.stamps[i] == stamp_ns:
+            return "duplicate"
+        self.stamps.insert(i, stamp_ns)
+        self.values.insert(i, value)
+        return "late"
+
+    def forget(self, before_ns: int) -> None:
+        """Drop samples that no time from ``before_ns`` on needs."""
+        i = bisect.bisect_right(self.stamps, before_ns) - 1
+        if i > 0:
+            del self.stamps[:i], self.values[:i]
+
+    def at(self, time_ns: float, extrapolate_ns: int = 0) -> tuple[Floats, Floats]:
+        """Value and rate (1/s) at a time: linear between samples, the first before all, extrapolated by the last rate for at most
+        ``extrapolate_ns`` after the last and held from there."""
+        stamps, values = self.stamps, self.values
+        i = bisect.bisect_right(stamps, time_ns)
+        if i == 0:
+            return values[0], np.zeros(self.size)
+        if i < len(stamps):
+            span = stamps[i] - stamps[i - 1]
+            rate = (values[i] - values[i - 1]) * (1e9 / span)
+            return values[i - 1] + (values[i] - values[i - 1]) * ((time_ns - stamps[i - 1]) / span), rate
+        if extrapolate_ns <= 0 or len(stamps) < 2 or time_ns == stamps[-1]:
+            return values[-1], np.zeros(self.size)
+        rate = (values[-1] - values[-2]) * (1e9 / (stamps[-1] - stamps[-2]))
+        ahead = time_ns - stamps[-1]
+        if ahead > extrapolate_ns:
+            return values[-1] + rate * (extrapolate_ns * 1e-9), np.zeros(self.size)
+        return values[-1] + rate * (ahead * 1e-9), rate
+
+
+def joint_order(names: Sequence[str], n: int) -> list[int] | str:
+    """Positions in a JointState's list of tube1_rotation.., tube1_translation..; or what is missing or double, in words."""
+    wanted = [f"tube{i + 1}_{kind}" for kind in ("rotation", "translation") for i in range(n)]
+    where = {name: i for i, name in enumerate(names)}
+    missing = [name for name in wanted if name not in where]
+    if missing:
+        have = ", ".join(list(names)[:8]) or "none"
+        return f"joint state lacks {', '.join(missing)} (it has: {have}); name the joints tubeN_rotation and tubeN_translation"
+    double = sorted({name for name in wanted if list(names).count(name) > 1})
+    if double:
+        return f"joint state names {', '.join(double)} more than once; name each joint once"
+    return [where[name] for name in wanted]
+
+
+def finite(values: Sequence[float]) -> bool:
+    """Whether every number is finite."""
+    return all(math.isfinite(v) for v in values)
