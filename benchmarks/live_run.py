@@ -1,4 +1,4 @@
-"""Punctuality of the estimator node over real DDS: how many steps are late, how late, and that none is skipped.
+"""Punctuality of the estimator node over real DDS: steps published late, how late, and none skipped.
 
 The estimator and a driver run as two processes of this machine; nobody but this script's own listener (with
 --listen) hears the outputs. Bags are played one after the other, each run with a fresh estimator, until the

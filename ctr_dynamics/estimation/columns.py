@@ -13,9 +13,8 @@ from numpy.typing import NDArray
 from ctr_dynamics.model.mesh import Mesh, section_lengths
 from ctr_dynamics.model.model import Model
 from ctr_dynamics.model.newton import lanes_for
-from ctr_dynamics.model.scheme import RATES, Y_NOW, Scheme
 from ctr_dynamics.model.simulator import Record, remap_fields
-from ctr_dynamics.model.tangent import linearise, step_tangent
+from ctr_dynamics.model.tangent import linearise, theta_tangent
 
 from .uncertainty import ModelUncertainty
 
@@ -62,16 +61,14 @@ class Columns:
     """V and its parts.
 
     Attributes:
-        stored: (slots, fields, r) columns of the stored fields: y_n, and for multi-step schemes y_{n-1} and the last rate.
+        stored: (2, fields, r) columns of the fields and of their rates.
         theta: (n_theta, r) parameter parts.
         dnodes: (nodes * S, r) columns of the node states after the last step.
         dx: (5 + N, r) columns of the unknowns after the last step.
     """
 
-    def __init__(self, model: Model, uncertainty: ModelUncertainty, rank: int, scheme: Scheme) -> None:
+    def __init__(self, model: Model, uncertainty: ModelUncertainty, rank: int) -> None:
         self.model, self.uncertainty, self.rank = model, uncertainty, rank
-        self.stages = scheme.stages
-        self.slots = 1 if scheme.one_step else RATES
         self._work: dict[tuple, tuple] = {}
         self._weights: dict[tuple, Floats] = {}
         self.key: tuple = ()
@@ -100,8 +97,8 @@ class Columns:
         wide = max(count, r)
         self.theta = np.zeros((count, wide))
         self.theta[:, :count] = np.diag(scale)
-        self.stored = np.zeros((self.slots, main + base, wide))
-        self.stored[: max(1, self.slots - 1), :, :count] = fields
+        self.stored = np.zeros((2, main + base, wide))
+        self.stored[0, :, :count] = fields
         self.dnodes, self.dx = np.zeros((len(dnodes), wide)), np.zeros((m, wide))
         self.dnodes[:, :count], self.dx[:, :count] = dnodes, dx
         variance = np.zeros(wide)
@@ -111,7 +108,7 @@ class Columns:
     @property
     def fields(self) -> Floats:
         """(fields, r) columns of the fields."""
-        return self.stored[Y_NOW]
+        return self.stored[0]
 
     def _remap(self, record: Record, beta: Floats) -> None:
         """Carry the columns to another set of sections."""
@@ -142,18 +139,16 @@ class Columns:
                 self._work[work_key] = (
                     lanes, big, (np.zeros(main), np.zeros(base), np.zeros((main + base, columns))), np.zeros((m, m)),
                     np.zeros((m, columns)), np.zeros((len(big[8]) // L, columns)),
-                    np.zeros((RATES + self.stages, main + base, columns)),
                 )  # fmt: skip
-            lanes, big, work, inverse, dx, dnodes, dbank = self._work[work_key]
-            dbank[: self.slots] = self.stored
-            ok = step_tangent(
-                model.tubes, lanes, record.mesh, record.scheme.c0, record.scheme.weights, par.copy(), record.inputs, record.found,
-                record.before, record.rates, dpar, EPSILON, model.step, big, work, dbank, inverse, dx, dnodes,
+            lanes, big, work, inverse, dx, dnodes = self._work[work_key]
+            stored = self.stored.copy()
+            ok = theta_tangent(
+                model.tubes, lanes, record.mesh, record.scheme.dt, par.copy(), record.inputs[-1], record.found[-1], record.after,
+                record.rates[-1], dpar, EPSILON, model.step, big, work, stored[0], stored[1], inverse, dx, dnodes,
             )  # fmt: skip
             if not ok:
                 return False
-            self.stored = dbank[: self.slots].copy()
-            self.dx, self.dnodes = dx.copy(), dnodes.copy()
+            self.stored, self.dx, self.dnodes = stored, dx.copy(), dnodes.copy()
         return True
 
     def widen(self, count: int) -> None:

@@ -33,7 +33,7 @@ from .modes import ModalBasis, input_vector, modal_basis
 from .outputs import Innovation, Modes, SolverStats, StepOutput
 from .rotations import conjugate, from_vector, matrix
 from .signals import Signal, finite, joint_order
-from .tip import TipWindow, tip_of
+from .tip import TipWindow
 from .tracker import ROTATION, TRANSLATION, registered, tracker_model
 
 Floats = NDArray[np.float64]
@@ -133,6 +133,7 @@ class Estimator:
         self._backwards = 0
         self._squares = [0.0, 0.0]
         self._residuals = 0
+        self._known: dict[float, tuple[Floats, Floats, Floats]] = {}  # the signals of one step, shared by both runs
         self._rows: dict[tuple, tuple[Floats, NDArray[np.int64]]] = {}
 
     # -- inputs --
@@ -328,6 +329,7 @@ class Estimator:
         assert t0 is not None
         extrapolate = self._timeout_ns if self._predicting else 0
         joints, load = self._joints, self._load
+        known = self._known
         offset = np.full(n, self._nominal_offset)
         force = np.zeros(3)
         if corrected:
@@ -336,9 +338,11 @@ class Estimator:
             force = self.fusion.theta[self.fusion.uncertainty.force]
 
         def at(t: float) -> Inputs:
-            time_ns = t0 + round(t * 1e9)
-            value, rate = joints.at(time_ns, extrapolate)
-            wrench = load.at(time_ns)[0] if load.stamps else _NO_LOAD
+            signals = known.get(t)
+            if signals is None:
+                time_ns = t0 + round(t * 1e9)
+                signals = known[t] = (*joints.at(time_ns, extrapolate), load.at(time_ns)[0] if load.stamps else _NO_LOAD)
+            value, rate, wrench = signals
             return Inputs(value[:n] + offset, rate[:n], value[n:], rate[n:], wrench[:3] + force, wrench[3:])
 
         return at
@@ -346,6 +350,7 @@ class Estimator:
     def _start(self, k: int) -> str:
         """Both runs at rest at step ``k``; returns the reason when there is no equilibrium."""
         t = k * DT_NS * 1e-9
+        self._known.clear()
         self.fusion.theta[:] = 0.0
         self.fusion._apply_theta()
         try:
@@ -387,10 +392,11 @@ class Estimator:
         self._failures = 0
         return self._output(k, result)
 
-    def _step(self, k: int, again: bool = False) -> StepResult:
+    def _step(self, k: int) -> StepResult:
         """Both runs from step k - 1 to k, and every sample that has become due."""
         assert self._fused is not None and self._alone is not None
         before, t = (k - 1) * DT_NS * 1e-9, k * DT_NS * 1e-9
+        self._known.clear()
         result = self.simulator.step(self._fused, before, self._inputs(True), record=True)
         if not result.ok:
             return result
@@ -409,8 +415,7 @@ class Estimator:
     def _keep_alone_tip(self, t: float) -> None:
         assert self._alone is not None
         S = self._alone.nodes.shape[1]
-        tip = tip_of(t, self._alone.nodes[-1], np.zeros((S, 1)), float(self._alone.inputs.beta_rate[0]))
-        self._alone_tips.append(tip)
+        self._alone_tips.append(t, self._alone.nodes[-1], np.zeros((S, 1)), float(self._alone.inputs.beta_rate[0]))
 
     def _fuse(self, k: int, t: float) -> None:
         """Samples whose own time is now past."""
@@ -450,7 +455,7 @@ class Estimator:
         if fused is None or alone is None:
             return
         position, _ = self.tracker.to_base(sample.position, sample.quaternion)
-        estimate = registered(self.tracker, self.fusion.bias, fused)[0]
+        estimate = registered(self.tracker, self.fusion.bias, fused)[:3]
         self._squares[0] += float(np.sum((position - alone.position) ** 2))
         self._squares[1] += float(np.sum((position - estimate) ** 2))
         self._residuals += 1
@@ -498,7 +503,7 @@ class Estimator:
         counters = self._frozen()
         for again in range(k + 1, reached + 1):
             self.health.rolled_back += 1
-            result = self._step(again, again=True)
+            result = self._step(again)
             if not result.ok:
                 self.health.failed(result.reason)
                 self._fused = None
@@ -562,13 +567,12 @@ class Estimator:
         assert self._fused is not None and self._alone is not None
         stamp = self._stamp(k)
         assert stamp is not None
-        position, quaternion, twist, covariance = self.fusion.tip_estimate()
+        tip = self.fusion.tip_estimate()
         force = self.fusion.uncertainty.force
         variance = self.fusion.force_variance()
         alone = self._alone_tips.last
         predicted_q = alone.quaternion.copy()
-        numbers = (position, quaternion, twist, covariance, alone.position, predicted_q, self.fusion.theta[force], variance)
-        if not all(np.all(np.isfinite(x)) for x in numbers):
+        if not (tip.finite and math.isfinite(float(alone.position.sum() + variance.sum()))):
             self._fused = None
             self.health.failed("not finite")
             self.health.restarts += 1
@@ -576,7 +580,7 @@ class Estimator:
         problem = self._problem(k)
         self.health.problem = problem
         return StepOutput(
-            stamp, k, not problem, problem, position, quaternion, covariance[:6, :6], twist, covariance[6:, 6:],
+            stamp, k, not problem, problem, tip.position, tip.quaternion, tip.covariance[:6, :6], tip.twist, tip.covariance[6:, 6:],
             alone.position.copy(), predicted_q, self._backbone(), self._measure_modes(k), self.fusion.theta[force].copy(),
             np.sqrt(variance), self._take_innovations(), SolverStats(result.iterations, result.sweeps, result.reason),
         )  # fmt: skip

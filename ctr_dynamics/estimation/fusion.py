@@ -19,8 +19,8 @@ from ctr_dynamics.model.model import Model
 from ctr_dynamics.model.simulator import Simulator, State, StepResult
 
 from .columns import Columns
-from .tip import TipWindow, tip_of
-from .tracker import DELAY, DRIFT, STATES, TrackerModel, expected, registered, residual, sensitivity
+from .tip import TipWindow
+from .tracker import DELAY, DRIFT, STATES, TrackerModel, expected, registered_rows, residual, sensitivity
 from .uncertainty import bias_sigma, model_uncertainty
 
 Floats = NDArray[np.float64]
@@ -53,6 +53,17 @@ class Update:
     reason: str
 
 
+@dataclass(frozen=True)
+class TipEstimate:
+    """Fused tip: position (3,) m, quaternion (4,) wxyz, twist (6,), covariance (12, 12) of pose and twist (base axes), and whether all is finite."""
+
+    position: Floats
+    quaternion: Floats
+    twist: Floats
+    covariance: Floats
+    finite: bool
+
+
 class Fusion:
     """Filter of one simulated robot.
 
@@ -65,7 +76,7 @@ class Fusion:
         self.model: Model = simulator.model
         self.uncertainty = model_uncertainty(self.model)
         self.nominal = simulator.parameters.copy()
-        self.columns = Columns(self.model, self.uncertainty, options.rank, simulator.scheme)
+        self.columns = Columns(self.model, self.uncertainty, options.rank)
         self.theta = np.zeros(len(self.uncertainty.names))
         self.bias = np.zeros(STATES)
         self.tips = TipWindow(math.ceil(options.window / simulator.scheme.dt) + 3)
@@ -115,17 +126,18 @@ class Fusion:
         force = self.uncertainty.force
         self.theta[force] *= decay
         self.columns.theta[force] *= decay
-        self._drive_drift()
         self._apply_theta()
         self._keep_tip(state, stamp)
         if self.steps % self.options.reduce_every == 0:
+            self._drive_drift(self.options.reduce_every)
             self._drive_force(self.options.reduce_every)
             self._reduce()
         return ok
 
-    def _drive_drift(self) -> None:
+    def _drive_drift(self, steps: int) -> None:
+        """The tracker's drift over ``steps`` steps: it fades and is driven anew."""
         noise = self.model.robot.tracker.noise
-        decay = math.exp(-self.simulator.scheme.dt / noise.drift_time.value)
+        decay = math.exp(-steps * self.simulator.scheme.dt / noise.drift_time.value)
         r = self.columns.theta.shape[1]
         rows = np.arange(r, r + STATES)[DRIFT]
         self.bias[DRIFT] *= decay
@@ -185,7 +197,7 @@ class Fusion:
     def _keep_tip(self, state: State, stamp: float) -> None:
         rate = float(state.inputs.beta_rate[0])
         S = state.nodes.shape[1]
-        self.tips.append(tip_of(stamp, state.nodes[-1], self.columns.dnodes[-S:], rate))
+        self.tips.append(stamp, state.nodes[-1], self.columns.dnodes[-S:], rate)
 
     # -- update --
 
@@ -261,11 +273,14 @@ class Fusion:
 
     # -- outputs --
 
-    def tip_estimate(self) -> tuple[Floats, Floats, Floats, Floats]:
-        """Fused tip now: position (3,) m, quaternion (4,) wxyz, twist (6,), covariance (12, 12) of pose and twist (base axes)."""
-        tip = self.tips.last
-        position, quaternion, J = registered(self.tracker, self.bias, tip)
-        return position, quaternion, np.concatenate([tip.velocity, tip.rate]), J @ self.pi @ J.T
+    def tip_estimate(self) -> TipEstimate:
+        """Fused tip now."""
+        i = (self.tips.count - 1) % self.tips.size
+        pose, covariance = np.empty(7), np.empty((12, 12))
+        finite = registered_rows(
+            self.tips.means[i], self.tips.columns[i], self.tracker.rotation, self.tracker.lever, self.bias, self.pi, pose, covariance
+        )
+        return TipEstimate(pose[:3], pose[3:], self.tips.means[i, 7:13].copy(), covariance, bool(finite))
 
     # -- roll-back --
 

@@ -5,9 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
-from .rotations import conjugate, from_vector, matrix, multiply, to_vector
+from .rotations import conjugate, from_vector, multiply, to_vector
 
 Floats = NDArray[np.float64]
 
@@ -29,24 +30,42 @@ class Tip:
     columns: Floats
 
 
-def tip_of(stamp: float, node: Floats, dnode: Floats, insertion_rate: float) -> Tip:
-    """Tip from the last node's state (S,) and its columns (S, r); ``insertion_rate`` is d beta_1 / dt in m/s."""
-    h = node[3:7] / np.linalg.norm(node[3:7])
-    R = matrix(h)
-    q = np.array([node[7], node[8], node[9] + insertion_rate])
-    velocity, rate = R @ q, R @ node[10:13]
-    norm2 = node[3:7] @ node[3:7]
-    dh = dnode[3:7]
-    # rotation vector of dR in base axes: 2 vec(dh h*) / |h|^2
-    w, x, y, z = node[3:7]
-    product = np.array([[-x, w, -z, y], [-y, z, w, -x], [-z, -y, x, w]])
-    turn = 2.0 / norm2 * (product @ dh)
-    columns = np.empty((12, dnode.shape[1]))
-    columns[0:3] = dnode[0:3]
-    columns[3:6] = turn
-    columns[6:9] = R @ dnode[7:10] + np.cross(turn.T, velocity).T
-    columns[9:12] = R @ dnode[10:13] + np.cross(turn.T, rate).T
-    return Tip(stamp, node[0:3].copy(), h, velocity, rate, columns)
+@njit(cache=True, nogil=True, error_model="numpy")
+def tip_rows(node, dnode, insertion_rate, mean, columns):
+    """Tip from the last node's state (S,) and its columns (S, r): ``mean`` (13,) position, quaternion, velocity, rate; ``columns`` (12, r)."""
+    w, x, y, z = node[3], node[4], node[5], node[6]
+    norm2 = w * w + x * x + y * y + z * z
+    k = 2.0 / norm2
+    R = np.empty((3, 3))
+    R[0, 0], R[0, 1], R[0, 2] = 1 - k * (y * y + z * z), k * (x * y - w * z), k * (x * z + w * y)
+    R[1, 0], R[1, 1], R[1, 2] = k * (x * y + w * z), 1 - k * (x * x + z * z), k * (y * z - w * x)
+    R[2, 0], R[2, 1], R[2, 2] = k * (x * z - w * y), k * (y * z + w * x), 1 - k * (x * x + y * y)
+    q2 = node[9] + insertion_rate
+    norm = np.sqrt(norm2)
+    for i in range(3):
+        mean[i] = node[i]
+        mean[7 + i] = R[i, 0] * node[7] + R[i, 1] * node[8] + R[i, 2] * q2
+        mean[10 + i] = R[i, 0] * node[10] + R[i, 1] * node[11] + R[i, 2] * node[12]
+    for i in range(4):
+        mean[3 + i] = node[3 + i] / norm
+    vx, vy, vz, ax, ay, az = mean[7], mean[8], mean[9], mean[10], mean[11], mean[12]
+    for c in range(dnode.shape[1]):
+        dw, dx, dy, dz = dnode[3, c], dnode[4, c], dnode[5, c], dnode[6, c]
+        # rotation vector of dR in base axes: 2 vec(dh h*) / |h|^2
+        tx = k * (-x * dw + w * dx - z * dy + y * dz)
+        ty = k * (-y * dw + z * dx + w * dy - x * dz)
+        tz = k * (-z * dw - y * dx + x * dy + w * dz)
+        columns[3, c], columns[4, c], columns[5, c] = tx, ty, tz
+        for i in range(3):
+            columns[i, c] = dnode[i, c]
+            columns[6 + i, c] = R[i, 0] * dnode[7, c] + R[i, 1] * dnode[8, c] + R[i, 2] * dnode[9, c]
+            columns[9 + i, c] = R[i, 0] * dnode[10, c] + R[i, 1] * dnode[11, c] + R[i, 2] * dnode[12, c]
+        columns[6, c] += ty * vz - tz * vy
+        columns[7, c] += tz * vx - tx * vz
+        columns[8, c] += tx * vy - ty * vx
+        columns[9, c] += ty * az - tz * ay
+        columns[10, c] += tz * ax - tx * az
+        columns[11, c] += tx * ay - ty * ax
 
 
 def between(a: Tip, b: Tip, stamp: float) -> Tip:
@@ -85,13 +104,11 @@ class TipWindow:
         self.means = np.zeros((self.size, 13))  # position, quaternion, velocity, rate
         self.columns = np.zeros((self.size, 12, columns))
 
-    def append(self, tip: Tip) -> None:
-        """Add the newest tip; the oldest one goes when the window is full."""
+    def append(self, stamp: float, node: Floats, dnode: Floats, insertion_rate: float) -> None:
+        """Add the tip of the last node's state (S,) with columns (S, r); the oldest goes when the window is full. Rate d beta_1 / dt in m/s."""
         i = self.count % self.size
-        self.stamps[i] = tip.stamp
-        mean = self.means[i]
-        mean[0:3], mean[3:7], mean[7:10], mean[10:13] = tip.position, tip.quaternion, tip.velocity, tip.rate
-        self.columns[i] = tip.columns
+        self.stamps[i] = stamp
+        tip_rows(node, dnode, insertion_rate, self.means[i], self.columns[i])
         self.count += 1
 
     def _tip(self, number: int) -> Tip:

@@ -32,6 +32,7 @@ Field rows (F = 7 + 2N): q 0-2, omega 3-5, u of tube 1 6-8, then u_z and gamma o
 
 import math
 
+import numpy as np
 from numba import njit
 
 # Rows of the state that every robot has.
@@ -70,7 +71,7 @@ def lane_count(lanes):
     return max(1, 8 * len(lanes))
 
 
-@njit(cache=True)
+@njit(cache=True, inline="always")
 def offsets(tubes, lanes):
     """First index of each block of the workspace: Y, YS, K, ACC, HI, OU, TMP, PAR, MA, MB."""
     n = len(tubes)
@@ -414,40 +415,49 @@ def _below_base(tubes, lanes, W, c0, cells, ust_base, x, histb, outb):
     L = lane_count(lanes)
     Y, YS, K, ACC, HI, OU, TMP, PAR, MA, MB = offsets(tubes, lanes)
     points = 4 * cells + 1
+    # state, stage, accumulated increment (psi, psi_t, m_z each), step, compliance: all in the workspace, so that lanes vectorise
+    S, A, B = TMP, TMP + 3 * L, TMP + 6 * L
+    DS, CO, US = TMP + 9 * L, TMP + 10 * L, TMP + 11 * L
     for i in range(n):
         GJ, RI, BT, KS = PAR + (n + i) * L, PAR + (3 * n + i) * L, PAR + (5 * n + i) * L, PAR + (6 * n + i) * L
         AL, AV, BE = PAR + (11 * n + i) * L, PAR + (12 * n + i) * L, PAR + (13 * n + i) * L
-        S, A, B = TMP, TMP + 3 * L, TMP + 6 * L  # state, stage, accumulated increment: psi, psi_t, m_z
+        for j in range(L):
+            W[S + 2 * L + j] = x[i * L + j]
         for j in range(L):
             W[S + j] = W[AL + j]
             W[S + L + j] = W[AV + j]
-            W[S + 2 * L + j] = x[i * L + j]
+            W[DS + j] = -W[BE + j] / cells
+            W[CO + j] = 1.0 / (W[GJ + j] + c0 * W[BT + j])
+            W[US + j] = W[GJ + j] * W[KS + j]
         for cell in range(cells):
             for r in range(3 * L):
                 W[A + r] = W[S + r]
                 W[B + r] = 0.0
             for stage in range(4):
                 point = (i * points + 4 * cell + stage) * 2 * L
+                at = np.uint64(point)
                 uz_ref = ust_base[i * points + 4 * cell + stage]
                 weight = 1.0 if stage == 0 or stage == 3 else 2.0
                 ahead = 0.5 if stage < 2 else 1.0
+                for r in range(2 * L):
+                    W[HI + r] = histb[at + np.uint64(r)]
                 for j in range(L):
-                    h = -W[BE + j] / cells
-                    hv, hu = histb[point + j], histb[point + L + j]
-                    gj, bt = W[GJ + j], W[BT + j]
                     psi_t = W[A + L + j]
-                    u = (W[A + 2 * L + j] + gj * W[KS + j] * uz_ref - bt * hu) / (gj + c0 * bt)
-                    ks_, kv, km = u, c0 * u + hu, 2.0 * W[RI + j] * (c0 * psi_t + hv)
-                    outb[point + j] = psi_t
-                    outb[point + L + j] = u
-                    W[B + j] += weight * ks_
+                    u = (W[A + 2 * L + j] + W[US + j] * uz_ref - W[BT + j] * W[HI + L + j]) * W[CO + j]
+                    kv, km = c0 * u + W[HI + L + j], 2.0 * W[RI + j] * (c0 * psi_t + W[HI + j])
+                    W[OU + j] = psi_t
+                    W[OU + L + j] = u
+                    h = ahead * W[DS + j]
+                    W[B + j] += weight * u
                     W[B + L + j] += weight * kv
                     W[B + 2 * L + j] += weight * km
-                    W[A + j] = W[S + j] + ahead * h * ks_
-                    W[A + L + j] = W[S + L + j] + ahead * h * kv
-                    W[A + 2 * L + j] = W[S + 2 * L + j] + ahead * h * km
+                    W[A + j] = W[S + j] + h * u
+                    W[A + L + j] = W[S + L + j] + h * kv
+                    W[A + 2 * L + j] = W[S + 2 * L + j] + h * km
+                for r in range(2 * L):
+                    outb[at + np.uint64(r)] = W[OU + r]
             for j in range(L):
-                h = -W[BE + j] / cells / 6.0
+                h = W[DS + j] / 6.0
                 W[S + j] += h * W[B + j]
                 W[S + L + j] += h * W[B + L + j]
                 W[S + 2 * L + j] += h * W[B + 2 * L + j]
@@ -539,9 +549,9 @@ def sweep(
     for k in range(len(sec_cells)):
         present = sec_tubes[k]
         # transition into this section: friction from the jump of the inner tubes' moments
-        b = point * F * L
+        at = np.uint64(point * F * L)
         for r in range(F * L):
-            W[HI + r] = hist[b + r]
+            W[HI + r] = hist[at + np.uint64(r)]
         for r in range(S * L):
             W[YS + r] = W[Y + r]
         _curvature(tubes, lanes, W, present, ust, point * 3 * n, c0)
@@ -552,43 +562,46 @@ def sweep(
                 res[(5 + present) * L + j] = -W[Y + (Z0 + present) * L + j]
                 W[Y + (Z0 + present) * L + j] = 0.0
         cells = sec_cells[k]
+        for j in range(L):
+            W[MA + j] = seclen[k * L + j] / cells  # MA is free until the section's end
         for cell in range(cells):
+            here = np.uint64(node * S * L)
             for r in range(S * L):
-                nodes[node * S * L + r] = W[Y + r]
+                nodes[here + np.uint64(r)] = W[Y + r]
                 W[YS + r] = W[Y + r]
                 W[ACC + r] = 0.0
             node += 1
             for stage in range(4):
-                b = point * F * L
+                at = np.uint64(point * F * L)
                 for r in range(F * L):
-                    W[HI + r] = hist[b + r]
+                    W[HI + r] = hist[at + np.uint64(r)]
                 _derivative(tubes, lanes, W, present, ust, point * 3 * n, c0)
                 for r in range(F * L):
-                    out[b + r] = W[OU + r]
+                    out[at + np.uint64(r)] = W[OU + r]
                 point += 1
                 weight = 1.0 if stage == 0 or stage == 3 else 2.0
                 ahead = 0.5 if stage < 2 else 1.0
                 for row in range(S):
                     for j in range(L):
                         r = row * L + j
-                        h = seclen[k * L + j] / cells
                         W[ACC + r] += weight * W[K + r]
-                        W[YS + r] = W[Y + r] + ahead * h * W[K + r]
+                        W[YS + r] = W[Y + r] + ahead * W[MA + j] * W[K + r]
             for row in range(S):
                 for j in range(L):
                     r = row * L + j
-                    W[Y + r] += seclen[k * L + j] / cells / 6.0 * W[ACC + r]
+                    W[Y + r] += W[MA + j] / 6.0 * W[ACC + r]
         # end of the section: fields, moments on the near side, body of the tube that ends
-        b = point * F * L
+        at = np.uint64(point * F * L)
         for r in range(F * L):
-            W[HI + r] = hist[b + r]
+            W[HI + r] = hist[at + np.uint64(r)]
+        here = np.uint64(node * S * L)
         for r in range(S * L):
-            nodes[node * S * L + r] = W[Y + r]
+            nodes[here + np.uint64(r)] = W[Y + r]
             W[YS + r] = W[Y + r]
         node += 1
         _derivative(tubes, lanes, W, present, ust, point * 3 * n, c0)
         for r in range(F * L):
-            out[b + r] = W[OU + r]
+            out[at + np.uint64(r)] = W[OU + r]
         point += 1
         _bending_moments(tubes, lanes, W, present, MA)
         before = present

@@ -25,11 +25,11 @@ def scaled_norm(res, scale):
 @njit(cache=True, nogil=True)
 def broadcast(lanes, source, target):
     """Copy every number of ``source`` (rows,) to all lanes of ``target`` (rows, L), both flat."""
-    L = lane_count(lanes)
-    for r in range(len(source)):
-        value = source[r]
+    L = np.uint64(lane_count(lanes))
+    for r in range(np.uint64(len(source))):
+        value, start = source[r], r * L
         for j in range(L):
-            target[r * L + j] = value
+            target[start + j] = value
 
 
 @njit(cache=True, nogil=True)

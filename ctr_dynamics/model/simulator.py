@@ -58,6 +58,7 @@ class Record:
     key: tuple
     mesh: Mesh
     before: np.ndarray
+    after: np.ndarray
     rates: np.ndarray
     inputs: np.ndarray
     found: np.ndarray
@@ -130,7 +131,7 @@ class Simulator:
         m = 5 + self.model.n
         unknowns = np.tile(equilibrium.x, (stages, 1))
         return State(
-            equilibrium.key, equilibrium.mesh, bank, unknowns, unknowns.copy(), np.zeros((m, m)), False, equilibrium.nodes, inputs
+            equilibrium.key, equilibrium.mesh, bank, unknowns, np.stack([unknowns, unknowns]), np.zeros((m, m)), False, equilibrium.nodes, inputs
         )
 
     def step(self, state: State, t: float, inputs_at: InputsAt, *, record: bool = False) -> StepResult:
@@ -147,7 +148,7 @@ class Simulator:
         for halving in halvings:
             trial = state.copy()
             trial.unknowns[:] = trial.unknowns[-1]
-            trial.earlier[:] = trial.unknowns
+            trial.earlier[:] = trial.unknowns[-1]
             count = 2**halving
             scheme = make_scheme(self.scheme.name, self.scheme.dt / count) if count > 1 else self.scheme
             records: list[Record] = []
@@ -183,7 +184,7 @@ class Simulator:
             inputs[i, :n], inputs[i, n : 2 * n], inputs[i, 2 * n : 3 * n] = now.alpha, now.alpha_rate, now.beta
             inputs[i, 3 * n : 3 * n + 3], inputs[i, 3 * n + 3 :] = now.force, now.torque
         small, big = self._work(key, mesh)
-        guess = 2.0 * state.unknowns - state.earlier
+        guess = 3.0 * (state.unknowns - state.earlier[0]) + state.earlier[1]  # quadratic in time, stage by stage
         before = bank[:RATES].copy() if record else bank
         found = np.empty_like(guess)
         outcome, iterations, sweeps, jacobians = step(
@@ -195,13 +196,14 @@ class Simulator:
         if outcome != CONVERGED:
             return StepResult(False, OUTCOMES[outcome], iterations, sweeps, jacobians)
         state.key, state.mesh, state.bank = key, mesh, bank
-        state.earlier, state.unknowns = state.unknowns, found
+        state.earlier = np.stack([state.unknowns, state.earlier[0]])
+        state.unknowns = found
         state.nodes = small[6].reshape(-1, 16 + 3 * n).copy()
         state.inputs = last
         records: tuple[Record, ...] = ()
         if record:
             rates = bank[RATES : RATES + stages].copy()
-            records = (Record(scheme, key, mesh, before, rates, inputs, found.copy()),)
+            records = (Record(scheme, key, mesh, before, state.fields.copy(), rates, inputs, found.copy()),)
         return StepResult(True, "ok", iterations, sweeps, jacobians, records=records)
 
     def _work(self, key: tuple, mesh: Mesh) -> tuple:

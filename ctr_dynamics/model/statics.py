@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 
@@ -60,8 +62,8 @@ class Statics:
 
         Args:
             guess: (5 + N,) unknowns to start from.
-            end_angles: (N,) psi_L that choose the branch; without them the branch is the one that continuous growth of
-                precurvature, weight and load reaches from straight tubes.
+            end_angles: (N,) psi_L that choose the branch; without them and without a guess it is the first stable one that Newton from
+                straight tubes, continuous growth of precurvature, weight and load, or a search over end angles finds.
             parameters: (NP,) block instead of the robot file's.
         Returns:
             Equilibrium
@@ -79,13 +81,39 @@ class Statics:
         if end_angles is not None:
             x, found = self._from_end_angles(work, par, np.asarray(end_angles, float))
             found = found and self._to_loads(work, par, x)
-        else:
-            x = np.zeros(5 + model.n) if guess is None else np.array(guess, float)
+        elif guess is not None:
+            x = np.array(guess, float)
             found = work.newton(par, x, self.tolerance)
             if not found:
                 x[:] = 0.0
                 found = self._grow(work, par, x)
+        else:
+            x, found = self._stable(work, par)
         return work.result(key, x, par, found)
+
+    def _stable(self, work: _Work, par: np.ndarray) -> tuple[np.ndarray, bool]:
+        """The first stable equilibrium of several starts, or an unstable one when no start leads to a stable one."""
+        fallback: np.ndarray | None = None
+        alpha = par[self.model.layout["alpha"]]
+
+        def starts() -> Iterator[tuple[np.ndarray, bool]]:
+            x = np.zeros(5 + self.model.n)
+            yield x, work.newton(par, x, self.tolerance)
+            x = np.zeros(5 + self.model.n)
+            yield x, self._grow(work, par, x)
+            # the energy has a minimum for some twist of each tube against the next: half turns apart in steps of 45 degrees
+            for eighths in product((0, 1, -1, 2, -2, 3, -3, 4), repeat=min(self.model.n - 1, 2)):
+                shift = np.zeros(self.model.n)
+                shift[1 : 1 + len(eighths)] = np.cumsum(eighths) * (math.pi / 4)
+                x, found = self._from_end_angles(work, par, alpha + shift)
+                yield x, found and self._to_loads(work, par, x)
+
+        for x, found in starts():
+            if found:
+                if work.stability(par, x) > 0.0:
+                    return x, True
+                fallback = x.copy() if fallback is None else fallback
+        return (np.zeros(5 + self.model.n), False) if fallback is None else (fallback, True)
 
     def _grow(self, work: _Work, par: np.ndarray, x: np.ndarray) -> bool:
         """Continuation in one factor on precurvature, weight and load."""
@@ -118,18 +146,13 @@ class Statics:
         psi_L and the tip's imbalance r are smooth functions of (x, alpha), and their joint Jacobian is regular where the
         shooting one is not, so det(d alpha / d psi_L) = det(r_x) / det([r_x, r_alpha; psi_x, psi_alpha]) is exact through a fold.
         """
-        model, layout = self.model, self.model.layout
-        n = model.n
-        par = model.parameters.copy()
+        layout = self.model.layout
+        par = self.model.parameters.copy()
         par[layout["alpha"]] = alpha
         par[layout["beta"]] = beta
         par[layout["force"]] = force
         par[layout["torque"]] = torque
-        work = _Work(model, equilibrium.mesh, np.asarray(beta, float))
-        joint = work.joint_jacobian(par, equilibrium.x, model.step, layout.rows("alpha"))
-        sign_x, log_x = np.linalg.slogdet(joint[: 5 + n, : 5 + n])
-        sign_j, log_j = np.linalg.slogdet(joint)
-        return float(sign_x * sign_j * math.exp(min(log_x - log_j, 700.0)))
+        return _Work(self.model, equilibrium.mesh, np.asarray(beta, float)).stability(par, equilibrium.x)
 
 
 def _continue(work: _Work, par: np.ndarray, x: np.ndarray, rows: np.ndarray, tolerance: float) -> bool:
@@ -253,6 +276,16 @@ class _Work:
         values = np.concatenate([resL.reshape(m, L), self._end_angles(out, states).T])
         steps = np.concatenate([step, np.full(n, 1e-7)])
         return (values[:, 1 : 1 + m + n] - values[:, :1]) / steps
+
+    def stability(self, par: np.ndarray, x: np.ndarray) -> float:
+        """det(d alpha / d psi_L) at ``x``, see :meth:`Statics.stability`."""
+        m = len(x)
+        joint = self.joint_jacobian(par, x, self.model.step, self.model.layout.rows("alpha"))
+        if not np.isfinite(joint).all():
+            return math.nan
+        sign_x, log_x = np.linalg.slogdet(joint[:m, :m])
+        sign_j, log_j = np.linalg.slogdet(joint)
+        return float(sign_x * sign_j * math.exp(min(log_x - log_j, 700.0)))
 
     def backward(self, par: np.ndarray, end_angles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Unloaded torsion from the free ends back to the actuators: (x, alpha) with end angles (N,) rad; x holds base torques only.

@@ -19,11 +19,11 @@ def history(weights, bank, hist, histb):
     for slot in range(len(weights)):
         w = weights[slot]
         if w != 0.0:
-            row = bank[slot]
+            row, rowb = bank[slot, :main], bank[slot, main:]
             for i in range(main):
                 hist[i] += w * row[i]
             for i in range(len(histb)):
-                histb[i] += w * row[main + i]
+                histb[i] += w * rowb[i]
 
 
 @njit(cache=True, nogil=True)
@@ -49,7 +49,8 @@ def step(tubes, lane, lanes, mesh, c0, weights, par, inputs, bank, guess, found,
             par[base + 3 + i] = inputs[stage, 3 * n + i]
         section_lengths(mesh.bp_tube, mesh.bp_offset, par[13 * n : 14 * n], seclen)
         for i in range(5 + n):
-            x[i] = guess[stage, i]
+            # what the guess missed at the stage before, it misses here too
+            x[i] = guess[stage, i] + (found[stage - 1, i] - guess[stage - 1, i] if stage else 0.0)
         outcome, its, plain, jacs = solve(
             tubes, lane, lanes, mesh, c0[stage], par, seclen, x, hist, histb, (W, out, outb, nodes, res), big, scale, perturb,
             inverse, fresh, tolerance, limit,

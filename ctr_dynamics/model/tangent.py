@@ -13,19 +13,36 @@ from ctr_dynamics.model.newton import broadcast, invert
 from ctr_dynamics.model.scheme import RATE_NOW, RATES, Y_BEFORE, Y_NOW
 from ctr_dynamics.model.step import history
 
+THETA = 0.55  # of the one-stage tangent: nearly the trapezoidal rule, with a little damping of what the step does not resolve
 
-@njit(cache=True, nogil=True, error_model="numpy")
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "contract"})
 def _combine(lanes, values, rows, m, columns, scale, perturb, dx, target):
     """d(values)/d(column) with the boundary values following: target (rows, columns) from perturbed lanes of ``values`` (rows, L)."""
-    L = lane_count(lanes)
-    for r in range(rows):
-        base = values[r * L]
-        for k in range(columns):
-            target[r, k] = (values[r * L + 1 + m + k] - base) * scale
-        for i in range(m):
-            slope = (values[r * L + 1 + i] - base) / perturb[i]
-            for k in range(columns):
-                target[r, k] += slope * dx[i, k]
+    # unsigned indices: a signed one may count from the end of the array, and LLVM does not vectorise over that choice
+    L, first = np.uint64(lane_count(lanes)), np.uint64(1 + m)
+    count, unknowns, one = np.uint64(columns), np.uint64(m), np.uint64(1)
+    inverse = 1.0 / perturb
+    for r in range(np.uint64(rows)):
+        start = r * L
+        base = values[start]
+        for k in range(count):
+            target[r, k] = (values[start + first + k] - base) * scale
+        for i in range(unknowns):
+            slope = (values[start + one + i] - base) * inverse[i]
+            if slope != 0.0:
+                for k in range(count):
+                    target[r, k] += slope * dx[i, k]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _perturb(lanes, values, rows, m, columns, epsilon, change):
+    """Add ``epsilon`` times the columns ``change`` (rows, r) to their lanes of ``values`` (rows, L)."""
+    L, first, count = np.uint64(lane_count(lanes)), np.uint64(1 + m), np.uint64(columns)
+    for r in range(np.uint64(rows)):
+        start = r * L + first
+        for k in range(count):
+            values[start + k] += epsilon * change[r, k]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -51,12 +68,8 @@ def linearise(tubes, lanes, mesh, c0, par, dpar, x, hist, histb, dhist, epsilon,
         for k in range(columns):
             parL[r * L + 1 + m + k] += epsilon * dpar[r, k]
     main = len(hist)
-    for r in range(main):
-        for k in range(columns):
-            histL[r * L + 1 + m + k] += epsilon * dhist[r, k]
-    for r in range(len(histb)):
-        for k in range(columns):
-            histbL[r * L + 1 + m + k] += epsilon * dhist[main + r, k]
+    _perturb(lanes, histL, main, m, columns, epsilon, dhist)
+    _perturb(lanes, histbL, len(histb), m, columns, epsilon, dhist[main:])
     sections = len(mesh.sec_cells)
     beta = np.empty(n)
     lengths = np.empty(sections)
@@ -89,6 +102,39 @@ def linearise(tubes, lanes, mesh, c0, par, dpar, x, hist, histb, dhist, epsilon,
     _combine(lanes, outL, main, m, columns, 1.0 / epsilon, perturb, dx, dfields)
     _combine(lanes, outbL, len(histb), m, columns, 1.0 / epsilon, perturb, dx, dfields[main:])
     _combine(lanes, nodesL, dnodes.shape[0], m, columns, 1.0 / epsilon, perturb, dx, dnodes)
+    return True
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def theta_tangent(tubes, lanes, mesh, dt, par, inputs, x, after, rate, dpar, epsilon, perturb, big, work, dy, drate, inverse, dx, dnodes):
+    """Columns over one step by the one-stage theta method, linearised at the step's end: one sweep instead of one a stage.
+
+    The covariance does not need the model's own time accuracy. ``after``, ``rate`` (fields,): fields and their rates at the end, ``x`` (m,) the
+    unknowns there, ``inputs`` (3N + 6,). ``dy``, ``drate`` (fields, r): columns of the fields and of their rates, advanced in place.
+    Returns False where the step's end cannot be linearised.
+    """
+    n = len(tubes)
+    hist, histb, dhist = work
+    main = len(hist)
+    c0 = 1.0 / (THETA * dt)
+    ratio = (1.0 - THETA) / THETA
+    for i in range(main):
+        hist[i] = rate[i] - c0 * after[i]
+    for i in range(len(histb)):
+        histb[i] = rate[main + i] - c0 * after[main + i]
+    fields, columns = dy.shape
+    for i in range(fields):
+        for k in range(columns):
+            dhist[i, k] = -c0 * dy[i, k] - ratio * drate[i, k]
+    for i in range(3 * n):
+        par[11 * n + i] = inputs[i]
+    for i in range(6):
+        par[14 * n + 3 + i] = inputs[3 * n + i]
+    if not linearise(tubes, lanes, mesh, c0, par, dpar, x, hist, histb, dhist, epsilon, perturb, big, inverse, dx, dy, dnodes):
+        return False
+    for i in range(fields):
+        for k in range(columns):
+            drate[i, k] = c0 * dy[i, k] + dhist[i, k]
     return True
 
 

@@ -23,7 +23,7 @@ CLOCK_LIMIT_NS = 1_000_000_000
 CATCH_UP_NS = 5_000_000_000
 """A backlog longer than this is given up: the estimator starts anew."""
 SLICE_STEPS = 8
-"""Steps of a backlog taken between two looks at the inbox."""
+"""Steps of a backlog that are taken between two looks at the inbox."""
 IDLE_NS = 50_000_000
 RETRY_NS = 1_000_000
 COLLECT_NS = 1_000_000_000
@@ -128,6 +128,7 @@ class StepLoop(threading.Thread):
         self._log_error = log_error
         self._wall = wall
         self._took_steps = False
+        self._correction_ns = 0  # what going back has cost lately
         self._wake = threading.Event()
         self._stopping = False
         self._last: tuple[int, int] | None = None  # k and stamp of the last step taken
@@ -185,6 +186,7 @@ class StepLoop(threading.Thread):
         try:
             while not self._stopping:
                 self._wake.clear()
+                self._took_steps = False
                 self._round()
                 self._sleep()
         finally:
@@ -193,9 +195,12 @@ class StepLoop(threading.Thread):
 
     def _round(self) -> None:
         try:
+            if self._step_first():
+                self._advance(corrects=False)
+            corrects = bool(self.inbox)
             while self.inbox:
                 self.inbox.popleft()()
-            self._advance()
+            self._advance(corrects)
         except Exception as error:
             # The node stays up whatever a message provokes: the fault is shown, the estimator starts anew.
             self.faults += 1
@@ -207,14 +212,36 @@ class StepLoop(threading.Thread):
         self._housekeeping(self._clock_ns())
         self._collect()
 
-    def _advance(self) -> None:
-        self._took_steps = False
-        while not self._stopping:
+    def _step_first(self) -> bool:
+        """Whether the step on time goes before what has arrived.
+
+        Under `predict` an input means going back some steps. When that could not be done before the next step
+        is due, the step is taken on time first, and the inputs, all together, in the pause behind it.
+        """
+        due_ns = self._next_due_ns()
+        if self.timing.policy != "predict" or not self._wall or due_ns is None or not self.inbox:
+            return False
+        wait_ns = due_ns - self._now_ns()
+        if wait_ns > min(self._correction_ns, STEP_NS // 2):
+            return False
+        if wait_ns > 0:
+            time.sleep(wait_ns * 1e-9)
+        return True
+
+    def _advance(self, corrects: bool) -> None:
+        """Take what is due; `corrects`: inputs have come, going back may be part of it."""
+        for _ in range(SLICE_STEPS):
             until_ns, more = self._until(self._now_ns())
             begin = time.perf_counter_ns()
             steps = self.estimator.advance(until_ns)
-            self.timing.advanced(len(steps), time.perf_counter_ns() - begin)
-            self._took_steps = self._took_steps or bool(steps)
+            spent_ns = time.perf_counter_ns() - begin
+            if steps:
+                self._took_steps = True
+                self.timing.stepped(len(steps), spent_ns)
+            elif corrects:
+                self.timing.corrected(spent_ns)
+                self._correction_ns = max(spent_ns, self._correction_ns * 9 // 10)
+            corrects = False
             for step in steps:
                 if self._last is not None and step.k <= self._last[0]:
                     self.timing.restarted()  # the estimator has started anew by itself
@@ -223,10 +250,9 @@ class StepLoop(threading.Thread):
                     self.timing.published(step.k, step.stamp_ns, self._now_ns())
                 else:
                     self.timing.withheld += 1
-            if not more or not steps or self.inbox:
-                if more:
-                    self._wake.set()
+            if self._stopping or not more or not steps:
                 return
+        self._wake.set()  # there is more to take, after a look at the inbox
 
     def _now_ns(self) -> int:
         """Time on the clock of the stamps; 0 while there is no clock."""
@@ -234,22 +260,21 @@ class StepLoop(threading.Thread):
         return self.stamp_clock.at(now_ns) if now_ns > 0 else 0
 
     def _until(self, now_ns: int) -> tuple[int | None, bool]:
-        """The time up to which to advance, and whether that leaves due steps for a next slice."""
+        """The time up to which to advance, and whether more steps are due behind it."""
         if now_ns <= 0:
             return None, False  # without a clock only what the inputs cover is taken
-        taken_ns = self._last[1] if self._last is not None else self.estimator.t0_ns
-        if taken_ns is None:
+        next_ns = self._last[1] + STEP_NS if self._last is not None else self.estimator.t0_ns
+        if next_ns is None:
             return now_ns, False
-        behind_ns = now_ns - taken_ns
-        if behind_ns > CATCH_UP_NS:
+        if now_ns - next_ns > CATCH_UP_NS:
             self._log_error(
-                f"steps are {behind_ns * 1e-9:.1f} s behind, limit {CATCH_UP_NS * 1e-9:g} s: "
+                f"steps are {(now_ns - next_ns) * 1e-9:.1f} s behind, limit {CATCH_UP_NS * 1e-9:g} s: "
                 "the estimator starts anew"
             )
             self.reset()
             return now_ns, False
-        if behind_ns > SLICE_STEPS * STEP_NS:
-            return taken_ns + SLICE_STEPS * STEP_NS, True
+        if self.timing.policy == "predict" and now_ns >= next_ns + STEP_NS:
+            return next_ns, True  # one by one, so that each is out as soon as it can be
         return now_ns, False
 
     def _sleep(self) -> None:
@@ -258,8 +283,9 @@ class StepLoop(threading.Thread):
         wait_ns = IDLE_NS
         due_ns = self._next_due_ns()
         if due_ns is not None and self._wall:
-            # Due and not taken: the estimator is waiting for an input. Look again soon, but do not spin.
-            wait_ns = min(due_ns - self._now_ns(), IDLE_NS) if self._took_steps else RETRY_NS
+            wait_ns = min(due_ns - self._now_ns(), IDLE_NS)
+            if wait_ns <= 0 and not self._took_steps:
+                wait_ns = RETRY_NS  # due and not taken: the estimator wants an input; do not spin
         if wait_ns > 0:
             self._wake.wait(wait_ns * 1e-9)
 

@@ -72,7 +72,7 @@ class StepTiming:
         self.restarts = 0
         self.start_steps = 0
         self.start_max_ns = 0
-        self.rollbacks = Histogram()
+        self.corrections = Histogram()
         self._worst: list[tuple[int, int]] = []  # heap of (lateness, k)
         self._arrivals: deque[tuple[int, int]] = deque(maxlen=4096)  # (joint stamp, arrival), stamps rising
         self._last_k: int | None = None
@@ -90,13 +90,14 @@ class StepTiming:
         self._start_until_ns = None
         self._arrivals.clear()
 
-    def advanced(self, steps: int, duration_ns: int) -> None:
-        """One call of the estimator took `duration_ns` and gave `steps` steps."""
-        if steps:
-            for _ in range(steps):
-                self.step_time.add(duration_ns // steps)
-        else:
-            self.rollbacks.add(duration_ns)
+    def stepped(self, steps: int, duration_ns: int) -> None:
+        """One call of the estimator took `duration_ns` and gave `steps` steps, at least one."""
+        for _ in range(steps):
+            self.step_time.add(duration_ns // steps)
+
+    def corrected(self, duration_ns: int) -> None:
+        """Going back for an input and forth again took `duration_ns`."""
+        self.corrections.add(duration_ns)
 
     def published(self, k: int, stamp_ns: int, now_ns: int) -> int:
         """Step k with this stamp is out at `now_ns`; returns its lateness in ns."""
@@ -143,7 +144,7 @@ class StepTiming:
             "restarts": self.restarts,
             "lateness_ms": self.lateness.summary(),
             "step_ms": self.step_time.summary(),
-            "correction_ms": self.rollbacks.summary(),
+            "correction_ms": self.corrections.summary(),
             "start": {"steps": self.start_steps, "max_ms": round(self.start_max_ns * 1e-6, 3)},
             "worst": [
                 {"k": k, "lateness_ms": round(late * 1e-6, 3)}

@@ -61,7 +61,7 @@ def test_unloaded_shapes_agree_with_two_public_models(case):
         found = statics.solve(beta, alpha, end_angles=psi)
         assert found.converged
         worst = max(worst, np.linalg.norm(found.tip_position - [row[f"tip_{k}"] for k in "xyz"]))
-        np.testing.assert_allclose(found.end_angles, psi, atol=2e-5)
+        np.testing.assert_allclose(found.end_angles, psi, atol=1e-4)
         # their frame does not turn about the tangent; tube 1's is turned by its end angle
         R = tip_frame(found.tip_quaternion)
         c, s = np.cos(psi[0]), np.sin(psi[0])

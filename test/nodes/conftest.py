@@ -1,0 +1,214 @@
+"""A live estimator node in its own process, a driver in this one, and everything the node says."""
+
+from __future__ import annotations
+
+import os
+import threading
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rclpy")
+
+from rclpy.parameter import Parameter
+from rclpy.parameter_client import AsyncParameterClient
+from rclpy.serialization import deserialize_message
+from std_srvs.srv import SetBool, Trigger
+
+from ctr_dynamics.messages import topics
+from ctr_dynamics.messages.cdr import decode_pose_stamped, decode_stamp
+from ctr_dynamics.messages.encode import encode_joint_state, encode_pose_stamped
+from ctr_dynamics.nodes import qos
+from ctr_dynamics.nodes.listener import Listener
+from ctr_dynamics.nodes.naming import message_class
+from ctr_dynamics.nodes.processes import ESTIMATOR, NodeProcess
+from ctr_dynamics.robot import load_robot
+
+PATIENCE_S = 120.0  # of every wait: nothing is asserted about how long anything takes
+BAGS = Path(__file__).parents[1] / "data" / "bags"
+
+
+class RestingRobot(threading.Thread):
+    """Publishes a robot at rest at 100 Hz, stamped now, and a tracker that agrees with the model at 40 Hz."""
+
+    def __init__(self, live: Live) -> None:
+        super().__init__(daemon=True)
+        robot = load_robot("till2020_tissue")
+        self.names = [f"tube{n}_{kind}" for n in (1, 2) for kind in ("rotation", "translation")]
+        rest = zip(robot.rest.alpha.value, robot.rest.beta.value, strict=True)
+        self.positions = [x for pair in rest for x in pair]
+        self.live = live
+        self.joints_on = self.tracker_on = True
+        self.joint_stamps: list[int] = []
+        profile = qos.profile("best_effort", 50)
+        node = live.listener.node
+        self.publishers = {
+            name: node.create_publisher(message_class(topics.TOPIC[name].ros_type), name, profile)
+            for name in (topics.JOINT_STATES, topics.TRACKER_TIP)
+        }
+        self.stopped = threading.Event()
+
+    def joints(self, stamp_ns: int, names=None, positions=None) -> None:
+        data = encode_joint_state(stamp_ns, names or self.names, positions or self.positions)
+        self.publishers[topics.JOINT_STATES].publish(data)
+
+    def tracker(self, stamp_ns: int, position, quaternion, frame: str = "ctr_base") -> None:
+        self.publishers[topics.TRACKER_TIP].publish(
+            encode_pose_stamped(stamp_ns, frame, position, quaternion)
+        )
+
+    def agreeing_pose(self):
+        """The model's last tip pose, None before there is one."""
+        heard = self.live.listener.heard[topics.TIP_POSE_PREDICTED]
+        return decode_pose_stamped(heard[-1].data) if heard else None
+
+    def run(self) -> None:
+        tick = 0
+        while not self.stopped.is_set():
+            now = time.time_ns()
+            if self.joints_on:
+                self.joint_stamps.append(now)
+                self.joints(now)
+            pose = self.agreeing_pose()
+            if self.tracker_on and pose is not None and tick % 5 == 0:
+                self.tracker(now, pose.position, pose.quaternion_xyzw)
+            tick += 1
+            self.stopped.wait(0.01)
+
+    def stop(self) -> None:
+        self.stopped.set()
+        self.join()
+
+
+class Live:
+    """An estimator process with a listener on all its outputs."""
+
+    def __init__(
+        self, folder: Path, parameters: dict, ros_arguments=(), heard=None, reliability="reliable"
+    ) -> None:
+        self.domain = int(os.environ["ROS_DOMAIN_ID"])
+        self.process = NodeProcess(
+            ESTIMATOR, parameters, self.domain, folder / "estimator.log", ros_arguments
+        )
+        names = heard or [topic.name for topic in topics.OUTPUTS]
+        self.listener = Listener(self.domain, names, reliability, depth=5000)
+        self.robots: list[RestingRobot] = []
+
+    def __enter__(self) -> Live:
+        self.listener.__enter__()
+        ready = self.listener.wait_for(
+            lambda: self.listener.matched() or self.process.code is not None, PATIENCE_S
+        )
+        assert ready, self.process.output()
+        assert self.process.code is None, self.process.output()
+        return self
+
+    def __exit__(self, *reason) -> None:
+        for robot in self.robots:
+            robot.stop()
+        code = self.process.stop(PATIENCE_S)
+        self.listener.__exit__(None, None, None)
+        assert code == 0, self.process.output()
+
+    def resting_robot(self, matched: bool = True) -> RestingRobot:
+        robot = RestingRobot(self)
+        self.robots.append(robot)
+        if matched:
+            self.wait(lambda: all(p.get_subscription_count() for p in robot.publishers.values()), "a match")
+        robot.start()
+        return robot
+
+    def wait(self, condition, what: str) -> None:
+        ok = self.listener.wait_for(lambda: condition() or self.process.code is not None, PATIENCE_S)
+        assert self.process.code is None, f"the node has ended\n{self.process.output()}"
+        assert ok, f"waited in vain for {what}\n{self.process.output()}"
+
+    def count(self, topic: str) -> int:
+        return self.listener.count(topic)
+
+    def wait_for_more(self, topic: str, number: int = 1) -> None:
+        target = self.count(topic) + number
+        self.wait(lambda: self.count(topic) >= target, f"{number} more messages on {topic}")
+
+    def stamps(self, topic: str) -> list[int]:
+        return [decode_stamp(message.data) for message in list(self.listener.heard[topic])]
+
+    def messages(self, topic: str) -> list:
+        kind = message_class(topics.TOPIC[topic].ros_type)
+        return [deserialize_message(message.data, kind) for message in list(self.listener.heard[topic])]
+
+    def valid(self) -> list[bool]:
+        return [message.data for message in self.messages(topics.VALID)]
+
+    def status(self, name: str):
+        """The last diagnostics status of that name, None before the first."""
+        heard = self.listener.heard[topics.DIAGNOSTICS]
+        if not heard:
+            return None
+        array = deserialize_message(heard[-1].data, message_class(topics.TOPIC[topics.DIAGNOSTICS].ros_type))
+        found = [status for status in array.status if status.name == f"ctr_estimator: {name}"]
+        assert len(found) == 1, [status.name for status in array.status]
+        return found[0]
+
+    def wait_for_status(self, name: str, level: int | None = None, text: str = ""):
+        def there() -> bool:
+            status = self.status(name)
+            if status is None or (level is not None and status.level != bytes([level])):
+                return False
+            return text in status.message + str([(v.key, v.value) for v in status.values])
+
+        self.wait(there, f"status {name} at level {level} with '{text}'; it is {self.status(name)}")
+        return self.status(name)
+
+    def done(self, future):
+        self.wait(future.done, "an answer")
+        return future.result()
+
+    def call(self, name: str, request):
+        kind = SetBool if isinstance(request, SetBool.Request) else Trigger
+        client = self.listener.node.create_client(kind, f"/ctr/estimator/{name}")
+        self.wait(client.service_is_ready, f"service {name}")
+        return self.done(client.call_async(request))
+
+    def trigger(self, name: str):
+        return self.call(name, Trigger.Request())
+
+    def set_parameter(self, name: str, value):
+        client = AsyncParameterClient(self.listener.node, "/ctr/estimator")
+        self.wait(client.services_are_ready, "parameter services")
+        return self.done(client.set_parameters([Parameter(name, value=value)])).results[0]
+
+    def get_parameters(self, names: list[str]):
+        client = AsyncParameterClient(self.listener.node, "/ctr/estimator")
+        self.wait(client.services_are_ready, "parameter services")
+        return self.done(client.get_parameters(names)).values
+
+
+@pytest.fixture
+def start(tmp_path):
+    """Makes a `Live` with parameters of the node."""
+
+    def make(parameters: dict | None = None, **options) -> Live:
+        return Live(tmp_path, parameters or {}, **options)
+
+    return make
+
+
+@pytest.fixture
+def bags() -> Path:
+    return BAGS
+
+
+@pytest.fixture
+def on_grid():
+    """Asserts that stamps lie on one grid of 3 ms, rise, and come once."""
+
+    def check(stamps: list[int], t0: int) -> None:
+        assert stamps
+        steps = np.array(stamps) - t0
+        assert not np.any(steps % topics.STEP_NS)
+        assert np.all(np.diff(steps) > 0)
+
+    return check
