@@ -7,16 +7,13 @@ from numba import njit
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def backbone_rows(s, nodes, fields, points, n, insertion_rate, turn, shift, dnodes, pi, rows):
+def backbone_rows(s, nodes, fields, points, n, insertion_rate, turn, shift, deviation, rows):
     """Fill ``rows`` (P, 15) float32: s, x, y, z, qx, qy, qz, qw, vx, vy, vz, ux, uy, uz, sd.
 
     ``nodes`` (P, S) states; ``fields`` (fields,) with ``points`` (P,) the point of each node; ``turn`` (3, 3) and ``shift`` (3,) the estimated
-    registration; ``dnodes`` (P * S, r) columns of the states and ``pi`` their coefficients' covariance. sd is the deviation of the
-    position per axis, in m: the root of the third of the trace.
+    registration; ``deviation`` (P,) m, the position's per axis (root of the third of its covariance's trace).
     """
-    S = nodes.shape[1]
     F = 7 + 2 * n
-    r = dnodes.shape[1]
     for i in range(len(nodes)):
         a, b, c, d = nodes[i, 3], nodes[i, 4], nodes[i, 5], nodes[i, 6]
         norm = math.sqrt(a * a + b * b + c * c + d * d)
@@ -45,15 +42,7 @@ def backbone_rows(s, nodes, fields, points, n, insertion_rate, turn, shift, dnod
         base = points[i] * F
         for k in range(3):
             rows[i, 11 + k] = fields[base + 6 + k]
-        variance = 0.0
-        for axis in range(3):
-            row = i * S + axis
-            for p in range(r):
-                total = 0.0
-                for q in range(r):
-                    total += pi[p, q] * dnodes[row, q]
-                variance += total * dnodes[row, p]
-        rows[i, 14] = math.sqrt(max(variance, 0.0) / 3.0)
+        rows[i, 14] = deviation[i]
 
 
 def node_points(sec_cells: np.ndarray) -> np.ndarray:

@@ -10,15 +10,17 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ctr_dynamics.model.mesh import Mesh, section_lengths
+from ctr_dynamics.model.mesh import Key, Mesh, build_mesh, section_lengths
 from ctr_dynamics.model.model import Model
 from ctr_dynamics.model.newton import lanes_for
 from ctr_dynamics.model.simulator import Record, remap_fields
 from ctr_dynamics.model.tangent import linearise, theta_tangent
+from ctr_dynamics.model.transfer import Transfer, coarse_key, transfer
 
 from .uncertainty import ModelUncertainty
 
 Floats = NDArray[np.float64]
+COLUMN_NODES = 24
 EPSILON = 1e-6  # of one standard deviation: small against the curvature of the step, large against rounding
 
 
@@ -65,19 +67,24 @@ class Columns:
         theta: (n_theta, r) parameter parts.
         dnodes: (nodes * S, r) columns of the node states after the last step.
         dx: (5 + N, r) columns of the unknowns after the last step.
+
+    The columns live on sections of at most ``COLUMN_NODES`` nodes: a covariance does not need the model's own resolution.
     """
 
     def __init__(self, model: Model, uncertainty: ModelUncertainty, rank: int) -> None:
         self.model, self.uncertainty, self.rank = model, uncertainty, rank
         self._work: dict[tuple, tuple] = {}
+        self._coarse: dict[Key, tuple[Key, Mesh, Transfer | None]] = {}
+        self.transfer: Transfer | None = None
         self._weights: dict[tuple, Floats] = {}
-        self.key: tuple = ()
+        self.key: Key = ((), ())
         self.mesh: Mesh | None = None
         self.beta = np.zeros(model.n)
 
     def start(self, key: tuple, mesh: Mesh, beta: Floats, alpha: Floats, par: Floats, x: Floats) -> Floats:
         """Columns of the static equilibrium's dependence on the uncertain parameters; returns Pi_aa (r, r)."""
         model, unc = self.model, self.uncertainty
+        own, mesh, moved = self._own(key, mesh, beta)
         count = len(unc.names)
         lanes = lanes_for(6 + model.n + count)
         big = model.buffers(mesh, 8 * len(lanes))
@@ -92,7 +99,8 @@ class Columns:
             model.tubes, lanes, mesh, 0.0, par, unc.effect * scale, x, np.zeros(main), np.zeros(base),
             np.zeros((main + base, count)), 1e-4, model.step, big, np.zeros((m, m)), dx, fields, dnodes,
         )  # fmt: skip
-        self.key, self.mesh, self.beta = key, mesh, beta.copy()
+        self.key, self.mesh, self.transfer = own, mesh, moved
+        self.beta = beta.copy()
         r = self.rank
         wide = max(count, r)
         self.theta = np.zeros((count, wide))
@@ -110,14 +118,24 @@ class Columns:
         """(fields, r) columns of the fields."""
         return self.stored[0]
 
-    def _remap(self, record: Record, beta: Floats) -> None:
+    def _own(self, key: Key, mesh: Mesh, beta: Floats) -> tuple[Key, Mesh, Transfer | None]:
+        """The columns' sections for the model's: key, mesh, and the transfer between them (None where they are the same)."""
+        own = coarse_key(key, COLUMN_NODES)
+        if own == key:
+            return key, mesh, None
+        if key not in self._coarse or self.model.moving_precurvature:
+            coarse = build_mesh(self.model.segments, beta, own, mesh.base_cells)
+            kept = self._coarse.get(key)
+            self._coarse[key] = own, coarse, kept[2] if kept else transfer(self.model.n, mesh, coarse)
+        return self._coarse[key]
+
+    def _remap(self, key: Key, mesh: Mesh, beta: Floats) -> None:
         """Carry the columns to another set of sections."""
         assert self.mesh is not None
         slots, _, r = self.stored.shape
         rows = np.ascontiguousarray(self.stored.transpose(0, 2, 1)).reshape(slots * r, -1)
-        moved = remap_fields(self.model.n, rows, self.mesh, self.beta, record.mesh, beta)
+        moved = remap_fields(self.model.n, rows, self.mesh, self.beta, mesh, beta)
         self.stored = np.ascontiguousarray(moved.reshape(slots, r, -1).transpose(0, 2, 1))
-        self.key, self.mesh = record.key, record.mesh
 
     def propagate(self, records: tuple[Record, ...], par: Floats) -> bool:
         """Move the columns over the solved (sub)steps in ``records``; False where a stage cannot be linearised (columns then stay)."""
@@ -126,15 +144,19 @@ class Columns:
         dpar = self.uncertainty.effect @ self.theta
         for record in records:
             beta = record.inputs[-1, 2 * model.n : 3 * model.n]
-            if record.key != self.key:
-                self._remap(record, beta)
-            self.beta = beta
+            key, mesh, moved = self._own(record.key, record.mesh, beta)
+            if key != self.key:
+                self._remap(key, mesh, beta)
+            self.key, self.mesh, self.transfer, self.beta = key, mesh, moved, beta
+            after, rate = record.after, record.rates[-1]
+            if moved is not None:
+                after, rate = moved.restrict @ after, moved.restrict @ rate
             columns = self.theta.shape[1]
-            work_key = (record.key, columns)
+            work_key = (key, columns)
             if work_key not in self._work:
                 lanes = lanes_for(1 + m + columns)
                 L = 8 * len(lanes)
-                big = model.buffers(record.mesh, L)
+                big = model.buffers(mesh, L)
                 main, base = len(big[4]) // L, len(big[5]) // L
                 self._work[work_key] = (
                     lanes, big, (np.zeros(main), np.zeros(base), np.zeros((main + base, columns))), np.zeros((m, m)),
@@ -143,13 +165,30 @@ class Columns:
             lanes, big, work, inverse, dx, dnodes = self._work[work_key]
             stored = self.stored.copy()
             ok = theta_tangent(
-                model.tubes, lanes, record.mesh, record.scheme.dt, par.copy(), record.inputs[-1], record.found[-1], record.after,
-                record.rates[-1], dpar, EPSILON, model.step, big, work, stored[0], stored[1], inverse, dx, dnodes,
+                model.tubes, lanes, mesh, record.scheme.dt, par.copy(), record.inputs[-1], record.found[-1], after,
+                rate, dpar, EPSILON, model.step, big, work, stored[0], stored[1], inverse, dx, dnodes,
             )  # fmt: skip
             if not ok:
                 return False
             self.stored, self.dx, self.dnodes = stored, dx.copy(), dnodes.copy()
         return True
+
+    def fields_change(self, a: Floats) -> Floats:
+        """(fields,) change of the model's fields by the coefficients ``a`` (r,)."""
+        change = self.fields @ a
+        return change if self.transfer is None else self.transfer.prolong @ change
+
+    def nodes_change(self, a: Floats) -> Floats:
+        """(nodes, S) change of the model's node states by the coefficients ``a`` (r,)."""
+        change = (self.dnodes @ a).reshape(-1, 16 + 3 * self.model.n)
+        return change if self.transfer is None else self.transfer.nodes @ change
+
+    def position_deviation(self, pi: Floats) -> Floats:
+        """(nodes,) deviation of the position per axis in m at the model's nodes, coefficients' covariance ``pi`` (r, r)."""
+        rows = self.dnodes.reshape(-1, 16 + 3 * self.model.n, self.dnodes.shape[1])[:, :3].reshape(-1, len(pi))
+        variance = np.einsum("ij,ij->i", rows @ pi, rows).reshape(-1, 3).sum(axis=1)
+        deviation = np.sqrt(np.maximum(variance, 0.0) / 3.0)
+        return deviation if self.transfer is None else self.transfer.nodes @ deviation
 
     def widen(self, count: int) -> None:
         """Append ``count`` columns of zeros."""
@@ -165,11 +204,11 @@ class Columns:
 
     def snapshot(self) -> tuple:
         """What :meth:`restore` needs; arrays are replaced by later steps, never written, so references do."""
-        return self.key, self.mesh, self.beta, self.theta.copy(), self.stored, self.dnodes, self.dx
+        return self.key, self.mesh, self.transfer, self.beta, self.theta.copy(), self.stored, self.dnodes, self.dx
 
     def restore(self, snapshot: tuple) -> None:
         """Go back to an earlier snapshot."""
-        self.key, self.mesh, self.beta, theta, self.stored, self.dnodes, self.dx = snapshot
+        self.key, self.mesh, self.transfer, self.beta, theta, self.stored, self.dnodes, self.dx = snapshot
         self.theta = theta.copy()
 
     def weights(self) -> Floats:

@@ -602,7 +602,7 @@ class Estimator:
         r = c.theta.shape[1]
         backbone_rows(
             s, state.nodes, state.fields, points, self.model.n, float(state.inputs.beta_rate[0]), turn, back @ bias[TRANSLATION],
-            c.dnodes, np.ascontiguousarray(self.fusion.pi[:r, :r]), rows,
+            c.position_deviation(np.ascontiguousarray(self.fusion.pi[:r, :r])), rows,
         )  # fmt: skip
         return rows
 

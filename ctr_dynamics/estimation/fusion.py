@@ -263,12 +263,11 @@ class Fusion:
         self.bias += x[r:]
         self.theta += c.theta @ a
         self._apply_theta()
-        change = c.fields @ a
-        state.bank[:2] += change
+        state.bank[:2] += c.fields_change(a)
         shift = c.dx @ a
         state.unknowns += shift
         state.earlier += shift
-        state.nodes += (c.dnodes @ a).reshape(state.nodes.shape)
+        state.nodes += c.nodes_change(a)
         self.tips.shift(a)
 
     # -- outputs --

@@ -89,7 +89,7 @@ class EstimatorNode(Node):
             self.get_logger().error,
             wall=not self._use_sim_time,
         )
-        self._services = [
+        self._offered = [
             self.create_service(Trigger, "~/reset", self._on_reset),
             self.create_service(Trigger, "~/save_snapshot", self._on_save_snapshot),
             self.create_service(SetBool, "~/enable_fusion", self._on_enable_fusion),
