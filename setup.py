@@ -33,7 +33,7 @@ setup(
     name=PACKAGE,
     version=version(),
     packages=find_packages(exclude=["test", "test.*"]),
-    package_data={PACKAGE: ["config/*.yaml", "config/*/*.yaml", "py.typed"]},
+    package_data={PACKAGE: ["config/*.yaml", "config/*/*.yaml", "data/bags/*", "py.typed"]},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{PACKAGE}"]),
         (f"share/{PACKAGE}", ["package.xml"]),

@@ -21,6 +21,8 @@ from ctr_dynamics.messages import topics
 from ctr_dynamics.messages.cdr import decode_stamp
 from ctr_dynamics.nodes import live_report
 from ctr_dynamics.nodes.playback import load
+from ctr_dynamics.parameters import Settings
+from ctr_dynamics.robot import load_robot
 
 if TYPE_CHECKING:
     from ctr_dynamics.nodes.listener import Listener
@@ -50,6 +52,8 @@ def demo(
         raise InputError(
             f"the demo needs rclpy ({error})", do="source ROS 2 or pip install 'ctr_dynamics[ros]'"
         ) from None
+    load_robot(robot)
+    Settings({"output.policy": policy})
     if bag is None:
         bag, truth = shipped_file(f"{SHIPPED}.mcap"), truth or shipped_truth()
     messages = load(bag, 0.0, duration)

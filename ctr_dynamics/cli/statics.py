@@ -20,18 +20,29 @@ SHOWN = 20  # failed rows named one by one
 
 
 def statics(
-    robot: Annotated[str, typer.Option("--robot", metavar="NAME_OR_FILE", help="A shipped robot or a robot file.")],
+    robot: Annotated[
+        str, typer.Option("--robot", metavar="NAME_OR_FILE", help="A shipped robot or a robot file.")
+    ],
     poses: Annotated[
         Path,
-        typer.Option("--poses", metavar="POSES.csv", help="Columns beta1,..,alpha1,..[,Fx,Fy,Fz][,psiL1,..] in m, rad, N."),
+        typer.Option(
+            "--poses",
+            metavar="POSES.csv",
+            help="Columns beta1,..,alpha1,..[,Fx,Fy,Fz][,psiL1,..] in m, rad, N.",
+        ),
     ],
-    output: Annotated[Path, typer.Option("--output", metavar="OUT.csv", help="Table to write, one row for each pose.")],
-    nodes: Annotated[int, typer.Option("--nodes", metavar="N", help="Nodes from base plate to tip, 8 to 1000.")] = 100,
+    output: Annotated[
+        Path, typer.Option("--output", metavar="OUT.csv", help="Table to write, one row for each pose.")
+    ],
+    nodes: Annotated[
+        int, typer.Option("--nodes", metavar="N", help="Nodes from base plate to tip, 8 to 1000.")
+    ] = 100,
 ) -> int:
     """Solve the static model for a table of actuator positions.
 
-    Columns are matched by name. Fx,Fy,Fz is a force on tube 1's tip in the base frame; psiL1,.. are end angles that
-    choose the branch where a pose has several stable shapes. Exit code 1 when a row failed or is invalid.
+    Columns are matched by name. Fx,Fy,Fz is a force on tube 1's tip in the base frame; psiL1,.. are end
+    angles that choose the branch where a pose has several stable shapes. Exit code 1 when a row failed or is
+    invalid.
     """
     if not 8 <= nodes <= 1000:
         raise InputError(f"--nodes {nodes} is outside 8 to 1000", do="100 is accurate to a micrometre")
@@ -53,6 +64,12 @@ def statics(
         print(f"ctr-dynamics: line {row.line}: {row.status}: {row.reason}", file=sys.stderr)
     if len(failed) > SHOWN:
         print(f"ctr-dynamics: and {len(failed) - SHOWN} more rows failed", file=sys.stderr)
-    print(", ".join(f"{counts[status]} {status}" for status in ("ok", "unstable", "failed", "invalid") if counts[status]))
+    print(
+        ", ".join(
+            f"{counts[status]} {status}"
+            for status in ("ok", "unstable", "failed", "invalid")
+            if counts[status]
+        )
+    )
     print(f"output  {output}")
     return 1 if failed else 0

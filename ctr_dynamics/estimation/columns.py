@@ -120,10 +120,11 @@ class Columns:
 
     def _own(self, key: Key, mesh: Mesh, beta: Floats) -> tuple[Key, Mesh, Transfer | None]:
         """The columns' sections for the model's: key, mesh, and the transfer between them (None where they are the same)."""
-        own = coarse_key(key, COLUMN_NODES)
-        if own == key:
-            return key, mesh, None
         if key not in self._coarse or self.model.moving_precurvature:
+            own = coarse_key(key, COLUMN_NODES)
+            if own == key:
+                self._coarse[key] = key, mesh, None
+                return self._coarse[key]
             coarse = build_mesh(self.model.segments, beta, own, mesh.base_cells)
             kept = self._coarse.get(key)
             self._coarse[key] = own, coarse, kept[2] if kept else transfer(self.model.n, mesh, coarse)

@@ -335,7 +335,7 @@ class Estimator:
         if corrected:
             for i, row in self._offset_rows:
                 offset[i] += self.fusion.theta[row]
-            force = self.fusion.theta[self.fusion.uncertainty.force]
+            force = self.fusion.force
 
         def at(t: float) -> Inputs:
             signals = known.get(t)
@@ -433,7 +433,7 @@ class Estimator:
             else:
                 update = self.fusion.compare(time_s, sample.position, sample.quaternion)
             if update.dof:
-                self.health.measured(update.nis, update.dof, update.accepted)
+                self.health.measured(update.nis, update.dof, update.accepted, update.accepted and not update.reason)
             else:
                 self.health.dropped += 1
                 self.health.note("tracker", "outside the window", f"pose of t = {time_s:.3f} s at step {k}: {update.reason}")
@@ -525,7 +525,7 @@ class Estimator:
         h.recent.extend(recent)
         for innovation in fresh:
             if innovation.dof:
-                h.measured(innovation.nis, innovation.dof, innovation.accepted)
+                h.measured(innovation.nis, innovation.dof, innovation.accepted, innovation.accepted and not innovation.reason)
             self._innovations.append(innovation)
 
     @property
@@ -560,7 +560,7 @@ class Estimator:
         if age > limit:
             return f"joint states are missing: the last is {age:.3f} s old, limit {limit:g} s"
         if self._fusing and self.health.rejecting:
-            return "the tracker contradicts the model: nearly all samples of the last second are outside the gate"
+            return "the tracker contradicts the model: most samples of the last second are outside the gate"
         return ""
 
     def _output(self, k: int, result: StepResult) -> StepOutput:
@@ -568,7 +568,6 @@ class Estimator:
         stamp = self._stamp(k)
         assert stamp is not None
         tip = self.fusion.tip_estimate()
-        force = self.fusion.uncertainty.force
         variance = self.fusion.force_variance()
         alone = self._alone_tips.last
         predicted_q = alone.quaternion.copy()
@@ -581,7 +580,7 @@ class Estimator:
         self.health.problem = problem
         return StepOutput(
             stamp, k, not problem, problem, tip.position, tip.quaternion, tip.covariance[:6, :6], tip.twist, tip.covariance[6:, 6:],
-            alone.position.copy(), predicted_q, self._backbone(), self._measure_modes(k), self.fusion.theta[force].copy(),
+            alone.position.copy(), predicted_q, self._backbone(), self._measure_modes(k), self.fusion.force,
             np.sqrt(variance), self._take_innovations(), SolverStats(result.iterations, result.sweeps, result.reason),
         )  # fmt: skip
 

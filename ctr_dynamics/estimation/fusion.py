@@ -35,6 +35,7 @@ class FusionOptions:
     force_sigma: float = 0.002
     force_sigma_max: float = 0.2
     adaptation: float = 0.1
+    ratio_cap: float = 10.0
     force_time: float = 0.2
     window: float = 0.2
     reduce_every: int = 8
@@ -83,6 +84,7 @@ class Fusion:
         self.pi = np.zeros((0, 0))
         self.steps = 0
         self.force_sigma = options.force_sigma
+        self._refused = False
         self._gate = {dof: float(chi2.ppf(options.gate_probability, dof)) for dof in range(1, 7)}
 
     # -- start and prediction --
@@ -210,7 +212,12 @@ class Fusion:
         dof = compared.dof
         self._adapt(compared.nis / dof)
         if compared.nis > self._gate[dof]:
-            return replace(compared, reason="outside the gate")
+            if not self._refused:
+                self._refused = True
+                return replace(compared, reason="outside the gate")
+            self._inflate(nu, H, R, self._gate[dof])
+            compared = replace(compared, reason="outside the gate twice in a row: fused with a widened covariance")
+        self._refused = False
         size = len(self.pi)
         ekf = ExtendedKalmanFilter(dim_x=size, dim_z=dof)
         ekf.P = self.pi
@@ -243,16 +250,32 @@ class Fusion:
         full[mask], variance[mask] = nu, np.diag(S)
         return nu, H, R, Update(full, variance, nis, int(mask.sum()), False, "")
 
+    @property
+    def force(self) -> Floats:
+        """(3,) estimated tip force, N, ``ctr_base`` axes."""
+        return self.theta[self.uncertainty.force]
+
     def force_variance(self) -> Floats:
         """(3,) variance of the estimated tip force, N^2."""
         part = self.columns.theta[self.uncertainty.force]
         r = part.shape[1]
         return np.maximum(np.einsum("ij,jk,ik->i", part, self.pi[:r, :r], part), 0.0)
 
+    def _inflate(self, nu: Floats, H: Floats, R: Floats, limit: float) -> None:
+        """Two readings in a row outside the gate are no outliers: the model has lost the robot. Widen the fields' part of the covariance until
+        the reading is plausible (a fading memory)."""
+        r = self.columns.theta.shape[1]
+        for _ in range(20):
+            self.pi[:r, :r] *= 2.0
+            self.pi[:r, r:] *= math.sqrt(2.0)
+            self.pi[r:, :r] *= math.sqrt(2.0)
+            if nu @ np.linalg.solve(H @ self.pi @ H.T + R, nu) < 0.5 * limit:
+                return
+
     def _adapt(self, ratio: float) -> None:
         """Raise the drive of the tip force while innovations are larger than predicted, lower it while they are smaller."""
         o = self.options
-        size = self.force_sigma * math.exp(o.adaptation * (min(ratio, 10.0) - 1.0))
+        size = self.force_sigma * math.exp(o.adaptation * (min(ratio, self.options.ratio_cap) - 1.0))
         self.force_sigma = min(max(size, o.force_sigma), o.force_sigma_max)
 
     def _correct(self, state: State, x: Floats) -> None:
@@ -286,12 +309,12 @@ class Fusion:
     def snapshot(self) -> tuple:
         """The filter's part of a state to which :meth:`restore` can return."""
         return (
-            self.theta.copy(), self.bias.copy(), self.pi.copy(), self.steps, self.force_sigma, self.columns.snapshot(), self.tips.snapshot(),
+            self.theta.copy(), self.bias.copy(), self.pi.copy(), self.steps, self.force_sigma, self._refused, self.columns.snapshot(), self.tips.snapshot(),
         )  # fmt: skip
 
     def restore(self, snapshot: tuple) -> None:
         """Return to a snapshot."""
-        theta, bias, pi, self.steps, self.force_sigma, columns, tips = snapshot
+        theta, bias, pi, self.steps, self.force_sigma, self._refused, columns, tips = snapshot
         self.theta, self.bias, self.pi = theta.copy(), bias.copy(), pi.copy()
         self.columns.restore(columns)
         self.tips.restore(tips)

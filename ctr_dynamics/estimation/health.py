@@ -29,7 +29,7 @@ class Health:
     """Counters and running figures of the estimator.
 
     ``joints``, ``tracker``, ``load``: input problems by kind. ``nis_sum``, ``nis_dof``, ``nis_count``: over all samples that reached the gate.
-    ``recent``: (nis / dof, accepted) of the last second's samples.
+    ``recent``: (nis / dof, within the gate) of the last second's samples.
     """
 
     joints: dict[str, Counter] = field(default_factory=dict)
@@ -53,6 +53,7 @@ class Health:
     rolled_back: int = 0
     fusing: bool = True
     force_sigma: float = 0.0
+    _within: int = 0
 
     def note(self, group: str, kind: str, what: str) -> None:
         """Count an input problem of ``kind`` in ``group`` (joints, tracker or load)."""
@@ -63,12 +64,13 @@ class Health:
         self.failures += 1
         self.reasons[reason] = self.reasons.get(reason, 0) + 1
 
-    def measured(self, nis: float, dof: int, accepted: bool) -> None:
-        """Count a tracker sample that reached the gate."""
+    def measured(self, nis: float, dof: int, accepted: bool, within: bool) -> None:
+        """Count a tracker sample that reached the gate: fused or not, and whether it lay within."""
         self.nis_count += 1
         self.nis_sum += nis
         self.nis_dof += dof
-        self.recent.append((nis / dof, accepted))
+        self.recent.append((nis / dof, within))
+        self._within = sum(inside for _, inside in self.recent)
         if accepted:
             self.accepted += 1
         else:
@@ -76,8 +78,8 @@ class Health:
 
     @property
     def rejecting(self) -> bool:
-        """Whether nearly all recent samples were refused: the tracker and the model do not describe the same robot."""
-        return len(self.recent) >= 20 and sum(accepted for _, accepted in self.recent) < 0.2 * len(self.recent)
+        """Whether most recent samples lay outside the gate: the tracker and the model do not describe the same robot."""
+        return self._within < 0.5 * len(self.recent) and len(self.recent) >= 20
 
     def nis_summary(self) -> dict[str, float | int | bool | None]:
         """Mean NIS per degree of freedom with the 95 % band of that mean for a consistent filter."""
@@ -126,9 +128,9 @@ class Health:
             "fusion": "on" if self.fusing else "off",
         }
         if self.rejecting:
-            refused = sum(not accepted for _, accepted in self.recent)
+            refused = sum(not within for _, within in self.recent)
             message = (
-                f"{refused} of the last {len(self.recent)} samples are outside the gate (limit 80 %): "
+                f"{refused} of the last {len(self.recent)} samples are outside the gate (limit half): "
                 "check the tracker's frame, units, stamps and the robot file"
             )
             return Status("tracker", ERROR, message, values)

@@ -172,7 +172,7 @@ def node_count(mesh: Mesh) -> int:
 
 
 @njit(cache=True)
-def section_lengths(bp_tube, bp_offset, beta, seclen):
+def section_lengths(bp_tube: np.ndarray, bp_offset: np.ndarray, beta: np.ndarray, seclen: np.ndarray) -> None:
     """Lengths (m) of the sections at the translations ``beta`` (N,), never negative, into ``seclen`` (sections,)."""
     start = 0.0
     for k in range(len(bp_tube)):

@@ -1,4 +1,7 @@
-"""Tables of actuator positions to static shapes: reading and checking the poses, solving each row, writing the result."""
+"""Tables of actuator positions to static shapes.
+
+Reading and checking the poses, solving each row, writing the result.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +28,9 @@ MAX_FORCE = 100.0  # N
 
 @dataclass(frozen=True)
 class Pose:
-    """One row: ``problem`` says why it cannot be used, else beta (N,) m, alpha (N,) rad, force (3,) N and end angles (N,) rad or None."""
+    """One row: ``problem`` says why it cannot be used, else beta (N,) m, alpha (N,) rad, force (3,) N and end
+    angles (N,) rad or None.
+    """
 
     line: int
     beta: Floats
@@ -40,7 +45,8 @@ class StaticRow:
     """Result of one row; the arrays are empty unless ``status`` is ok or unstable.
 
     Attributes:
-        status: ok, unstable (stability <= 0), failed (no equilibrium found) or invalid (input that cannot be used).
+        status: ok, unstable (stability <= 0), failed (no equilibrium found) or invalid (input that cannot be
+        used).
         reason: of failed and invalid.
         tip_position: (3,) m in ``ctr_base``; tip_quaternion: (4,) wxyz of tube 1's tip frame.
         torques: (N,) internal moment m_iz at beta_i, N m.
@@ -80,7 +86,9 @@ def _check_header(header: Sequence[str], n: int, where: str) -> list[str]:
                 where=where,
             )
     if missing:
-        raise InputError(f"column '{missing[0]}' is missing", do=f"needed are {', '.join(needed)}", where=where)
+        raise InputError(
+            f"column '{missing[0]}' is missing", do=f"needed are {', '.join(needed)}", where=where
+        )
     for group in groups:
         absent = [name for name in group if name not in header]
         if absent and len(absent) < len(group):
@@ -91,10 +99,12 @@ def _check_header(header: Sequence[str], n: int, where: str) -> list[str]:
 
 
 def read_poses(path: Path, model: Model) -> tuple[list[Pose], list[str]]:
-    """Poses of a CSV file with the columns beta1.., alpha1.. and optionally Fx, Fy, Fz and psiL1..; SI units and radians.
+    """Poses of a CSV file with the columns beta1.., alpha1.. and optionally Fx, Fy, Fz and psiL1..; SI units
+    and radians.
 
     Returns:
-        The rows, those that cannot be used with their ``problem``, and the names of columns that were not read.
+        The rows, those that cannot be used with their ``problem``, and the names of columns that were not
+        read.
 
     Raises:
         InputError: the file cannot be read or its columns are not these.
@@ -109,9 +119,13 @@ def read_poses(path: Path, model: Model) -> tuple[list[Pose], list[str]]:
     except csv.Error as error:
         raise InputError(f"not a CSV file: {error}", do="separate columns by commas", where=where) from None
     except OSError as error:
-        raise InputError(f"cannot be read ({error.strerror})", do="check path and rights", where=where) from None
+        raise InputError(
+            f"cannot be read ({error.strerror})", do="check path and rights", where=where
+        ) from None
     if not lines:
-        raise InputError("the file is empty", do="its first line names the columns beta1,..,alpha1,..", where=where)
+        raise InputError(
+            "the file is empty", do="its first line names the columns beta1,..,alpha1,..", where=where
+        )
     header = [cell.strip() for cell in lines[0][1]]
     spare = _check_header(header, model.n, where)
     if len(lines) == 1:
@@ -154,12 +168,17 @@ def _pose(model: Model, header: list[str], line: int, cells: list[str]) -> Pose:
             "angles are in rad, a value in degrees is multiplied by pi/180"
         )
     if not problem and np.abs(force).max() > MAX_FORCE:
-        problem = f"a force of {np.linalg.norm(force):g} N is beyond {MAX_FORCE:g} N; forces are in N, base frame"
+        problem = (
+            f"a force of {np.linalg.norm(force):g} N is beyond {MAX_FORCE:g} N; forces are in N, base frame"
+        )
     return Pose(line, beta, alpha, force, end_angles, problem)
 
 
 def solve_poses(model: Model, poses: Sequence[Pose], tolerance: float = 1e-10) -> Iterator[StaticRow]:
-    """Static shapes of ``poses`` one by one, with the robot's own weight and bodies. Rows do not depend on each other."""
+    """Static shapes of ``poses`` one by one, with the robot's own weight and bodies.
+
+    Rows do not depend on each other.
+    """
     statics = Statics(model, tolerance)
     for pose in poses:
         if pose.problem:
@@ -171,7 +190,11 @@ def solve_poses(model: Model, poses: Sequence[Pose], tolerance: float = 1e-10) -
             yield StaticRow(pose.line, "invalid", str(error))
             continue
         if not found.converged:
-            how = "near the given end angles" if pose.end_angles is not None else "on the branch grown from straight tubes"
+            how = (
+                "near the given end angles"
+                if pose.end_angles is not None
+                else "on the branch grown from straight tubes"
+            )
             yield StaticRow(pose.line, "failed", f"no equilibrium was found {how}")
             continue
         stability = statics.stability(found, pose.beta, pose.alpha, pose.force)

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
+from scipy.interpolate import CubicSpline
 
 from ctr_dynamics.errors import InputError
 from ctr_dynamics.model.mesh import Mesh, node_positions, point_positions
@@ -131,7 +132,7 @@ class Simulator:
         m = 5 + self.model.n
         unknowns = np.tile(equilibrium.x, (stages, 1))
         return State(
-            equilibrium.key, equilibrium.mesh, bank, unknowns, np.stack([unknowns, unknowns]), np.zeros((m, m)), False, equilibrium.nodes, inputs
+            equilibrium.key, equilibrium.mesh, bank, unknowns, unknowns.copy(), np.zeros((m, m)), False, equilibrium.nodes, inputs
         )
 
     def step(self, state: State, t: float, inputs_at: InputsAt, *, record: bool = False) -> StepResult:
@@ -148,7 +149,7 @@ class Simulator:
         for halving in halvings:
             trial = state.copy()
             trial.unknowns[:] = trial.unknowns[-1]
-            trial.earlier[:] = trial.unknowns[-1]
+            trial.earlier[:] = trial.unknowns
             count = 2**halving
             scheme = make_scheme(self.scheme.name, self.scheme.dt / count) if count > 1 else self.scheme
             records: list[Record] = []
@@ -163,28 +164,32 @@ class Simulator:
                 for name in ("key", "mesh", "bank", "unknowns", "earlier", "inverse", "nodes", "inputs"):
                     setattr(state, name, getattr(trial, name))
                 state.usable = False
-                return StepResult(True, f"{count} substeps" if count > 1 else "fresh start", *totals, count, tuple(records))
-        return StepResult(False, result.reason, *totals)
+                how = f"{count} substeps" if count > 1 else "fresh start"
+                return StepResult(True, how, totals[0], totals[1], totals[2], count, tuple(records))
+        return StepResult(False, result.reason, totals[0], totals[1], totals[2])
 
     def _attempt(self, state: State, scheme: Scheme, t: float, inputs_at: InputsAt, fresh: bool, record: bool) -> StepResult:
         n, stages = self.model.n, scheme.stages
         at_stages = [inputs_at(t + c * scheme.dt) for c in scheme.times]
         last = at_stages[-1]
+        inputs = np.empty((stages, 3 * n + 6))
+        for i, now in enumerate(at_stages):
+            inputs[i, :n], inputs[i, n : 2 * n], inputs[i, 2 * n : 3 * n] = now.alpha, now.alpha_rate, now.beta
+            inputs[i, 3 * n : 3 * n + 3], inputs[i, 3 * n + 3 :] = now.force, now.torque
+        if not np.isfinite(inputs).all():
+            return StepResult(False, "actuators or load hold a number that is not finite", 0, 0, 0)
         bank, mesh = state.bank, state.mesh
         try:
-            key, now_mesh = self.model.mesh(last.beta, state.key)
+            still = not self.model.moving_precurvature and np.array_equal(last.beta, state.inputs.beta)
+            key, now_mesh = (state.key, mesh) if still else self.model.mesh(last.beta, state.key)
         except InputError as error:
             return StepResult(False, str(error), 0, 0, 0)
         if key != state.key:
             bank = remap_fields(n, bank, mesh, state.inputs.beta, now_mesh, last.beta)
             fresh = True
         mesh = now_mesh
-        inputs = np.empty((stages, 3 * n + 6))
-        for i, now in enumerate(at_stages):
-            inputs[i, :n], inputs[i, n : 2 * n], inputs[i, 2 * n : 3 * n] = now.alpha, now.alpha_rate, now.beta
-            inputs[i, 3 * n : 3 * n + 3], inputs[i, 3 * n + 3 :] = now.force, now.torque
         small, big = self._work(key, mesh)
-        guess = 3.0 * (state.unknowns - state.earlier[0]) + state.earlier[1]  # quadratic in time, stage by stage
+        guess = 2.0 * state.unknowns - state.earlier  # linear in time, stage by stage
         before = bank[:RATES].copy() if record else bank
         found = np.empty_like(guess)
         outcome, iterations, sweeps, jacobians = step(
@@ -196,8 +201,7 @@ class Simulator:
         if outcome != CONVERGED:
             return StepResult(False, OUTCOMES[outcome], iterations, sweeps, jacobians)
         state.key, state.mesh, state.bank = key, mesh, bank
-        state.earlier = np.stack([state.unknowns, state.earlier[0]])
-        state.unknowns = found
+        state.earlier, state.unknowns = state.unknowns, found
         state.nodes = small[6].reshape(-1, 16 + 3 * n).copy()
         state.inputs = last
         records: tuple[Record, ...] = ()
@@ -224,45 +228,65 @@ def remap_fields(
     """Fields (rows, fields) of the sections ``old`` at ``old_beta`` as fields of the sections ``new`` at ``new_beta``.
 
     By interpolation inside each old section, never across one. Sections that are the same but for their cells keep their reference coordinate.
+    The Runge-Kutta stages of a cell are not the field at their abscissa: at the middle they miss it by -e and +e with e of second order in the
+    cell's length, at the end by an error of third order. These offsets belong to the history as well, or the change of cells would be a kick.
     """
     old_s, old_section = point_positions(old, old_beta)
     new_s, new_section = point_positions(new, new_beta)
     F = 7 + 2 * n
     main = len(old_s) * F
     ends = [old_s[old_section == k][-1] for k in range(len(old.sec_cells))]
-    tip_old, tip_new = old_s[-1], new_s[-1]
     result = np.zeros((len(bank), len(new_s) * F + bank.shape[1] - main))
     result[:, len(new_s) * F :] = bank[:, main:]
-    fields = bank[:, :main].reshape(len(bank), -1, F)
-    target = result[:, : len(new_s) * F].reshape(len(bank), -1, F)
+    fields = bank[:, :main].reshape(len(bank), -1, F).swapaxes(0, 1)
+    target = result[:, : len(new_s) * F].reshape(len(bank), -1, F).swapaxes(0, 1)
     same = np.array_equal(old.bp_tube, new.bp_tube) and np.array_equal(old.bp_offset, new.bp_offset)
     for k in range(len(new.sec_cells)):
         where = np.flatnonzero(new_section == k)
-        s = new_s[where] * tip_old / tip_new
-        if same:
-            there = old_s[old_section == k]
-            span = max(new_s[where][-1] - new_s[where][0], 1e-15)
-            s = there[0] + (new_s[where] - new_s[where][0]) / span * (there[-1] - there[0])
+        s = new_s[where] * old_s[-1] / new_s[-1]
         middle = 0.5 * (s[0] + s[-1])
         source = k if same else next((j for j, end in enumerate(ends) if middle <= end + 1e-12), len(ends) - 1)
         points = np.flatnonzero(old_section == source)
-        # stage points at a cell's start, its two middles and its end: the distinct abscissae are starts, middles and the last end
-        distinct = np.concatenate([points[i:-1:4] for i in (0, 1)] + [points[-1:]])
-        distinct = distinct[np.argsort(old_s[distinct], kind="stable")]
-        target[:, where] = _interpolate(old_s[distinct], fields[:, distinct], s)
+        x = old_s[points]
+        if same:
+            s = x[0] + (new_s[where] - new_s[where][0]) / max(np.ptp(new_s[where]), 1e-15) * (x[-1] - x[0])
+        target[where] = _resample(x, fields[points], s)
     return result
 
 
-def _interpolate(x: np.ndarray, values: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """Piecewise quadratic Lagrange interpolation of values (slots, points, F) at ``at``, held outside the range of ``x``."""
-    if x[-1] - x[0] < 1e-12 or len(x) < 3:
-        return np.repeat(values[:, -1:], len(at), axis=1)
+def _resample(x: np.ndarray, values: np.ndarray, at: np.ndarray) -> np.ndarray:
+    """Stage values (points, ...) of one section's cells at ``x`` as those of other cells at ``at``; both hold four stages a cell and the end."""
+    if x[-1] - x[0] < 1e-12:
+        return np.repeat(values[-1:], len(at), axis=0)
     at = np.clip(at, x[0], x[-1])
-    left = np.clip(2 * ((np.searchsorted(x, at, side="right") - 1) // 2), 0, len(x) - 3)
-    x0, x1, x2 = x[left], x[left + 1], x[left + 2]
-    w0 = (at - x1) * (at - x2) / ((x0 - x1) * (x0 - x2))
-    w1 = (at - x0) * (at - x2) / ((x1 - x0) * (x1 - x2))
-    w2 = (at - x0) * (at - x1) / ((x2 - x0) * (x2 - x1))
-    return (
-        w0[:, None] * values[:, left] + w1[:, None] * values[:, left + 1] + w2[:, None] * values[:, left + 2]
-    )
+    first, second, last = values[1:-1:4], values[2:-1:4], values[3:-1:4]
+    nodes = np.concatenate([values[0:-1:4], values[-1:]])
+    knots = np.concatenate([x[0:-1:4], x[-1:]])
+    centres = 0.5 * (knots[:-1] + knots[1:])
+    grid = np.empty(2 * len(centres) + 1)
+    grid[0::2], grid[1::2] = knots, centres
+    known = np.empty((len(grid), *values.shape[1:]))
+    known[0::2], known[1::2] = nodes, 0.5 * (first + second)
+    result = CubicSpline(grid, known)(at) if len(grid) > 3 else _quadratic(grid, known, at)
+    ratio = (at[-1] - at[0]) / ((len(at) - 1) // 4) / (x[-1] - x[0]) * len(centres)
+    half, end = 0.5 * (second - first) * ratio**2, (last - nodes[1:]) * ratio**3
+    for stage, offset in ((1, -half), (2, half), (3, end)):
+        result[stage:-1:4] += _linear(centres, offset, 0.5 * (at[0:-1:4] + at[3:-1:4]))
+    return result
+
+
+def _linear(x: np.ndarray, values: np.ndarray, at: np.ndarray) -> np.ndarray:
+    """Linear interpolation of values (points, ...), held outside the range of ``x``."""
+    if len(x) == 1:
+        return np.repeat(values, len(at), axis=0)
+    left = np.clip(np.searchsorted(x, at, side="right") - 1, 0, len(x) - 2)
+    w = np.clip((at - x[left]) / (x[left + 1] - x[left]), 0.0, 1.0).reshape(-1, *[1] * (values.ndim - 1))
+    return (1.0 - w) * values[left] + w * values[left + 1]
+
+
+def _quadratic(x: np.ndarray, values: np.ndarray, at: np.ndarray) -> np.ndarray:
+    """Parabola through three values (3, ...)."""
+    w0 = (at - x[1]) * (at - x[2]) / ((x[0] - x[1]) * (x[0] - x[2]))
+    w1 = (at - x[0]) * (at - x[2]) / ((x[1] - x[0]) * (x[1] - x[2]))
+    w2 = (at - x[0]) * (at - x[1]) / ((x[2] - x[0]) * (x[2] - x[1]))
+    return np.tensordot(np.stack([w0, w1, w2], axis=1), values, axes=1)

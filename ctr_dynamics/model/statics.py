@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ctr_dynamics.model.kernels import lane_count, sweep
 from ctr_dynamics.model.mesh import Mesh, section_lengths
@@ -57,7 +58,17 @@ class Statics:
         self.model = model
         self.tolerance = tolerance
 
-    def solve(self, beta, alpha, force=(0, 0, 0), torque=(0, 0, 0), *, guess=None, end_angles=None, parameters=None):
+    def solve(
+        self,
+        beta: ArrayLike,
+        alpha: ArrayLike,
+        force: ArrayLike = (0, 0, 0),
+        torque: ArrayLike = (0, 0, 0),
+        *,
+        guess: np.ndarray | None = None,
+        end_angles: ArrayLike | None = None,
+        parameters: np.ndarray | None = None,
+    ) -> Equilibrium:
         """Equilibrium at beta (N,) m, alpha (N,) rad (at beta) under a wrench on tube 1's tip (N, N m, ``ctr_base``).
 
         Args:
@@ -140,7 +151,9 @@ class Statics:
         x, _ = work.backward(unloaded, end_angles)
         return x, work.newton(unloaded, x, self.tolerance)
 
-    def stability(self, equilibrium: Equilibrium, beta, alpha, force=(0, 0, 0), torque=(0, 0, 0)) -> float:
+    def stability(
+        self, equilibrium: Equilibrium, beta: ArrayLike, alpha: ArrayLike, force: ArrayLike = (0, 0, 0), torque: ArrayLike = (0, 0, 0)
+    ) -> float:
         """det(d alpha / d psi_L) with the loads held, positive on stable branches (Gilbert et al. 2016, Ha et al. 2016).
 
         psi_L and the tip's imbalance r are smooth functions of (x, alpha), and their joint Jacobian is regular where the
@@ -298,7 +311,7 @@ class _Work:
         angles, torque = end_angles.copy(), np.zeros(n)
         ust = mesh.ust.reshape(-1, n, 3) * KS[:, None]
 
-        def slope(angles: np.ndarray, torque: np.ndarray, present: int, reference: np.ndarray):
+        def slope(angles: np.ndarray, torque: np.ndarray, present: int, reference: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
             c, s = np.cos(angles[:present]), np.sin(angles[:present])
             wx = c * reference[:present, 0] - s * reference[:present, 1]
             wy = s * reference[:present, 0] + c * reference[:present, 1]

@@ -6,11 +6,11 @@ from collections.abc import Mapping
 
 from ctr_dynamics.estimation.outputs import ERROR, OK, WARN, Status
 from ctr_dynamics.nodes.stepping import StampClock
-from ctr_dynamics.nodes.timing import LATE_NS, VERY_LATE_NS, StepTiming
+from ctr_dynamics.nodes.timing import GOES_BACK_NS, LATE_NS, VERY_LATE_NS, StepTiming
 
 
-def timing_status(timing: StepTiming, faults: int, last_fault: str) -> Status:
-    """Punctuality of the published steps; WARN on late or skipped steps, ERROR after a fault of the node."""
+def timing_status(timing: StepTiming, faults: int, last_fault: str, withheld_behind_ns: int = 0) -> Status:
+    """Punctuality of the steps: WARN when late or skipped, ERROR after a fault or when stamps went back."""
     report = timing.report()
 
     def spread(name: str) -> str:
@@ -28,6 +28,14 @@ def timing_status(timing: StepTiming, faults: int, last_fault: str) -> Status:
         "step p50 / p99 / max (ms)": spread("step_ms"),
         "correction p50 / p99 / max (ms)": spread("correction_ms"),
     }
+    if withheld_behind_ns > GOES_BACK_NS:
+        return Status(
+            "timing",
+            ERROR,
+            f"nothing is published: steps are {withheld_behind_ns * 1e-9:.3f} s before the last published "
+            f"stamp, limit {GOES_BACK_NS * 1e-9:g} s; mend the clock that stamps the joints or call ~/reset",
+            values,
+        )
     if faults:
         return Status(
             "timing",

@@ -22,7 +22,7 @@ from rclpy.signals import SignalHandlerOptions
 from rclpy.subscription import RCLError
 from std_srvs.srv import SetBool, Trigger
 
-from ctr_dynamics import __version__, model
+from ctr_dynamics import __version__
 from ctr_dynamics.bagio.writer import LiveRecorder
 from ctr_dynamics.errors import InputError
 from ctr_dynamics.estimation.estimator import Estimator
@@ -106,7 +106,6 @@ class EstimatorNode(Node):
     def _warm_up(self) -> None:
         self.get_logger().info("compiling the kernels (seconds with a filled cache, minutes without)")
         begin = time.perf_counter()
-        model.warmup()
         rehearse(self._robot, self.settings)
         self.get_logger().info(f"kernels ready after {time.perf_counter() - begin:.1f} s")
 
@@ -212,7 +211,9 @@ class EstimatorNode(Node):
     def _statuses(self, now_ns: int) -> list[Any]:
         return [
             *self._estimator.health.statuses(),
-            diagnostics.timing_status(self.timing, self.loop.faults, self.loop.last_fault),
+            diagnostics.timing_status(
+                self.timing, self.loop.faults, self.loop.last_fault, self.outputs.withheld_behind_ns
+            ),
             diagnostics.clock_status(self.loop.stamp_clock, now_ns, self._use_sim_time),
             diagnostics.topics_status(self._qos_faults.by_topic, self._undecodable),
         ]
@@ -225,6 +226,10 @@ class EstimatorNode(Node):
         else:
             self.loop.wake()
 
+    def _reset(self) -> None:
+        self.loop.reset()
+        self.outputs.let_go_back()
+
     def _clock_went_back(self) -> None:
         self.loop.reset()
         self.outputs.forget_stamps()
@@ -232,7 +237,7 @@ class EstimatorNode(Node):
     def _on_reset(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         return self._answer(
             response,
-            lambda: self.loop.call(self.loop.reset),
+            lambda: self.loop.call(self._reset),
             lambda _: "the estimator starts anew at the next complete joint state",
         )
 

@@ -13,6 +13,7 @@ from ctr_dynamics.messages import topics
 from ctr_dynamics.messages.encode import StepEncoder, encode_diagnostics
 from ctr_dynamics.nodes.naming import message_class, node_topic
 from ctr_dynamics.nodes.qos import QosFaults
+from ctr_dynamics.nodes.timing import GOES_BACK_NS
 
 
 class Outputs:
@@ -35,8 +36,12 @@ class Outputs:
         record: Callable[[str, int, bytes], None] | None = None,
     ) -> None:
         self.last_stamp_ns: int | None = None
+        self.withheld_behind_ns = (
+            0  # how far the last step lay before what was published; 0: it was published
+        )
         self.valid: bool | None = None
         self.reason = "no step has been taken yet: waiting for the first complete joint state"
+        self._may_go_back = False
         self._encoder = encoder
         self._record = record
         self._publishers = {
@@ -52,7 +57,12 @@ class Outputs:
     def step(self, out: Any) -> bool:
         """Publish one step; False when its stamp is not later than all that were published."""
         if self.last_stamp_ns is not None and out.stamp_ns <= self.last_stamp_ns:
-            return False
+            behind_ns = self.last_stamp_ns - out.stamp_ns
+            if not (self._may_go_back and behind_ns > GOES_BACK_NS):
+                self.withheld_behind_ns = max(behind_ns, 1)
+                return False
+        self._may_go_back = False
+        self.withheld_behind_ns = 0
         messages = self._encoder.encode(out)
         self.last_stamp_ns = out.stamp_ns
         for message in messages:
@@ -62,8 +72,12 @@ class Outputs:
         return True
 
     def forget_stamps(self) -> None:
-        """The clock itself has gone back (a simulation starts again): earlier stamps are new ones now."""
+        """The node's clock itself has gone back (a simulation starts again): earlier stamps are new."""
         self.last_stamp_ns = None
+
+    def let_go_back(self) -> None:
+        """After a reset: if the stamps have gone back by more than a second, start from there."""
+        self._may_go_back = True
 
     def diagnostics(self, stamp_ns: int, statuses: list[Any]) -> None:
         """Publish /diagnostics."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 from ctr_dynamics.estimation.estimator import Estimator
 from ctr_dynamics.messages.encode import StepEncoder
 from ctr_dynamics.parameters import Settings
@@ -9,29 +11,33 @@ from ctr_dynamics.robot import Robot
 
 START_NS = 1_000_000_000_000
 JOINT_PERIOD_NS = 10_000_000
-DURATION_NS = 300_000_000
+TICKS = 40
 
 
 def rehearse(robot: Robot, settings: Settings) -> int:
-    """Run another estimator at the robot's rest position, tracker included; returns the number of steps.
+    """Run another estimator about the robot's rest position with every kind of input; returns the number of steps.
 
-    The tracker reports the predicted tip, every third sample late enough to be fused by roll-back.
+    The actuators turn and slide a little, a load comes and goes, and the tracker reports the predicted tip, now
+    and then late enough to be fused by roll-back.
     """
     estimator = Estimator(robot, settings)
     encoder = StepEncoder(settings["output.frame_id"], robot.name)
     names = [f"tube{n}_{kind}" for n in range(1, robot.n_tubes + 1) for kind in ("rotation", "translation")]
-    rest = zip(robot.rest.alpha.value, robot.rest.beta.value, strict=True)
-    positions = [float(x) for pair in rest for x in pair]
+    rest = list(zip(robot.rest.alpha.value, robot.rest.beta.value, strict=True))
     steps = 0
-    for stamp_ns in range(START_NS, START_NS + DURATION_NS, JOINT_PERIOD_NS):
+    for tick in range(TICKS):
+        stamp_ns = START_NS + tick * JOINT_PERIOD_NS
+        motion = 0.5 * (1.0 - math.cos(2.0 * math.pi * tick / TICKS))
+        positions = [x for alpha, beta in rest for x in (alpha + 0.02 * motion, beta - 2e-4 * motion)]
         estimator.add_joint_state(stamp_ns, names, positions)
-        for index, out in enumerate(estimator.advance(stamp_ns + JOINT_PERIOD_NS // 2)):
+        estimator.add_tip_load(stamp_ns, (0.0, -1e-3 * motion, 0.0), (0.0, 0.0, 0.0))
+        steps_now = estimator.advance(stamp_ns + JOINT_PERIOD_NS // 2)
+        steps += len(steps_now)
+        for out in steps_now:
             encoder.encode(out, estimator.health.statuses)
-            steps += 1
-            if index == 0 and out.valid:
-                w, x, y, z = out.predicted_quaternion_wxyz
-                age_ns = JOINT_PERIOD_NS if steps % 3 else 3 * JOINT_PERIOD_NS
-                estimator.add_tracker_pose(
-                    out.stamp_ns - age_ns, out.predicted_position, (x, y, z, w), settings["output.frame_id"]
-                )
+        if steps_now and steps_now[-1].valid:
+            out = steps_now[-1]
+            w, *xyz = out.predicted_quaternion_wxyz.tolist()
+            age_ns = JOINT_PERIOD_NS if tick % 3 else 4 * JOINT_PERIOD_NS
+            estimator.add_tracker_pose(out.stamp_ns - age_ns, out.predicted_position.tolist(), (*xyz, w))
     return steps

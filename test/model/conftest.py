@@ -1,4 +1,7 @@
-"""Makes the helpers beside the tests importable: `model_cases` builds robots, `model_oracle` is the plain NumPy twin."""
+"""Makes the helpers beside the tests importable.
+
+`model_cases` builds robots, `model_oracle` is the plain NumPy twin.
+"""
 
 import sys
 from pathlib import Path

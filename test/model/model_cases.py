@@ -114,7 +114,8 @@ def still(beta, alpha, force=(0, 0, 0), torque=(0, 0, 0)) -> Inputs:
 
 
 def run(model: Model, scheme: str, dt: float, steps: int, at, *, start=None, alpha=-0.45, tolerance=1e-7):
-    """Step `steps` times from rest at `start` (default: at time 0); returns simulator, states' tips (steps + 1, 3) and last state.
+    """Step `steps` times from rest at `start` (default: at time 0); returns simulator, states' tips (steps +
+    1, 3) and last state.
 
     Every step must succeed.
     """
@@ -140,5 +141,7 @@ def dominant_frequency(values: np.ndarray, dt: float, guess: float) -> float:
 
     grid = np.linspace(0.8, 1.2, 161) * guess
     best = grid[np.argmin([minus_power(f) for f in grid])]
-    found = minimize_scalar(minus_power, bounds=(best * 0.99, best * 1.01), method="bounded", options={"xatol": 1e-9 * best})
+    found = minimize_scalar(
+        minus_power, bounds=(best * 0.99, best * 1.01), method="bounded", options={"xatol": 1e-9 * best}
+    )
     return float(found.x)

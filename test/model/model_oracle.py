@@ -1,7 +1,9 @@
-"""Plain NumPy twin of the arc-length kernels, written from the vector form of the equations, one point and one tube at a time.
+"""Plain NumPy twin of the arc-length kernels, written from the vector form of the equations, one point and
+one tube at a time.
 
-Nothing is simplified by hand: the common curvature follows from (14) by solving for it numerically, and angular rates of the
-tubes are differentiated as vectors, so that (12), (13), (16) and (17) in the kernels are checked against where they come from.
+Nothing is simplified by hand: the common curvature follows from (14) by solving for it numerically, and
+angular rates of the tubes are differentiated as vectors, so that (12), (13), (16) and (17) in the kernels are
+checked against where they come from.
 """
 
 import numpy as np
@@ -29,8 +31,14 @@ class Oracle:
         self.n, self.mesh, self.seclen, self.c0 = layout.n, mesh, seclen, c0
         self.p = {name: par[layout[name]] for name in layout._rows}
         self.J = [np.diag([1.0, 1.0, 2.0]) * i for i in self.p["inertia_per_length"]]
-        self.K = [np.diag([e, e, g]) for e, g in zip(self.p["bending_stiffness"], self.p["torsional_stiffness"], strict=True)]
-        self.B = [np.diag([b, b, t]) for b, t in zip(self.p["bending_damping"], self.p["torsion_damping"], strict=True)]
+        self.K = [
+            np.diag([e, e, g])
+            for e, g in zip(self.p["bending_stiffness"], self.p["torsional_stiffness"], strict=True)
+        ]
+        self.B = [
+            np.diag([b, b, t])
+            for b, t in zip(self.p["bending_damping"], self.p["torsion_damping"], strict=True)
+        ]
 
     def unpack(self, y: np.ndarray):
         """p, h, q, omega, n, m_xy, m_z (N,), theta (N,), gamma (N,)."""
@@ -40,7 +48,10 @@ class Oracle:
         return y[:3], y[3:7], y[7:10], y[10:13], y[13:16], y[16:18], y[18 : 18 + n], theta, gamma
 
     def tube_moment(self, i, u1, u1_t, uz, uz_t, theta, gamma, reference):
-        """Internal moment of tube i in its own frame, (14), and its curvature vector; u_i,t is the derivative of R_z^T u_1 as a vector."""
+        """Internal moment of tube i in its own frame, (14), and its curvature vector.
+
+        U_i,t is the derivative of R_z^T u_1 as a vector.
+        """
         Rt = turn(theta[i]).T
         u = Rt @ u1
         u_t = Rt @ u1_t - gamma[i] * np.cross(E3, u)
@@ -62,7 +73,8 @@ class Oracle:
             u1 = np.array([*xy, uz[0]])
             u1_t = np.array([*(c0 * np.asarray(xy) + history[6:8]), uz_t[0]])
             return sum(
-                turn(theta[i]) @ self.tube_moment(i, u1, u1_t, uz, uz_t, theta, gamma, reference)[0] for i in range(present)
+                turn(theta[i]) @ self.tube_moment(i, u1, u1_t, uz, uz_t, theta, gamma, reference)[0]
+                for i in range(present)
             )[:2]
 
         free = total((0.0, 0.0))
@@ -148,7 +160,7 @@ class Oracle:
     def body(self, y, history, i):
         """m (p_tt - g) and the body's rate of angular momentum, both in the frame of tube 1."""
         p = self.p
-        _, h, q, w, *_, theta, gamma = self.unpack(y)
+        _, h, _, w, *_, theta, gamma = self.unpack(y)
         w_t, g_t, acceleration = self.rates(y, history, gamma)
         wi, wi_t = self.own_rate(i, w, w_t, theta, gamma, g_t)
         H = np.diag([p[f"body_inertia_{k}"][i] for k in "xyz"])
@@ -198,7 +210,12 @@ class Oracle:
         fields, nodes, res = np.zeros_like(hist), [], np.zeros(5 + n)
         *_, theta, gamma = self.unpack(y)
         straight = mesh.ust0.reshape(n, 3)
-        near = np.array([-p["bending_stiffness"][i] * p["precurvature"][i] * (turn(theta[i]) @ straight[i])[:2] for i in range(n)])
+        near = np.array(
+            [
+                -p["bending_stiffness"][i] * p["precurvature"][i] * (turn(theta[i]) @ straight[i])[:2]
+                for i in range(n)
+            ]
+        )
         # base plate on the outermost tube, (24)
         rate = y[12] + gamma[n - 1]
         y[18 + n - 1] += (

@@ -11,7 +11,7 @@ from ctr_dynamics.model.model import Model
 
 
 def random_problem(n, seed, nodes=12):
-    """A model of `n` tubes with random parameters, unknowns and histories of the size that motion produces."""
+    """A model of `n` tubes with random parameters, unknowns and histories of the size of motion."""
     rng = np.random.default_rng(seed)
     model = Model(many_tubes(n), nodes=nodes)
     layout, par = model.layout, model.parameters.copy()
@@ -40,8 +40,8 @@ def compiled(model, mesh, lanes, par, beta, x, hist, histb, c0):
     for j in range(L):
         section_lengths(mesh.bp_tube, mesh.bp_offset, beta.reshape(-1, L)[:, j].copy(), lengths)
         seclenL.reshape(-1, L)[:, j] = lengths
-    sweep(model.tubes, lanes, W, c0, mesh.sec_cells, mesh.sec_tubes, mesh.ust, mesh.ust0, mesh.ust_base, mesh.base_cells,
-          parL, seclenL, xL, histL, histbL, out, outb, nodes, res)  # fmt: skip
+    sweep(model.tubes, lanes, W, c0, mesh.sec_cells, mesh.sec_tubes, mesh.ust, mesh.ust0, mesh.ust_base,
+          mesh.base_cells, parL, seclenL, xL, histL, histbL, out, outb, nodes, res)  # fmt: skip
     return tuple(a.reshape(-1, L).copy() for a in (res, out, outb, nodes))
 
 
@@ -53,7 +53,10 @@ def relative(found, expected):
 @pytest.mark.parametrize("n", [1, 2, 3, 4])
 @pytest.mark.parametrize("c0", [0.0, 765.0])
 def test_sweep_equals_its_numpy_twin(n, c0):
-    """Random unknowns, actuators, loads and histories; damping, friction, bodies and every gyroscopic term on."""
+    """Random unknowns, actuators, loads and histories.
+
+    Damping, friction, bodies and every gyroscopic term on.
+    """
     model, mesh, par, beta, x, hist, histb = random_problem(n, 10 * n)
     if c0 == 0.0:
         hist, histb = 0.0 * hist, 0.0 * histb
@@ -65,14 +68,16 @@ def test_sweep_equals_its_numpy_twin(n, c0):
     S = 16 + 3 * n
     for row in range(S):
         a, b = found[3].reshape(-1, S)[:, row], expected[3][:, row]
-        np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-10 * max(np.abs(b).max(), 1e-12), err_msg=f"state row {row}")
+        np.testing.assert_allclose(
+            a, b, rtol=1e-9, atol=1e-10 * max(np.abs(b).max(), 1e-12), err_msg=f"state row {row}"
+        )
     for name, a, b in zip(("res", "out", "outb"), found, expected, strict=False):
         assert relative(a, b) < 1e-9, name
 
 
 @pytest.mark.parametrize("n", [1, 2, 3, 4])
 def test_lanes_equal_separate_sweeps(n):
-    """Sixteen different problems at once, a perturbed everything in each, against sixteen sweeps of one lane."""
+    """Sixteen problems at once, everything perturbed in each, against sweeps of one lane."""
     lanes, L, c0 = (0, 0), 16, 765.0
     model, mesh, *base = random_problem(n, 5)
     rng = np.random.default_rng(7)
@@ -93,10 +98,20 @@ def test_polynomial_sine_and_cosine():
 
 
 def test_torsion_row_of_the_total_moment_is_the_sum_of_the_tubes():
-    """Without friction, bodies and loads the torques of all tubes add up to one rod's: (13), summed, has no internal torque."""
+    """Without friction, bodies and loads the torques of all tubes add up to one rod's.
+
+    (13), summed, has no internal torque.
+    """
     n = 3
     model, mesh, par, beta, x, hist, histb = random_problem(n, 3)
-    for name in ("tube_coulomb", "tube_viscous", "body_mass", "body_inertia_x", "body_inertia_y", "body_inertia_z"):
+    for name in (
+        "tube_coulomb",
+        "tube_viscous",
+        "body_mass",
+        "body_inertia_x",
+        "body_inertia_y",
+        "body_inertia_z",
+    ):
         par[model.layout[name]] = 0.0
     changed = par.copy()
     changed[model.layout["tube_coulomb"]] = 0.05

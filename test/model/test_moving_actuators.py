@@ -1,4 +1,9 @@
-"""Translations while the model runs: insertion, breakpoints that pass each other and the plate, meshes that follow, failures."""
+"""Translations while the model runs.
+
+Insertion, breakpoints that pass each other and the plate, meshes that follow, failures.
+"""
+
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -15,7 +20,9 @@ DT = 0.003
 
 
 def slide(robot, tube, distance, speed, rotation=0.0):
-    """Inputs of tube `tube` sliding out by `distance` m at `speed` m/s and back, all tubes turning to and fro; and the end time."""
+    """Inputs of tube `tube` sliding out by `distance` m at `speed` m/s and back, all tubes turning to and
+    fro; and the end time.
+    """
     beta0, alpha0 = np.array(robot.rest.beta.value), np.array(robot.rest.alpha.value)
     half = abs(distance) / speed
 
@@ -56,16 +63,20 @@ def follow(model, at, seconds, scheme="sdirk3", every=50):
 
 
 def test_insertion_out_and_back():
-    """The inner tube slides 30 mm out and back at 5 mm/s while it turns at 0.1 rad/s: no step fails, the path is the static one, the end the start."""
+    """The inner tube slides 30 mm out and back at 5 mm/s while it turns at 0.1 rad/s.
+
+    No step fails, the path is the static one, the end the start.
+    """
     model = Model(load_robot("till2020_tissue"), nodes=24)
     at, end = slide(model.robot, 0, 0.03, 5e-3, rotation=0.1)
     tips, checks, _, _ = follow(model, at, end + 2.0)
     assert np.linalg.norm(tips[-1] - tips[0]) < 0.1e-3
     # the vibration that the sudden start leaves is no part of the quasi-static path: means over its period
     apart = np.array([np.linalg.norm(found - static) for t, found, static in checks if t > 1.0])
-    print(f"insertion: path {apart.max() * 1e3:.4f} mm, return {np.linalg.norm(tips[-1] - tips[0]) * 1e3:.4f} mm")
+    back = np.linalg.norm(tips[-1] - tips[0])
+    print(f"insertion: path {apart.max() * 1e3:.4f} mm, return {back * 1e3:.4f} mm")
     assert apart.max() < 0.2e-3
-    assert np.ptp(tips[:, 2]) > 0.02
+    assert np.linalg.norm(tips - tips[0], axis=1).max() > 0.02
 
 
 def test_breakpoints_pass_the_plate_without_a_kick():
@@ -73,20 +84,25 @@ def test_breakpoints_pass_the_plate_without_a_kick():
     model = Model(load_robot("till2020_tissue"), nodes=24)
     at, end = slide(model.robot, 1, -0.008, 4e-3)
     tips, checks, keys, _ = follow(model, at, end + 0.5, every=25)
-    assert len({key[0] for key in keys}) == 2  # with and without the outer tube's straight part before the plate
+    assert (
+        len({key[0] for key in keys}) == 2
+    )  # with and without the outer tube's straight part before the plate
     speed = np.linalg.norm(np.diff(tips, axis=0), axis=1) / DT
-    quasi_static = max(
-        np.linalg.norm(b[2] - a[2]) / (b[0] - a[0]) for a, b in zip(checks[:-1], checks[1:], strict=True)
-    )
+    quasi_static = max(np.linalg.norm(b[2] - a[2]) / (b[0] - a[0]) for a, b in pairwise(checks))
     apart = np.array([np.linalg.norm(found - static) for t, found, static in checks if t > 1.0])
-    print(f"plate: path {apart.max() * 1e3:.4f} mm, speed {speed.max() * 1e3:.2f} mm/s of {quasi_static * 1e3:.2f}")
+    print(
+        f"plate: path {apart.max() * 1e3:.4f} mm, speed {speed.max() / quasi_static:.3f} of the quasi-static"
+    )
     assert apart.max() < 0.2e-3
     assert speed.max() < 3 * quasi_static + 1e-3
     assert np.linalg.norm(tips[-1] - tips[0]) < 0.1e-3
 
 
 def test_curvature_change_passes_a_tube_end():
-    """Tube 1's curved part begins inside tube 2 and comes out beyond its end: the order of breakpoints changes on the way."""
+    """Tube 1's curved part begins inside tube 2 and comes out beyond its end.
+
+    The order of breakpoints changes on the way.
+    """
     robot = load_robot("three_tube")
     model = Model(robot, nodes=30)
     beta0 = np.array(robot.rest.beta.value)
@@ -114,7 +130,10 @@ def test_mesh_follows_a_section_that_grows():
 
 
 def test_accuracy_does_not_depend_on_what_was_solved_before():
-    """A pose after another one with the same order of breakpoints but other lengths: the same shape as from a fresh model."""
+    """A pose after another one with the same order of breakpoints but other lengths.
+
+    The same shape as from a fresh model.
+    """
     robot = load_robot("till2020_tissue")
     first, second = [-0.2521, -0.1999], [-0.2521, -0.1500]
     used, fresh = Model(robot, nodes=24), Model(robot, nodes=24)
@@ -134,14 +153,19 @@ def test_remap_is_exact_for_smooth_fields():
 
     def fields(mesh):
         s, section = point_positions(mesh, beta)
-        main = ((1 + section[:, None]) * (1.0 + 3 * s[:, None] - 7 * s[:, None] ** 2) * np.arange(1, 12)).ravel()
+        main = (
+            (1 + section[:, None]) * (1.0 + 3 * s[:, None] - 7 * s[:, None] ** 2) * np.arange(1, 12)
+        ).ravel()
         return np.concatenate([main, np.ones(len(mesh.ust_base) * 2)])[None]
 
     np.testing.assert_allclose(remap_fields(2, fields(old), old, beta, new, beta), fields(new), rtol=1e-12)
 
 
 def test_polynomial_precurvature_moves_with_its_tube():
-    """A tube of linearly rising curvature slides: the dynamic path is the static one, whose precurvature was taken anew at each position."""
+    """A tube of linearly rising curvature slides.
+
+    The dynamic path is the static one, whose precurvature was taken anew at each position.
+    """
     tube = make_tube(segments=((0.2, [[0, 40.0], [0, 0], [0, 0]]),))
     model = Model(make_robot([tube], [-0.08]), nodes=24)
     at, end = slide(model.robot, 0, 0.03, 0.01)
@@ -151,7 +175,10 @@ def test_polynomial_precurvature_moves_with_its_tube():
 
 
 def test_a_jump_that_cannot_be_followed_leaves_the_state_alone():
-    """Actuators or loads beyond reach: ok False with a reason, everything finite and as it was, and the next step goes on."""
+    """Actuators or loads beyond reach.
+
+    Ok False with a reason, everything finite and as it was, and the next step goes on.
+    """
     model = Model(load_robot("till2020_tissue"), nodes=24)
     beta, alpha = model.robot.rest.beta.value, model.robot.rest.alpha.value
     calm = still(beta, alpha)
@@ -165,6 +192,7 @@ def test_a_jump_that_cannot_be_followed_leaves_the_state_alone():
         "order": still([-0.2521, 0.0], alpha),
         "behind the plate": still([-0.41, -0.3], alpha),
         "not a number": still(beta, [np.nan, 0.0]),
+        "not a position": still([np.nan, -0.1977], alpha),
     }
     for name, jump in jumps.items():
         result = simulator.step(state, 0.009, lambda t, jump=jump: jump)
@@ -198,7 +226,9 @@ def test_a_failed_step_across_the_plate_keeps_its_sections():
 
 @pytest.mark.parametrize("n", [1, 3, 4])
 def test_any_number_of_tubes_runs(n):
-    """Turning and sliding robots of one, three and four tubes with every term on stay finite and settle where statics says."""
+    """Turning and sliding robots of one, three and four tubes with every term on stay finite and settle where
+    statics says.
+    """
     model = Model(many_tubes(n), nodes=20)
     beta0 = np.array(model.robot.rest.beta.value)
 
@@ -207,7 +237,14 @@ def test_any_number_of_tubes_runs(n):
         rate = 2.5 if t < 0.2 else 0.0
         alpha = 0.5 * s * np.arange(1, n + 1)
         beta = beta0 + 0.004 * s * np.linspace(1, 0, n)
-        return Inputs(alpha, 0.2 * rate * np.arange(1, n + 1) * 5, beta, np.zeros(n), np.array([0.02, 0, 0]), np.zeros(3))
+        return Inputs(
+            alpha,
+            0.2 * rate * np.arange(1, n + 1) * 5,
+            beta,
+            np.zeros(n),
+            np.array([0.02, 0, 0]),
+            np.zeros(3),
+        )
 
     simulator = Simulator(model, make_scheme("backward_euler", DT))
     state = simulator.rest(at(0.0))

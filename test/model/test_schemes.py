@@ -14,7 +14,10 @@ ORDERS = {"backward_euler": 1, "bdf2": 2, "trapezoid": 2, "bdf_alpha": 2, "sdirk
 
 @pytest.mark.parametrize("name", ORDERS)
 def test_order_of_convergence_in_time(name):
-    """Tip of a damped, precurved tube under a smooth force against very short steps: errors fall by 2^order when the step halves."""
+    """Tip of a damped, precurved tube under a smooth force against very short steps.
+
+    Errors fall by 2^order when the step halves.
+    """
     tube = make_tube(segments=((0.15, (4.0, 0, 0)),), mass=2e-3, bending_damping=2e-5, torsion_damping=1e-5)
     model = Model(make_robot([tube], [-0.02], gravity=(0, -9.81, 0)), nodes=16)
     end = 0.12
@@ -50,7 +53,10 @@ def test_coefficients_reproduce_polynomials():
             t = 0.5
             bank = np.zeros(RATES + 1)
             bank[Y_NOW], bank[Y_BEFORE], bank[RATE_NOW] = y(t - dt), y(t - 2 * dt), rate(t - dt)
-            assert scheme.c0[0] * y(t) + scheme.weights[0] @ bank == pytest.approx(rate(t), abs=1e-9), (name, power)
+            assert scheme.c0[0] * y(t) + scheme.weights[0] @ bank == pytest.approx(rate(t), abs=1e-9), (
+                name,
+                power,
+            )
 
 
 def test_named_members_of_bdf_alpha():
@@ -99,7 +105,10 @@ def release_inputs():
 
 @pytest.mark.slow
 def test_default_scheme_meets_the_release_test():
-    """Tip after a cut load, 1-6 s at 3 ms, against BDF2 at 0.25 ms on the same nodes: at most 0.10 mm rms; the 3 ms BDF2 errs by over 1 mm."""
+    """Tip after a cut load, 1-6 s at 3 ms, against BDF2 at 0.25 ms on the same nodes.
+
+    At most 0.10 mm rms; the 3 ms BDF2 errs by over 1 mm.
+    """
     model, at = release_inputs()
     start = at(0.0)
     later = lambda t: at(t + 0.999)  # noqa: E731

@@ -120,7 +120,10 @@ def test_cantilever_sag_under_its_weight():
 
 
 def test_large_deflection_of_a_cantilever():
-    """Elastica under a transverse end force with P L^2 / EI = 3: tip at 0.603 L across and 0.254 L short (Bisshopp and Drucker 1945)."""
+    """Elastica under a transverse end force with P L^2 / EI = 3.
+
+    Tip at 0.603 L across and 0.254 L short (Bisshopp and Drucker 1945).
+    """
     L = 0.2
     model = Model(make_robot([make_tube(segments=((L, (0, 0, 0)),))], [0.0]), nodes=60)
     EI = model.parameters[model.layout["bending_stiffness"]][0]
@@ -141,7 +144,10 @@ def test_torque_twists_the_whole_tube():
 
 
 def test_polynomial_precurvature_equals_a_constant_and_follows_its_tube():
-    """Constants written as polynomials change nothing; a linear one gives its clothoid, also when its beginning is behind the plate."""
+    """Constants written as polynomials change nothing.
+
+    A linear one gives its clothoid, also when its beginning is behind the plate.
+    """
     constant = make_tube(segments=((0.1, (0, 0, 0)), (0.1, (9.0, 2.0, 0.5))))
     polynomial = make_tube(segments=((0.1, np.zeros((3, 2))), (0.1, [[9.0, 0, 0], [2.0, 0, 0], [0.5, 0, 0]])))
     tips = []
@@ -170,7 +176,10 @@ def test_twist_of_a_torsional_precurvature_behind_the_plate_is_exact():
 
 
 def test_convergence_in_arc_length_is_fourth_order():
-    """Tip of a loaded, damped step's sections against very many nodes: errors fall by 16 when nodes double."""
+    """Tip of a loaded, damped step's sections against very many nodes.
+
+    Errors fall by 16 when nodes double.
+    """
     robot = load_robot("till2020_tissue")
     beta, alpha = robot.rest.beta.value, (1.2, 0.3)
 

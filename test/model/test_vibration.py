@@ -1,4 +1,7 @@
-"""Small vibrations of one straight tube against beam theory: frequencies, material damping, numerical damping, energy."""
+"""Small vibrations of one straight tube against beam theory.
+
+Frequencies, material damping, numerical damping, energy.
+"""
 
 import numpy as np
 import pytest
@@ -14,17 +17,26 @@ L = 0.2
 
 
 def trapezoid_true(frequency, dt):
-    """Frequency of the motion whose trapezoidal rule shows `frequency`: the rule maps omega to 2/dt atan(omega dt/2), exactly for linear motion."""
+    """Frequency of the motion whose trapezoidal rule shows `frequency`.
+
+    The rule maps omega to 2/dt atan(omega dt/2), exactly for linear motion.
+    """
     return np.tan(np.pi * frequency * dt) / (np.pi * dt)
 
 
 def shown_by(scheme, frequency, dt):
-    """Frequency that a Runge-Kutta scheme shows for a motion of `frequency`: the angle that its stability function turns in a step."""
+    """Frequency that a Runge-Kutta scheme shows for a motion of `frequency`.
+
+    The angle that its stability function turns in a step.
+    """
     return np.angle(sdirk_amplification(scheme, 2j * np.pi * frequency * dt)) / (2 * np.pi * dt)
 
 
 def released(tube, *, dt, steps, force=(0, 0, 0), torque=(0, 0, 0), beta=0.0, scheme="trapezoid", nodes=24):
-    """Motion after a small load is taken away at t = 0: model, tip states per step (steps + 1, S) and stored fields."""
+    """Motion after a small load is taken away at t = 0.
+
+    Model, tip states per step (steps + 1, S) and stored fields.
+    """
     model = Model(make_robot([tube], [beta]), nodes=nodes)
     free, held = still([beta], [0.0]), still([beta], [0.0], force, torque)
     simulator = Simulator(model, make_scheme(scheme, dt), tolerance=1e-9)
@@ -40,7 +52,10 @@ def released(tube, *, dt, steps, force=(0, 0, 0), torque=(0, 0, 0), beta=0.0, sc
 
 def constants(model):
     p, layout = model.parameters, model.layout
-    return [p[layout[k]][0] for k in ("bending_stiffness", "torsional_stiffness", "mass_per_length", "inertia_per_length")]
+    return [
+        p[layout[k]][0]
+        for k in ("bending_stiffness", "torsional_stiffness", "mass_per_length", "inertia_per_length")
+    ]
 
 
 @pytest.mark.parametrize("ratio", [0.0, 0.5, 4.0])
@@ -50,7 +65,9 @@ def test_bending_frequency_of_a_cantilever(ratio):
     EI, _, mass, _ = constants(Model(make_robot([tube], [0.0])))
     tube = make_tube(segments=((L, (0, 0, 0)),), mass=ratio * mass * L)
     root = brentq(
-        lambda x: 1 + np.cos(x) * np.cosh(x) + ratio * x * (np.cos(x) * np.sinh(x) - np.sin(x) * np.cosh(x)), 0.3, 1.9
+        lambda x: 1 + np.cos(x) * np.cosh(x) + ratio * x * (np.cos(x) * np.sinh(x) - np.sin(x) * np.cosh(x)),
+        0.3,
+        1.9,
     )
     expected = root**2 * np.sqrt(EI / (mass * L**4)) / (2 * np.pi)
     dt = 1 / (60 * expected)
@@ -112,7 +129,9 @@ def torsion(model, held, free, dt, steps, scheme="trapezoid"):
 
 
 def energy(model, state, fields):
-    """Kinetic plus elastic energy (rows,), J, of stored fields (rows, fields) of one tube before the plate, by Simpson's rule."""
+    """Kinetic plus elastic energy (rows,), J, of stored fields (rows, fields) of one tube before the plate,
+    by Simpson's rule.
+    """
     EI, GJ, mass, inertia = constants(model)
     mesh = state.mesh
     lengths = np.zeros(len(mesh.sec_cells))
@@ -136,7 +155,10 @@ def energy(model, state, fields):
 
 
 def test_trapezoid_keeps_the_energy():
-    """Without dissipation the trapezoidal rule conserves the energy of small vibrations; 700 steps, over ten periods."""
+    """Without dissipation the trapezoidal rule conserves the energy of small vibrations.
+
+    700 steps, over ten periods.
+    """
     tube = make_tube(segments=((L, (0, 0, 0)),), mass=1e-3)
     model, state, _, fields = released(tube, dt=2e-3, steps=700, force=(0.0, 1e-3, 0.0), nodes=40)
     E = energy(model, state, fields[2:])
@@ -146,7 +168,10 @@ def test_trapezoid_keeps_the_energy():
 
 
 def test_large_motion_keeps_its_energy_nearly():
-    """A precurved tube whipping through large angles: no drift of the trapezoidal rule beyond its second order error."""
+    """A precurved tube whipping through large angles.
+
+    No drift of the trapezoidal rule beyond its second order error.
+    """
     tube = make_tube(segments=((L, (6.0, 0, 0)),), mass=1e-3)
     model, state, tips, fields = released(tube, dt=1e-3, steps=600, force=(0.1, 0.1, 0.0), nodes=40)
     assert np.ptp(tips[:, 1]) > 0.05
@@ -169,7 +194,9 @@ def test_numerical_damping_is_the_schemes_own(scheme, amplification):
     EI, _, mass, _ = constants(Model(make_robot([tube], [0.0])))
     ratio = 1e-3 / (mass * L)
     root = brentq(
-        lambda x: 1 + np.cos(x) * np.cosh(x) + ratio * x * (np.cos(x) * np.sinh(x) - np.sin(x) * np.cosh(x)), 0.3, 1.9
+        lambda x: 1 + np.cos(x) * np.cosh(x) + ratio * x * (np.cos(x) * np.sinh(x) - np.sin(x) * np.cosh(x)),
+        0.3,
+        1.9,
     )
     omega = root**2 * np.sqrt(EI / (mass * L**4))
     dt = 0.3 / omega
@@ -200,7 +227,9 @@ def test_material_damping_ratio():
     EI, _, mass, _ = constants(Model(make_robot([tube], [0.0])))
     ratio = 1e-3 / (mass * L)
     root = brentq(
-        lambda x: 1 + np.cos(x) * np.cosh(x) + ratio * x * (np.cos(x) * np.sinh(x) - np.sin(x) * np.cosh(x)), 0.3, 1.9
+        lambda x: 1 + np.cos(x) * np.cosh(x) + ratio * x * (np.cos(x) * np.sinh(x) - np.sin(x) * np.cosh(x)),
+        0.3,
+        1.9,
     )
     omega = root**2 * np.sqrt(EI / (mass * L**4))
     zeta = 0.01
@@ -221,7 +250,9 @@ def test_torsional_damping_ratio():
     H, zeta = 400 * 2 * inertia * L, 0.02
     root = brentq(lambda x: x * np.tan(x) - 2 * inertia * L / H, 1e-6, 1.5)
     omega = root / L * np.sqrt(GJ / (2 * inertia))
-    tube = make_tube(segments=((L, (0, 0, 0)),), inertia=(1e-12, 1e-12, H), torsion_damping=2 * zeta * GJ / omega)
+    tube = make_tube(
+        segments=((L, (0, 0, 0)),), inertia=(1e-12, 1e-12, H), torsion_damping=2 * zeta * GJ / omega
+    )
     dt = 2 * np.pi / omega / 100
     model = Model(make_robot([tube], [-L / 2]), nodes=16)
     held, free = still([-L / 2], [0.0], torque=(0, 0, 1e-3)), still([-L / 2], [0.0])

@@ -33,7 +33,7 @@ BAGS = Path(__file__).parents[1] / "data" / "bags"
 class RestingRobot(threading.Thread):
     """Publishes a robot at rest at 100 Hz, stamped now, and a tracker that agrees with the model at 40 Hz."""
 
-    def __init__(self, live: Live) -> None:
+    def __init__(self, live: Live, shift_ns: int = 0) -> None:
         super().__init__(daemon=True)
         robot = load_robot("till2020_tissue")
         self.names = [f"tube{n}_{kind}" for n in (1, 2) for kind in ("rotation", "translation")]
@@ -41,6 +41,7 @@ class RestingRobot(threading.Thread):
         self.positions = [x for pair in rest for x in pair]
         self.live = live
         self.joints_on = self.tracker_on = True
+        self.shift_ns = shift_ns  # of the stamps
         self.joint_stamps: list[int] = []
         profile = qos.profile("best_effort", 50)
         node = live.listener.node
@@ -67,7 +68,7 @@ class RestingRobot(threading.Thread):
     def run(self) -> None:
         tick = 0
         while not self.stopped.is_set():
-            now = time.time_ns()
+            now = time.time_ns() + self.shift_ns
             if self.joints_on:
                 self.joint_stamps.append(now)
                 self.joints(now)
@@ -101,8 +102,10 @@ class Live:
         ready = self.listener.wait_for(
             lambda: self.listener.matched() or self.process.code is not None, PATIENCE_S
         )
-        assert ready, self.process.output()
-        assert self.process.code is None, self.process.output()
+        if not ready or self.process.code is not None:
+            self.process.stop(PATIENCE_S)
+            self.listener.__exit__(None, None, None)
+            pytest.fail(f"the node did not start\n{self.process.output()}")
         return self
 
     def __exit__(self, *reason) -> None:
@@ -112,8 +115,8 @@ class Live:
         self.listener.__exit__(None, None, None)
         assert code == 0, self.process.output()
 
-    def resting_robot(self, matched: bool = True) -> RestingRobot:
-        robot = RestingRobot(self)
+    def resting_robot(self, matched: bool = True, shift_ns: int = 0) -> RestingRobot:
+        robot = RestingRobot(self, shift_ns)
         self.robots.append(robot)
         if matched:
             self.wait(lambda: all(p.get_subscription_count() for p in robot.publishers.values()), "a match")

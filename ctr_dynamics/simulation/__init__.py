@@ -1,0 +1,8 @@
+"""Simulated scenarios: motions and loads from a YAML file, run through the model and written as a bag of
+driver messages.
+"""
+
+from ctr_dynamics.simulation.run import Recording, simulate, write_recording
+from ctr_dynamics.simulation.scenario import Scenario, load_scenario, scenario_names
+
+__all__ = ["Recording", "Scenario", "load_scenario", "scenario_names", "simulate", "write_recording"]

@@ -1,0 +1,71 @@
+"""The demo: two processes over real DDS, figures, picture and exit code."""
+
+import json
+
+import pytest
+
+from ctr_dynamics.bagio.reader import open_bag
+from ctr_dynamics.cli import demo as demo_file
+from ctr_dynamics.errors import InputError
+from ctr_dynamics.messages import topics
+from ctr_dynamics.nodes import processes
+
+pytestmark = pytest.mark.ros
+
+
+def run(capfd, **options):
+    defaults = {"bag": None, "truth": None, "robot": "till2020_tissue", "policy": "predict", "duration": 0.0}
+    code = demo_file.demo(**{**defaults, **options})
+    return code, capfd.readouterr().out
+
+
+def test_the_demo_ends_with_tables_picture_and_recorded_outputs(tmp_path, capfd):
+    code, shown = run(capfd, output=tmp_path / "out", duration=1.5)
+    assert code == 0, shown
+    assert "model alone" in shown
+    assert "fused" in shown
+    figures = json.loads((tmp_path / "out" / "demo.json").read_text())
+    assert {c["reference"] for c in figures["comparisons"]} == {"tracker", "truth"}
+    assert figures["timing"]["skipped"] == 0
+    assert (tmp_path / "out" / "demo.png").read_bytes().startswith(b"\x89PNG")
+    bag = open_bag(tmp_path / "out" / "outputs.mcap")
+    assert bag.topics[topics.TIP_POSE].messages > 300
+
+
+def test_an_unknown_robot_or_policy_is_refused_before_anything_starts(tmp_path, capfd):
+    with pytest.raises(InputError, match="nobody"):
+        run(capfd, output=tmp_path, robot="nobody")
+    with pytest.raises(InputError, match="maybe"):
+        run(capfd, output=tmp_path, policy="maybe")
+
+
+def test_an_estimator_that_does_not_start_fails_the_demo(tmp_path, capfd, monkeypatch):
+    monkeypatch.setattr(processes, "ESTIMATOR", "ctr_dynamics.nodes.no_such_module")
+    code, shown = run(capfd, output=tmp_path)
+    assert code == 1
+    assert "demo failed: the estimator did not start" in shown
+    assert "no_such_module" in shown
+
+
+def test_outputs_that_do_not_come_fail_the_demo(tmp_path, capfd, bags):
+    # Joints of two tubes cannot drive three.
+    code, shown = run(
+        capfd, output=tmp_path, robot="three_tube", duration=0.5, bag=bags / "clean_release.mcap"
+    )
+    assert code == 1
+    assert "no tip pose came" in shown
+
+
+def test_a_process_that_ignores_the_signal_is_killed(tmp_path, monkeypatch):
+    script = tmp_path / "stubborn.py"
+    script.write_text(
+        "import signal, time\n"
+        "signal.signal(signal.SIGINT, signal.SIG_IGN)\n"
+        "print('up', flush=True)\n"
+        "time.sleep(600)\n"
+    )
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    process = processes.NodeProcess("stubborn", {}, 1, tmp_path / "log")
+    while "up" not in process.output():
+        assert process.code is None
+    assert process.stop(timeout_s=0.5) == -9

@@ -1,0 +1,93 @@
+"""The driver's bag: order, part, stamps, pace; the figures of a live run."""
+
+import numpy as np
+import pytest
+
+from ctr_dynamics.bagio.reader import open_bag
+from ctr_dynamics.errors import InputError
+from ctr_dynamics.messages import topics
+from ctr_dynamics.messages.cdr import decode_joint_state, decode_stamp
+from ctr_dynamics.messages.encode import encode_joint_state, encode_pose_stamped
+from ctr_dynamics.nodes.listener import Heard
+from ctr_dynamics.nodes.live_report import Trace, compare, compare_truth, trace_of, tracker_of, truth_of
+from ctr_dynamics.nodes.playback import load, pace, shifted
+
+
+def test_shifting_moves_the_stamp_and_nothing_else():
+    data = encode_joint_state(1_700_000_000_123_456_789, ["tube1_rotation"], [0.25])
+    moved = shifted(data, 3_900_000_001)
+    assert decode_stamp(moved) == 1_700_000_004_023_456_790
+    assert decode_joint_state(moved).positions == (0.25,)
+    assert moved[:4] + moved[12:] == data[:4] + data[12:]
+    big = b"\x00\x00\x00\x00" + (5).to_bytes(4, "big") + (7).to_bytes(4, "big") + data[12:]
+    assert decode_stamp(shifted(big, 1_000_000_000)) == 6_000_000_007
+
+
+def test_a_part_of_a_bag_in_order_of_arrival(bags):
+    whole = load(bags / "clean_release.mcap")
+    assert {m.topic for m in whole} == {topic.name for topic in topics.INPUTS}
+    assert [m.log_ns for m in whole] == sorted(m.log_ns for m in whole)
+    part = load(bags / "clean_release.mcap", start_s=1.0, duration_s=0.5)
+    assert 0 < len(part) < len(whole)
+    assert part[0].log_ns - whole[0].log_ns >= 1_000_000_000
+    assert part[-1].log_ns - whole[0].log_ns <= 1_500_000_000
+
+
+def test_a_bag_without_joints_in_that_part_is_refused(bags, tmp_path):
+    with pytest.raises(InputError, match="joint_states"):
+        load(bags / "clean_release.mcap", start_s=1000.0)
+    with pytest.raises(InputError):
+        load(tmp_path / "none.mcap")
+
+
+def test_pace_yields_each_moment_once_it_has_come_and_stops_when_told():
+    clock = iter(range(0, 10_000, 7))
+    moments = [1000, 1010, 1010, 1400]
+    seen = []
+    now = 0
+
+    def tick():
+        nonlocal now
+        now = next(clock)
+        return now
+
+    for index, late in pace(moments, 50, lambda: len(seen) == 3, tick):
+        due = 50 + moments[index] - moments[0]
+        assert now >= due
+        assert late == now - due
+        seen.append(index)
+    assert seen == [0, 1, 2]
+
+
+def test_comparison_is_over_the_samples_within_the_run():
+    t = np.linspace(0, 1, 11)
+    straight = np.column_stack([t, 0 * t, 0 * t])
+    fused, alone = Trace(t, straight), Trace(t, straight + np.array([0.0, 3e-3, 4e-3]))
+    samples = Trace(
+        np.array([-1.0, 0.25, 0.55, 2.0]), np.array([[9, 9, 9], [0.25, 0, 0], [0.55, 1e-3, 0], [9, 9, 9]])
+    )
+    found = compare("tracker", samples, alone, fused)
+    assert found.samples == 2
+    assert found.fused_max == pytest.approx(1e-3)
+    assert found.fused_rms == pytest.approx(1e-3 / np.sqrt(2))
+    assert found.alone_max == pytest.approx(5e-3)
+    with pytest.raises(ValueError, match="tracker"):
+        compare("tracker", Trace(np.array([5.0]), np.zeros((1, 3))), alone, fused)
+    far = Trace(t, straight + 1.0)
+    assert compare_truth([far, fused], alone, fused).fused_rms == 0.0
+
+
+def test_traces_of_messages_bag_and_truth(bags):
+    heard = [
+        Heard(0, encode_pose_stamped(stamp, "ctr_base", (stamp, 0, 0), (0, 0, 0, 1))) for stamp in (30, 10)
+    ]
+    trace = trace_of(heard, 10)
+    np.testing.assert_allclose(trace.t, [0.0, 20e-9])
+    np.testing.assert_allclose(trace.p[:, 0], [10, 30])
+    bag = bags / "clean_release.mcap"
+    start = next(iter(open_bag(bag).inputs())).message.stamp_ns
+    tracker = tracker_of(bag, start)
+    truth = truth_of(bags / "truth" / "clean_release.npz")
+    assert len(tracker.t) > 200
+    near = min(float(np.sqrt(np.mean(np.sum((c.at(tracker.t) - tracker.p) ** 2, axis=1)))) for c in truth)
+    assert near < 1.5e-3

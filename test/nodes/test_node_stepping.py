@@ -1,0 +1,219 @@
+"""The stepping thread and its account, against scripted estimators and clocks."""
+
+import threading
+from types import SimpleNamespace
+
+import pytest
+
+from ctr_dynamics.nodes.stepping import CATCH_UP_NS, STEP_NS, StampClock, StepLoop
+from ctr_dynamics.nodes.timing import Histogram, StepTiming
+
+MS = 1_000_000
+
+
+class Scripted:
+    """Steps on time from `t0_ns` on, and notes when it was asked."""
+
+    def __init__(self, t0_ns=None):
+        self.t0_ns = t0_ns
+        self.k = 0
+        self.asked = []
+        self.resets = 0
+        self.fault = None
+
+    def advance(self, now_ns=None):
+        self.asked.append(now_ns)
+        if self.fault is not None:
+            fault, self.fault = self.fault, None
+            raise fault
+        steps = []
+        while self.t0_ns is not None and now_ns is not None and self.t0_ns + self.k * STEP_NS <= now_ns:
+            steps.append(SimpleNamespace(k=self.k, stamp_ns=self.t0_ns + self.k * STEP_NS))
+            self.k += 1
+        return steps
+
+    def reset(self):
+        self.resets += 1
+        self.t0_ns, self.k = None, 0
+
+
+def make_loop(estimator, clock, policy="predict", publish=None):
+    """A loop whose rounds the test calls itself; `published` holds the stamps."""
+    published = []
+    errors = []
+
+    def note(step):
+        published.append(step.stamp_ns)
+        return True
+
+    loop = StepLoop(
+        estimator,
+        publish or note,
+        lambda now: None,
+        lambda: clock.now,
+        StepTiming(policy, 100 * MS),
+        errors.append,
+    )
+    return loop, published, errors
+
+
+@pytest.fixture
+def clock():
+    return SimpleNamespace(now=1_000_000 * MS)
+
+
+def test_inputs_are_taken_in_together_before_the_step(clock):
+    estimator = Scripted()
+    loop, published, _ = make_loop(estimator, clock)
+    order = []
+    loop.put(lambda: order.append("joints") or setattr(estimator, "t0_ns", clock.now))
+    loop.put(lambda: order.append("tracker"))
+    loop._round()
+    assert order == ["joints", "tracker"]
+    assert published == [clock.now]
+
+
+def test_a_backlog_is_published_step_by_step_and_nothing_is_skipped(clock):
+    estimator = Scripted(clock.now)
+    loop, published, _ = make_loop(estimator, clock)
+    t0 = clock.now
+    clock.now += 40 * STEP_NS
+    while len(published) < 41:
+        before = len(published)
+        loop._round()
+        assert before < len(published) <= before + 9
+    assert published == [t0 + k * STEP_NS for k in range(41)]
+    assert loop.timing.skipped == 0
+    assert all(b - a <= STEP_NS for a, b in zip(estimator.asked, estimator.asked[1:], strict=False))
+
+
+def test_a_hopeless_backlog_starts_anew(clock):
+    estimator = Scripted(clock.now)
+    loop, published, errors = make_loop(estimator, clock)
+    loop._round()
+    clock.now += CATCH_UP_NS + 2 * STEP_NS
+    loop._round()
+    assert estimator.resets == 1
+    assert len(published) == 1
+    assert "starts anew" in errors[0]
+    assert loop.timing.restarts == 1
+
+
+def test_without_a_clock_only_covered_steps_are_asked_for(clock):
+    estimator = Scripted(clock.now)
+    clock.now = 0
+    loop, published, _ = make_loop(estimator, clock)
+    loop._round()
+    assert estimator.asked == [None]
+    assert published == []
+
+
+def test_a_fault_is_shown_and_the_estimator_starts_anew(clock):
+    estimator = Scripted(clock.now)
+    estimator.fault = ZeroDivisionError("no")
+    loop, _, errors = make_loop(estimator, clock)
+    loop._round()
+    assert loop.faults == 1
+    assert loop.last_fault == "ZeroDivisionError: no"
+    assert estimator.resets == 1
+    assert "ZeroDivisionError" in errors[0]
+
+
+def test_a_step_that_is_due_goes_before_inputs_that_cost_too_much(clock):
+    estimator = Scripted(clock.now)
+    loop, published, _ = make_loop(estimator, clock)
+    loop._round()
+    loop._correction_ns = 10 * MS
+    seen = []
+    clock.now += STEP_NS
+    loop.put(lambda: seen.append(len(published)))
+    loop._round()
+    assert seen == [2]
+    # With time to spare, inputs come first.
+    clock.now += STEP_NS // 4
+    loop.put(lambda: seen.append(len(published)))
+    loop._correction_ns = 0
+    loop._round()
+    assert seen == [2, 2]
+
+
+def test_calls_run_in_the_thread_and_hand_back_result_or_error(clock):
+    loop, _, _ = make_loop(Scripted(), clock)
+    loop.start()
+    try:
+        assert loop.call(lambda: threading.current_thread().name) == "stepping"
+        with pytest.raises(KeyError):
+            loop.call(lambda: {}["missing"])
+    finally:
+        loop.stop()
+        loop.join(60)
+    assert not loop.is_alive()
+    with pytest.raises(TimeoutError, match="did not answer"):
+        loop.call(lambda: None, timeout_s=0.01)
+
+
+def test_stamp_clock_follows_a_foreign_clock_after_three_stamps():
+    clock = StampClock()
+    clock.sample(1000 * MS, 1004 * MS)
+    assert clock.agrees
+    assert clock.at(7) == 7
+    for count in range(3):
+        assert clock.agrees, count
+        clock.sample(10 * MS + count, 90_000 * MS + 5 - count)
+    assert not clock.agrees
+    assert clock.at(90_000 * MS) == 90_000 * MS - (89_990 * MS + 1)
+    clock.sample(20 * MS, 90_005 * MS)  # arrives sooner after its stamp: a better estimate
+    assert clock.offset_ns == 89_985 * MS
+    for _ in range(3):
+        clock.sample(90_100 * MS, 90_101 * MS)
+    assert clock.agrees
+    assert clock.offset_ns == 0
+
+
+def test_lateness_under_predict_is_against_the_stamp():
+    timing = StepTiming("predict", 100 * MS)
+    timing.published(0, 0, 30 * MS)  # the start has been solved by now
+    timing.published(10, 30 * MS, 31 * MS)
+    timing.published(11, 33 * MS, 34 * MS)
+    timing.published(12, 36 * MS, 36 * MS + 3 * MS + 1)
+    timing.published(15, 45 * MS, 45 * MS + 20 * MS + 1)
+    report = timing.report()
+    assert report["start"] == {"steps": 2, "max_ms": 30.0}
+    assert report["steps"] == 3
+    assert report["late_over_3ms"] == 2
+    assert report["late_over_20ms"] == 1
+    assert report["skipped"] == 9 + 2
+    assert report["worst"][0]["k"] == 15
+
+
+def test_lateness_under_wait_is_against_the_covering_input_or_the_timeout():
+    timing = StepTiming("wait", 100 * MS)
+    timing.arrived(0, 2 * MS)
+    timing.published(0, 0, 3 * MS)
+    timing.arrived(10 * MS, 14 * MS)
+    timing.arrived(9 * MS, 15 * MS)  # does not bring the stamps forward
+    assert timing.published(2, 6 * MS, 16 * MS) == 2 * MS
+    assert timing.published(3, 9 * MS, 18 * MS) == 4 * MS
+    assert timing.published(4, 12 * MS, 113 * MS) == 1 * MS  # no input: due when the wait was over
+    assert timing.late == 1
+
+
+def test_a_restart_begins_a_new_count():
+    timing = StepTiming("predict", 100 * MS)
+    timing.published(0, 0, 0)
+    timing.published(1, 3 * MS, 3 * MS)
+    timing.restarted()
+    timing.published(0, 900 * MS, 910 * MS)
+    assert timing.report()["skipped"] == 0
+    assert timing.report()["restarts"] == 1
+
+
+def test_histogram_quantiles_are_upper_edges_and_the_maximum_is_exact():
+    histogram = Histogram(bin_ns=10, bins=10)
+    assert histogram.quantile(0.5) == 0.0
+    for value in (1, 11, 21, 31, 12345):
+        histogram.add(value)
+    assert histogram.quantile(0.5) == pytest.approx(30e-6)
+    assert histogram.quantile(0.8) == pytest.approx(40e-6)
+    assert histogram.quantile(1.0) == pytest.approx(12345e-6)
+    assert histogram.summary()["max"] == round(12345e-6, 4)
