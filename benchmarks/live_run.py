@@ -44,11 +44,11 @@ def run(bag: Path, settings: dict[str, Any], seconds: float, listen: bool) -> di
         played = {"bag": str(bag), "duration_s": seconds, "wait_s": 900.0}
         driver = stack.enter_context(NodeProcess(DRIVER, played, domain, folder / "driver.log"))
         before = 0.0
-        while driver.code is None:
+        while driver.code is None and estimator.code is None:
             time.sleep(0.2)
             before = before or processor_time(estimator.pid)
         used = processor_time(estimator.pid) - before
-        if driver.code != 0 or estimator.stop() != 0:
+        if estimator.code is not None or driver.code != 0 or estimator.stop() != 0:
             raise SystemExit(f"{driver.output()}\n{estimator.output()}")
         return {"bag": str(bag), **json.loads(report.read_text()), "processor_s": round(used, 2)}
 

@@ -397,12 +397,13 @@ class Estimator:
         assert self._fused is not None and self._alone is not None
         before, t = (k - 1) * DT_NS * 1e-9, k * DT_NS * 1e-9
         self._known.clear()
+        expected = 2.0 * self._fused.unknowns - self._fused.earlier
         result = self.simulator.step(self._fused, before, self._inputs(True), record=True)
         if not result.ok:
             return result
         if result.substeps > 1:
             self.health.substeps += 1
-        alone = self.reference.step(self._alone, before, self._inputs(False))
+        alone = self.reference.step(self._alone, before, self._inputs(False), lead=self._fused.unknowns - expected)
         if not alone.ok:
             return alone
         self._keep_alone_tip(t)

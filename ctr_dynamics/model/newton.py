@@ -166,7 +166,7 @@ def solve(tubes, lane, lanes, mesh, c0, par, seclen, x, hist, histb, small, big,
                     g = (dx[i] - product[i]) / denominator
                     for k in range(m):
                         inverse[i, k] += g * left[k]
-            slow = best > 0.3 * norm
+            slow = best > 0.6 * norm
             norm = best
             newest = False
             if norm <= tolerance:

@@ -135,13 +135,16 @@ class Simulator:
             equilibrium.key, equilibrium.mesh, bank, unknowns, unknowns.copy(), np.zeros((m, m)), False, equilibrium.nodes, inputs
         )
 
-    def step(self, state: State, t: float, inputs_at: InputsAt, *, record: bool = False) -> StepResult:
+    def step(
+        self, state: State, t: float, inputs_at: InputsAt, *, record: bool = False, lead: np.ndarray | None = None
+    ) -> StepResult:
         """Advance ``state`` from t to t + dt (s) in place; ``inputs_at`` gives actuators and load at any time in between.
 
         A step that fails is tried again with a fresh Jacobian and, for one-step schemes, in up to 32 substeps. With ``record`` the result
-        carries what the tangent of the step needs.
+        carries what the tangent of the step needs. ``lead`` (stages, 5 + N): by how much another run of the same inputs has just missed
+        its own extrapolated start; this one would miss by nearly the same.
         """
-        result = self._attempt(state, self.scheme, t, inputs_at, not state.usable, record)
+        result = self._attempt(state, self.scheme, t, inputs_at, not state.usable, record, lead)
         if result.ok:
             return result
         totals = [result.iterations, result.sweeps, result.jacobians]
@@ -168,7 +171,7 @@ class Simulator:
                 return StepResult(True, how, totals[0], totals[1], totals[2], count, tuple(records))
         return StepResult(False, result.reason, totals[0], totals[1], totals[2])
 
-    def _attempt(self, state: State, scheme: Scheme, t: float, inputs_at: InputsAt, fresh: bool, record: bool) -> StepResult:
+    def _attempt(self, state: State, scheme: Scheme, t: float, inputs_at: InputsAt, fresh: bool, record: bool, lead: np.ndarray | None = None) -> StepResult:
         n, stages = self.model.n, scheme.stages
         at_stages = [inputs_at(t + c * scheme.dt) for c in scheme.times]
         last = at_stages[-1]
@@ -190,6 +193,8 @@ class Simulator:
         mesh = now_mesh
         small, big = self._work(key, mesh)
         guess = 2.0 * state.unknowns - state.earlier  # linear in time, stage by stage
+        if lead is not None:
+            guess += lead
         before = bank[:RATES].copy() if record else bank
         found = np.empty_like(guess)
         outcome, iterations, sweeps, jacobians = step(

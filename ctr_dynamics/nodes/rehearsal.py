@@ -15,10 +15,10 @@ TICKS = 40
 
 
 def rehearse(robot: Robot, settings: Settings) -> int:
-    """Run another estimator about the robot's rest position with every kind of input; returns the number of steps.
+    """Run another estimator near the robot's rest position with every kind of input; returns how many steps.
 
-    The actuators turn and slide a little, a load comes and goes, and the tracker reports the predicted tip, now
-    and then late enough to be fused by roll-back.
+    The actuators turn and slide a little, a load comes and goes, and the tracker reports the predicted tip,
+    now and then late enough to be fused by roll-back.
     """
     estimator = Estimator(robot, settings)
     encoder = StepEncoder(settings["output.frame_id"], robot.name)

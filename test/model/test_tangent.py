@@ -73,8 +73,8 @@ def test_tangent_of_steps_equals_finite_differences(scheme):
     for record in records:
         assert step_tangent(
             model.tubes, lanes, record.mesh, record.scheme.c0, record.scheme.weights, model.parameters.copy(),
-            record.inputs, record.found, record.before, record.rates, parameters, 1e-6, 0.1 * model.step, big, work,
-            columns, inverse, dx, nodes,
+            record.inputs, record.found, record.before, record.rates, parameters, 1e-6, 0.1 * model.step, big,
+            work, columns, inverse, dx, nodes,
         )  # fmt: skip
 
     h = 1e-4
