@@ -41,12 +41,13 @@ def run(bag: Path, settings: dict[str, Any], seconds: float, listen: bool) -> di
         if listen:
             names = [topic.name for topic in topics.OUTPUTS]
             stack.enter_context(Listener(domain, names, depth=5000))
+        while estimator.code is None and "waiting for" not in estimator.output():
+            time.sleep(0.1)  # kernels are being compiled
+        before = processor_time(estimator.pid)
         played = {"bag": str(bag), "duration_s": seconds, "wait_s": 900.0}
         driver = stack.enter_context(NodeProcess(DRIVER, played, domain, folder / "driver.log"))
-        before = 0.0
         while driver.code is None and estimator.code is None:
             time.sleep(0.2)
-            before = before or processor_time(estimator.pid)
         used = processor_time(estimator.pid) - before
         if estimator.code is not None or driver.code != 0 or estimator.stop() != 0:
             raise SystemExit(f"{driver.output()}\n{estimator.output()}")

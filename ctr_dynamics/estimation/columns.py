@@ -97,7 +97,7 @@ class Columns:
         dnodes = np.zeros((len(big[8]) // (8 * len(lanes)), count))
         linearise(
             model.tubes, lanes, mesh, 0.0, par, unc.effect * scale, x, np.zeros(main), np.zeros(base),
-            np.zeros((main + base, count)), 1e-4, model.step, big, np.zeros((m, m)), dx, fields, dnodes,
+            np.zeros((main + base, count)), 1e-4, model.tangent_step, big, np.zeros((m, m)), dx, fields, dnodes,
         )  # fmt: skip
         self.key, self.mesh, self.transfer = own, mesh, moved
         self.beta = beta.copy()
@@ -167,7 +167,7 @@ class Columns:
             stored = self.stored.copy()
             ok = theta_tangent(
                 model.tubes, lanes, mesh, record.scheme.dt, par.copy(), record.inputs[-1], record.found[-1], after,
-                rate, dpar, EPSILON, model.step, big, work, stored[0], stored[1], inverse, dx, dnodes,
+                rate, dpar, EPSILON, model.tangent_step, big, work, stored[0], stored[1], inverse, dx, dnodes,
             )  # fmt: skip
             if not ok:
                 return False

@@ -397,7 +397,7 @@ class Estimator:
         assert self._fused is not None and self._alone is not None
         before, t = (k - 1) * DT_NS * 1e-9, k * DT_NS * 1e-9
         self._known.clear()
-        expected = 2.0 * self._fused.unknowns - self._fused.earlier
+        expected = 2.0 * self._fused.unknowns - self._fused.earlier[0]
         result = self.simulator.step(self._fused, before, self._inputs(True), record=True)
         if not result.ok:
             return result

@@ -82,7 +82,7 @@ def _follow(model: Model, equilibrium: Equilibrium, par: Floats) -> Floats | Non
     fields, nodes = np.zeros((main + base, count)), np.zeros((equilibrium.nodes.size, count))
     ok = linearise(
         model.tubes, lanes, equilibrium.mesh, 0.0, par, dpar, equilibrium.x, np.zeros(main), np.zeros(base),
-        np.zeros((main + base, count)), 1e-3, model.step, big, np.zeros((m, m)), np.zeros((m, count)), fields, nodes,
+        np.zeros((main + base, count)), 1e-3, model.tangent_step, big, np.zeros((m, m)), np.zeros((m, count)), fields, nodes,
     )  # fmt: skip
     return fields / scale if ok else None
 
@@ -108,7 +108,7 @@ def modal_basis(model: Model, equilibrium: Equilibrium, par: Floats, beta: Float
     def apply(columns: Floats, dpar: Floats) -> Floats | None:
         scale = 1e-4
         ok = linearise(
-            model.tubes, lanes, mesh, c0, par, dpar, equilibrium.x, hist[:main], hist[main:], -c0 * scale * columns, 1e-3, model.step,
+            model.tubes, lanes, mesh, c0, par, dpar, equilibrium.x, hist[:main], hist[main:], -c0 * scale * columns, 1e-3, model.tangent_step,
             big, inverse, dx, dfields, dnodes,
         )  # fmt: skip
         return dfields / scale if ok else None

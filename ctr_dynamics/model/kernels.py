@@ -92,7 +92,7 @@ def workspace_rows(n):
 
 @njit(cache=True, inline="always", fastmath=FAST, error_model="numpy")
 def _sincos(x):
-    """(sin x, cos x) by polynomials, without library calls, so that lane loops vectorise; error below 1e-15 for abs(x) < 1e5."""
+    """(sin x, cos x) by polynomials, without library calls, so that lane loops vectorise; error below 1e-12 for abs(x) < 1e4."""
     k = math.floor(x * _TWO_OVER_PI + 0.5)
     r = (x - k * _PIO2_HI) - k * _PIO2_LO
     z = r * r
@@ -118,7 +118,7 @@ def _sincos(x):
             + z
             * (
                 -1.38888888888730564116e-3
-                + z * (2.48015872888517045348e-5 + z * (-2.75573141792967388112e-7 + z * 2.08757008419747316778e-9))
+                + z * (2.48015872888517045348e-5 + z * (-2.75573141792967388112e-7 + z * (2.08757008419747316778e-9 - z * 1.13585365213876817300e-11)))
             )
         )
     )

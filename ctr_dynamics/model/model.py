@@ -20,7 +20,8 @@ class Model:
         jacobian_lanes: lanes of the Jacobian's sweep.
         layout: rows of the parameter block.
         parameters: (NP,) block at the robot file's values; actuators and tip wrench are 0.
-        scale: (5 + N,) N and N m, unit of each shooting residual; step: (5 + N,) perturbation of each unknown.
+        scale: (5 + N,) N and N m, unit of each shooting residual; step: (5 + N,) perturbation of each unknown for Newton's
+            method; tangent_step: a smaller one, for tangents.
         nodes: requested nodes from plate to tip.
     """
 
@@ -68,6 +69,7 @@ class Model:
         force, moment = stiffness / reach**2, stiffness / reach
         self.scale = np.array([force] * 3 + [moment] * (2 + n))
         self.step = np.array([moment] * n + [force] * 3 + [moment] * 2) * 1e-6
+        self.tangent_step = 0.1 * self.step
         self._meshes: dict[Key, Mesh] = {}
         # precurvature that varies within a tube's segments, or twists it behind the plate, moves over the cells with the tube
         self.moving_precurvature = any(

@@ -132,7 +132,7 @@ class Simulator:
         m = 5 + self.model.n
         unknowns = np.tile(equilibrium.x, (stages, 1))
         return State(
-            equilibrium.key, equilibrium.mesh, bank, unknowns, unknowns.copy(), np.zeros((m, m)), False, equilibrium.nodes, inputs
+            equilibrium.key, equilibrium.mesh, bank, unknowns, np.stack([unknowns, unknowns]), np.zeros((m, m)), False, equilibrium.nodes, inputs
         )
 
     def step(
@@ -148,16 +148,17 @@ class Simulator:
         if result.ok:
             return result
         totals = [result.iterations, result.sweeps, result.jacobians]
-        halvings = range(0, 6) if self.scheme.one_step else range(1)
-        for halving in halvings:
+        quadratic = state.unknowns - 2.0 * state.earlier[0] + state.earlier[1]  # what a quadratic start adds to the linear one
+        retries = [(1, quadratic), (1, None)] + [(2**halving, None) for halving in range(1, 6) if self.scheme.one_step]
+        for count, start in retries:
             trial = state.copy()
-            trial.unknowns[:] = trial.unknowns[-1]
-            trial.earlier[:] = trial.unknowns
-            count = 2**halving
+            if start is None:  # from where the last step ended
+                trial.unknowns[:] = trial.unknowns[-1]
+                trial.earlier[:] = trial.unknowns[-1]
             scheme = make_scheme(self.scheme.name, self.scheme.dt / count) if count > 1 else self.scheme
             records: list[Record] = []
             for part in range(count):
-                result = self._attempt(trial, scheme, t + part * scheme.dt, inputs_at, True, record)
+                result = self._attempt(trial, scheme, t + part * scheme.dt, inputs_at, True, record, start)
                 records.extend(result.records)
                 for i, value in enumerate((result.iterations, result.sweeps, result.jacobians)):
                     totals[i] += value
@@ -192,7 +193,7 @@ class Simulator:
             fresh = True
         mesh = now_mesh
         small, big = self._work(key, mesh)
-        guess = 2.0 * state.unknowns - state.earlier  # linear in time, stage by stage
+        guess = 2.0 * state.unknowns - state.earlier[0]  # linear in time, stage by stage
         if lead is not None:
             guess += lead
         before = bank[:RATES].copy() if record else bank
@@ -206,7 +207,8 @@ class Simulator:
         if outcome != CONVERGED:
             return StepResult(False, OUTCOMES[outcome], iterations, sweeps, jacobians)
         state.key, state.mesh, state.bank = key, mesh, bank
-        state.earlier, state.unknowns = state.unknowns, found
+        state.earlier = np.stack([state.unknowns, state.earlier[0]])
+        state.unknowns = found
         state.nodes = small[6].reshape(-1, 16 + 3 * n).copy()
         state.inputs = last
         records: tuple[Record, ...] = ()
