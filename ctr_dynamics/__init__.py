@@ -10,11 +10,21 @@ for _name in ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
 
 
 def _kernel_cache() -> str:
-    """Folder for compiled kernels, one for each state of the sources: numba looks at the file of a kernel only, not at those of the kernels it calls."""
+    """Folder for compiled kernels, one for each state of the sources.
+
+    Numba by itself looks at the file of a kernel only, not at those of the kernels that it calls.
+    """
     here = Path(__file__).parent
-    stamps = sorted((p.name, p.stat().st_mtime_ns) for folder in ("model", "estimation") for p in (here / folder).glob("*.py"))
+    stamps = sorted(
+        (p.name, p.stat().st_mtime_ns)
+        for folder in ("model", "estimation")
+        for p in (here / folder).glob("*.py")
+    )
     digest = hashlib.sha256(repr(stamps).encode()).hexdigest()[:16]
-    base = Path(os.environ.get("NUMBA_CACHE_DIR") or Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser() / "ctr_dynamics")
+    base = Path(
+        os.environ.get("NUMBA_CACHE_DIR")
+        or Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser() / "ctr_dynamics"
+    )
     return str(base if base.name == digest else base / digest)
 
 

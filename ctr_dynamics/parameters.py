@@ -37,7 +37,13 @@ PARAMETERS: tuple[Parameter, ...] = (
     Parameter("model.dt_s", "float", 0.003, "s", "Step of the output grid.", 0.003, 0.003, read_only=True),
     Parameter("model.nodes", "int", 24, "", "Arc-length nodes in all.", 8, 1000, read_only=True),
     Parameter(
-        "model.tolerance", "float", 1e-4, "", "Scaled imbalance at the tip at which the shooting ends.", 1e-11, 1e-3
+        "model.tolerance",
+        "float",
+        1e-4,
+        "",
+        "Scaled imbalance at the tip at which the shooting ends.",
+        1e-11,
+        1e-3,
     ),
     Parameter("filter.enabled", "bool", True, "", "Fuse the tracker; false runs the model alone."),
     Parameter(

@@ -91,7 +91,11 @@ class Columns:
         main, base = len(big[4]) // (8 * len(lanes)), len(big[5]) // (8 * len(lanes))
         m = 5 + model.n
         par = par.copy()
-        par[model.layout["alpha"]], par[model.layout["beta"]], par[model.layout["alpha_rate"]] = alpha, beta, 0.0
+        par[model.layout["alpha"]], par[model.layout["beta"]], par[model.layout["alpha_rate"]] = (
+            alpha,
+            beta,
+            0.0,
+        )
         scale = np.where(unc.sigma > 0, unc.sigma, 1e-3)
         dx, fields = np.zeros((m, count)), np.zeros((main + base, count))
         dnodes = np.zeros((len(big[8]) // (8 * len(lanes)), count))
@@ -186,7 +190,9 @@ class Columns:
 
     def position_deviation(self, pi: Floats) -> Floats:
         """(nodes,) deviation of the position per axis in m at the model's nodes, coefficients' covariance ``pi`` (r, r)."""
-        rows = self.dnodes.reshape(-1, 16 + 3 * self.model.n, self.dnodes.shape[1])[:, :3].reshape(-1, len(pi))
+        rows = self.dnodes.reshape(-1, 16 + 3 * self.model.n, self.dnodes.shape[1])[:, :3].reshape(
+            -1, len(pi)
+        )
         variance = np.einsum("ij,ij->i", rows @ pi, rows).reshape(-1, 3).sum(axis=1)
         deviation = np.sqrt(np.maximum(variance, 0.0) / 3.0)
         return deviation if self.transfer is None else self.transfer.nodes @ deviation
@@ -197,15 +203,28 @@ class Columns:
         def wide(array: Floats) -> Floats:
             return np.concatenate([array, np.zeros((*array.shape[:-1], count))], axis=-1)
 
-        self.theta, self.stored, self.dnodes, self.dx = map(wide, (self.theta, self.stored, self.dnodes, self.dx))
+        self.theta, self.stored, self.dnodes, self.dx = map(
+            wide, (self.theta, self.stored, self.dnodes, self.dx)
+        )
 
     def transform(self, T: Floats) -> None:
         """Replace the columns V by V T."""
-        self.theta, self.stored, self.dnodes, self.dx = (x @ T for x in (self.theta, self.stored, self.dnodes, self.dx))
+        self.theta, self.stored, self.dnodes, self.dx = (
+            x @ T for x in (self.theta, self.stored, self.dnodes, self.dx)
+        )
 
     def snapshot(self) -> tuple:
         """What :meth:`restore` needs; arrays are replaced by later steps, never written, so references do."""
-        return self.key, self.mesh, self.transfer, self.beta, self.theta.copy(), self.stored, self.dnodes, self.dx
+        return (
+            self.key,
+            self.mesh,
+            self.transfer,
+            self.beta,
+            self.theta.copy(),
+            self.stored,
+            self.dnodes,
+            self.dx,
+        )
 
     def restore(self, snapshot: tuple) -> None:
         """Go back to an earlier snapshot."""

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctr_dynamics.errors import InputError
-from ctr_dynamics.model.mesh import node_positions
+from ctr_dynamics.model.mesh import node_points, node_positions
 from ctr_dynamics.model.model import Model
 from ctr_dynamics.model.scheme import make_scheme
 from ctr_dynamics.model.simulator import Inputs, InputsAt, Simulator, State, StepResult
@@ -26,9 +26,9 @@ from ctr_dynamics.model.statics import Statics
 from ctr_dynamics.parameters import Settings, axes_mask
 from ctr_dynamics.robot import Robot
 
-from .backbone import backbone_rows, node_points
 from .fusion import Fusion, FusionOptions
 from .health import Health
+from .kernels import backbone_rows
 from .modes import ModalBasis, input_vector, modal_basis
 from .outputs import Innovation, Modes, SolverStats, StepOutput
 from .rotations import conjugate, from_vector, matrix
@@ -133,7 +133,9 @@ class Estimator:
         self._backwards = 0
         self._squares = [0.0, 0.0]
         self._residuals = 0
-        self._known: dict[float, tuple[Floats, Floats, Floats]] = {}  # the signals of one step, shared by both runs
+        self._known: dict[
+            float, tuple[Floats, Floats, Floats]
+        ] = {}  # the signals of one step, shared by both runs
         self._rows: dict[tuple, tuple[Floats, NDArray[np.int64]]] = {}
 
     # -- inputs --
@@ -145,12 +147,20 @@ class Estimator:
             self.health.note("joints", "names", order)
             return
         if len(positions) < len(names):
-            self.health.note("joints", "positions", f"joint state has {len(positions)} positions for {len(names)} names; give one each")
+            self.health.note(
+                "joints",
+                "positions",
+                f"joint state has {len(positions)} positions for {len(names)} names; give one each",
+            )
             return
         value = np.array([positions[i] for i in order], dtype=float)
         n = self.model.n
-        if not finite(value):
-            self.health.note("joints", "not finite", f"joint state at {stamp_ns} ns holds a value that is not finite; it was left out")
+        if not finite(value.tolist()):
+            self.health.note(
+                "joints",
+                "not finite",
+                f"joint state at {stamp_ns} ns holds a value that is not finite; it was left out",
+            )
             return
         reason = self.robot.actuator_problem(value[n:], value[:n])
         if reason:
@@ -159,7 +169,11 @@ class Estimator:
         if self._joints.stamps and stamp_ns < self._joints.stamps[-1] - self.window_ns:
             self._backwards += 1
             back = (self._joints.stamps[-1] - stamp_ns) * 1e-9
-            self.health.note("joints", "time ran backwards", f"stamp {back:.3f} s before the last, limit {self.window_ns * 1e-9:g} s")
+            self.health.note(
+                "joints",
+                "time ran backwards",
+                f"stamp {back:.3f} s before the last, limit {self.window_ns * 1e-9:g} s",
+            )
             if self._backwards >= 3:  # not a stray sample: the clock or the bag began anew
                 self.reset()
                 self.health.restarts += 1
@@ -167,12 +181,19 @@ class Estimator:
         self._backwards = 0
         last = self._joints.stamps[-1] if self._joints.stamps else None
         taken = self._stamp(self.k)
-        if last is not None and taken is not None and last < taken < stamp_ns and taken - last > self._timeout_ns:
+        if (
+            last is not None
+            and taken is not None
+            and last < taken < stamp_ns
+            and taken - last > self._timeout_ns
+        ):
             # steps were taken with the held value: go on from there, not from a straight line over the gap
             self._joints.add(taken, self._joints.values[-1])
         kind = self._joints.add(stamp_ns, value)
         if kind == "duplicate":
-            self.health.note("joints", "duplicate stamp", f"a second joint state of {stamp_ns} ns; the first one counts")
+            self.health.note(
+                "joints", "duplicate stamp", f"a second joint state of {stamp_ns} ns; the first one counts"
+            )
             return
         if self.t0_ns is None:
             self.t0_ns = stamp_ns
@@ -187,30 +208,46 @@ class Estimator:
         frame = str(self.settings["output.frame_id"])
         if frame_id and frame_id.lstrip("/") != frame:
             self.health.note(
-                "tracker", "other frame", f"pose in frame '{frame_id}', expected '{frame}'; register the tracker or rename its frame"
+                "tracker",
+                "other frame",
+                f"pose in frame '{frame_id}', expected '{frame}'; register the tracker or rename its frame",
             )
             self.health.dropped += 1
             return
         if not (finite(position) and finite(quaternion_xyzw)):
-            self.health.note("tracker", "not finite", f"pose at {stamp_ns} ns holds a value that is not finite; it was left out")
+            self.health.note(
+                "tracker",
+                "not finite",
+                f"pose at {stamp_ns} ns holds a value that is not finite; it was left out",
+            )
             self.health.dropped += 1
             return
         x, y, z, w = quaternion_xyzw
         norm = math.sqrt(x * x + y * y + z * z + w * w)
         if not 0.9 <= norm <= 1.1:
-            self.health.note("tracker", "quaternion", f"norm {norm:.3g} is outside 0.9 to 1.1; send unit quaternions; the pose was left out")
+            self.health.note(
+                "tracker",
+                "quaternion",
+                f"norm {norm:.3g} is outside 0.9 to 1.1; send unit quaternions; the pose was left out",
+            )
             self.health.dropped += 1
             return
         if abs(norm - 1.0) > 1e-3:
             self.health.note("tracker", "quaternion normalised", f"norm {norm:.4f}, limit 1 +- 0.001")
         if any(s.stamp_ns == stamp_ns for s in self._samples[-50:]):
-            self.health.note("tracker", "duplicate stamp", f"a second pose of {stamp_ns} ns; the first one counts")
+            self.health.note(
+                "tracker", "duplicate stamp", f"a second pose of {stamp_ns} ns; the first one counts"
+            )
             self.health.dropped += 1
             return
         taken = self._stamp(self.k)
         late = max(0.0, (taken - stamp_ns) * 1e-9) if taken is not None else 0.0
         if late > self.window_ns * 1e-9:
-            self.health.note("tracker", "too late", f"pose came {late:.3f} s after its stamp, limit {self.window_ns * 1e-9:g} s")
+            self.health.note(
+                "tracker",
+                "too late",
+                f"pose came {late:.3f} s after its stamp, limit {self.window_ns * 1e-9:g} s",
+            )
             self.health.dropped += 1
             return
         if late > 2 * DT_NS * 1e-9:
@@ -219,19 +256,29 @@ class Estimator:
         self._samples.append(Sample(stamp_ns, np.array(position, dtype=float), quaternion, late))
         self._samples.sort(key=lambda s: s.stamp_ns)
 
-    def add_tip_load(self, stamp_ns: int, force: Sequence[float], torque: Sequence[float], frame_id: str = "") -> None:
+    def add_tip_load(
+        self, stamp_ns: int, force: Sequence[float], torque: Sequence[float], frame_id: str = ""
+    ) -> None:
         """Take in a known wrench on the tip (N, N m about the tip point, ``ctr_base`` axes)."""
         frame = str(self.settings["output.frame_id"])
         if frame_id and frame_id.lstrip("/") != frame:
-            self.health.note("load", "other frame", f"load in frame '{frame_id}', expected '{frame}'; send it in base axes")
+            self.health.note(
+                "load", "other frame", f"load in frame '{frame_id}', expected '{frame}'; send it in base axes"
+            )
             return
         if not (finite(force) and finite(torque)):
-            self.health.note("load", "not finite", f"load at {stamp_ns} ns holds a value that is not finite; it was left out")
+            self.health.note(
+                "load",
+                "not finite",
+                f"load at {stamp_ns} ns holds a value that is not finite; it was left out",
+            )
             return
         first = not self._load.stamps
         kind = self._load.add(stamp_ns, np.array([*force, *torque], dtype=float))
         if kind == "duplicate":
-            self.health.note("load", "duplicate stamp", f"a second load of {stamp_ns} ns; the first one counts")
+            self.health.note(
+                "load", "duplicate stamp", f"a second load of {stamp_ns} ns; the first one counts"
+            )
         elif first:
             if self.t0_ns is not None and stamp_ns - self.t0_ns <= LOAD_GRACE_NS:
                 self._changed(self.t0_ns)
@@ -307,14 +354,20 @@ class Estimator:
     def _skip_ahead(self, now_ns: int | None) -> None:
         """Start anew at the newest joints when more steps are due than can be caught up with."""
         assert self.t0_ns is not None
-        until = self._joints.stamps[-1] if now_ns is None or not self._predicting else max(now_ns, self._joints.stamps[-1])
+        until = (
+            self._joints.stamps[-1]
+            if now_ns is None or not self._predicting
+            else max(now_ns, self._joints.stamps[-1])
+        )
         behind = (until - self.t0_ns) // DT_NS - self.k
         if behind <= MAX_BEHIND or self.k < 0 or len(self._joints.stamps) < 2:
             return
         if self._joints.stamps[-1] - self._joints.stamps[-2] <= MAX_BEHIND * DT_NS:
             return  # a long call without a gap: take every step
         newest = self._joints.stamps[-1]
-        self.health.note("joints", "gap", f"{behind * DT_NS * 1e-9:.1f} s without joints; the model starts anew at rest")
+        self.health.note(
+            "joints", "gap", f"{behind * DT_NS * 1e-9:.1f} s without joints; the model starts anew at rest"
+        )
         self.health.restarts += 1
         self.k = (newest - self.t0_ns) // DT_NS - 1
         self._fused = self._alone = None
@@ -341,7 +394,10 @@ class Estimator:
             signals = known.get(t)
             if signals is None:
                 time_ns = t0 + round(t * 1e9)
-                signals = known[t] = (*joints.at(time_ns, extrapolate), load.at(time_ns)[0] if load.stamps else _NO_LOAD)
+                signals = known[t] = (
+                    *joints.at(time_ns, extrapolate),
+                    load.at(time_ns)[0] if load.stamps else _NO_LOAD,
+                )
             value, rate, wrench = signals
             return Inputs(value[:n] + offset, rate[:n], value[n:], rate[n:], wrench[:3] + force, wrench[3:])
 
@@ -403,12 +459,16 @@ class Estimator:
             return result
         if result.substeps > 1:
             self.health.substeps += 1
-        alone = self.reference.step(self._alone, before, self._inputs(False), lead=self._fused.unknowns - expected)
+        alone = self.reference.step(
+            self._alone, before, self._inputs(False), lead=self._fused.unknowns - expected
+        )
         if not alone.ok:
             return alone
         self._keep_alone_tip(t)
         if not self.fusion.predict(self._fused, result, t):
-            self.health.note("tracker", "tangent", "the step could not be linearised; the covariance was held")
+            self.health.note(
+                "tracker", "tangent", "the step could not be linearised; the covariance was held"
+            )
         self._fuse(k, t)
         self._keep(k)
         return result
@@ -416,7 +476,9 @@ class Estimator:
     def _keep_alone_tip(self, t: float) -> None:
         assert self._alone is not None
         S = self._alone.nodes.shape[1]
-        self._alone_tips.append(t, self._alone.nodes[-1], np.zeros((S, 1)), float(self._alone.inputs.beta_rate[0]))
+        self._alone_tips.append(
+            t, self._alone.nodes[-1], np.zeros((S, 1)), float(self._alone.inputs.beta_rate[0])
+        )
 
     def _fuse(self, k: int, t: float) -> None:
         """Samples whose own time is now past."""
@@ -434,13 +496,26 @@ class Estimator:
             else:
                 update = self.fusion.compare(time_s, sample.position, sample.quaternion)
             if update.dof:
-                self.health.measured(update.nis, update.dof, update.accepted, update.accepted and not update.reason)
+                self.health.measured(
+                    update.nis, update.dof, update.accepted, update.accepted and not update.reason
+                )
             else:
                 self.health.dropped += 1
-                self.health.note("tracker", "outside the window", f"pose of t = {time_s:.3f} s at step {k}: {update.reason}")
+                self.health.note(
+                    "tracker",
+                    "outside the window",
+                    f"pose of t = {time_s:.3f} s at step {k}: {update.reason}",
+                )
             self._innovations.append(
                 Innovation(
-                    sample.stamp_ns, update.residual, update.variance, update.nis, update.dof, update.accepted, sample.late_s, update.reason
+                    sample.stamp_ns,
+                    update.residual,
+                    update.variance,
+                    update.nis,
+                    update.dof,
+                    update.accepted,
+                    sample.late_s,
+                    update.reason,
                 )
             )
         limit = self.t0_ns + k * DT_NS - 2 * self.window_ns - 300_000_000
@@ -468,7 +543,11 @@ class Estimator:
         if not self._predicting and k % 8:
             return
         assert self._fused is not None and self._alone is not None
-        self._kept.append(Kept(k, self._fused.copy(), self._alone.copy(), self.fusion.snapshot(), self._alone_tips.snapshot()))
+        self._kept.append(
+            Kept(
+                k, self._fused.copy(), self._alone.copy(), self.fusion.snapshot(), self._alone_tips.snapshot()
+            )
+        )
         oldest = k - self.window_ns // DT_NS - 9
         while len(self._kept) > 1 and self._kept[1].k <= oldest:
             self._kept.popleft()
@@ -513,7 +592,17 @@ class Estimator:
 
     def _frozen(self) -> tuple:
         h = self.health
-        return (h.nis_count, h.nis_sum, h.nis_dof, h.accepted, h.rejected, h.dropped, list(h.recent), list(self._squares), self._residuals)
+        return (
+            h.nis_count,
+            h.nis_sum,
+            h.nis_dof,
+            h.accepted,
+            h.rejected,
+            h.dropped,
+            list(h.recent),
+            list(self._squares),
+            self._residuals,
+        )
 
     def _thaw(self, counters: tuple, innovations: int, k: int) -> None:
         """Samples that were counted when they were first fused are not counted again."""
@@ -521,12 +610,27 @@ class Estimator:
         repeated = {i.stamp_ns for i in self._reported}
         fresh = [i for i in self._innovations[innovations:] if i.stamp_ns not in repeated]
         del self._innovations[innovations:]
-        (h.nis_count, h.nis_sum, h.nis_dof, h.accepted, h.rejected, h.dropped, recent, self._squares, self._residuals) = counters
+        (
+            h.nis_count,
+            h.nis_sum,
+            h.nis_dof,
+            h.accepted,
+            h.rejected,
+            h.dropped,
+            recent,
+            self._squares,
+            self._residuals,
+        ) = counters
         h.recent.clear()
         h.recent.extend(recent)
         for innovation in fresh:
             if innovation.dof:
-                h.measured(innovation.nis, innovation.dof, innovation.accepted, innovation.accepted and not innovation.reason)
+                h.measured(
+                    innovation.nis,
+                    innovation.dof,
+                    innovation.accepted,
+                    innovation.accepted and not innovation.reason,
+                )
             self._innovations.append(innovation)
 
     @property
@@ -595,7 +699,10 @@ class Estimator:
         if key not in self._rows:
             if len(self._rows) > 8:
                 self._rows.clear()
-            self._rows[key] = (node_positions(state.mesh, state.inputs.beta), node_points(state.mesh.sec_cells))
+            self._rows[key] = (
+                node_positions(state.mesh, state.inputs.beta),
+                node_points(state.mesh.sec_cells),
+            )
         s, points = self._rows[key]
         rows = np.empty((len(state.nodes), 15), np.float32)
         c = self.fusion.columns
@@ -615,34 +722,55 @@ class Estimator:
             par = self.simulator.parameters.copy()
             layout = self.model.layout
             equilibrium = Statics(self.model, 1e-6).solve(
-                inputs.beta, inputs.alpha, inputs.force, inputs.torque, guess=state.unknowns[-1], parameters=par
+                inputs.beta,
+                inputs.alpha,
+                inputs.force,
+                inputs.torque,
+                guess=state.unknowns[-1],
+                parameters=par,
             )
             self._modes = None
             if equilibrium.converged:
-                par[layout["alpha"]], par[layout["beta"]], par[layout["alpha_rate"]] = inputs.alpha, inputs.beta, 0.0
+                par[layout["alpha"]], par[layout["beta"]], par[layout["alpha_rate"]] = (
+                    inputs.alpha,
+                    inputs.beta,
+                    0.0,
+                )
                 par[layout["force"]], par[layout["torque"]] = inputs.force, inputs.torque
                 self._modes = modal_basis(self.model, equilibrium, par, inputs.beta)
         if self._modes is None:
             return Modes.none()
-        return self._modes.measure(state.fields, input_vector(inputs.alpha, inputs.beta, inputs.force, inputs.torque))
+        return self._modes.measure(
+            state.fields, input_vector(inputs.alpha, inputs.beta, inputs.force, inputs.torque)
+        )
 
     def snapshot(self) -> dict[str, Any]:
         """Where the estimator stands, for a file."""
         f = self.fusion
         names = f.uncertainty.names
         r = f.columns.theta.shape[1] if self._fused is not None else 0
-        deviation = np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", f.columns.theta, f.pi[:r, :r], f.columns.theta), 0.0)) if r else None
+        deviation = (
+            np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", f.columns.theta, f.pi[:r, :r], f.columns.theta), 0.0))
+            if r
+            else None
+        )
         return {
             "k": self.k,
             "stamp_ns": self._stamp(self.k),
             "problem": self.health.problem,
             "parameters": {
-                name: {"value": float(f.theta[i]), "sigma": float(deviation[i]) if deviation is not None else None}
+                name: {
+                    "value": float(f.theta[i]),
+                    "sigma": float(deviation[i]) if deviation is not None else None,
+                }
                 for i, name in enumerate(names)
             },
             "tracker_bias": [float(x) for x in f.bias],
             "tip_force_drive_N": f.force_sigma,
-            "statuses": [{"name": s.name, "level": s.level, "message": s.message, "values": s.values} for s in self.health.statuses()],
+            "statuses": [
+                {"name": s.name, "level": s.level, "message": s.message, "values": s.values}
+                for s in self.health.statuses()
+            ],
         }
 
     def summary(self) -> dict[str, Any]:

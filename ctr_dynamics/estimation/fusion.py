@@ -16,11 +16,12 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from ctr_dynamics.model.model import Model
-from ctr_dynamics.model.simulator import Simulator, State, StepResult
+from ctr_dynamics.model.simulator import Inputs, Simulator, State, StepResult
 
 from .columns import Columns
+from .kernels import registered_rows
 from .tip import TipWindow
-from .tracker import DELAY, DRIFT, STATES, TrackerModel, expected, registered_rows, residual, sensitivity
+from .tracker import DELAY, DRIFT, STATES, TrackerModel, expected, residual, sensitivity
 from .uncertainty import bias_sigma, model_uncertainty
 
 Floats = NDArray[np.float64]
@@ -114,7 +115,7 @@ class Fusion:
         self._reduce()
         self._keep_tip(state, stamp)
 
-    def _block(self, inputs) -> Floats:
+    def _block(self, inputs: Inputs) -> Floats:
         par = self.simulator.parameters.copy()
         layout = self.model.layout
         par[layout["force"]], par[layout["torque"]] = inputs.force, inputs.torque
@@ -216,7 +217,9 @@ class Fusion:
                 self._refused = True
                 return replace(compared, reason="outside the gate")
             self._inflate(nu, H, R, self._gate[dof])
-            compared = replace(compared, reason="outside the gate twice in a row: fused with a widened covariance")
+            compared = replace(
+                compared, reason="outside the gate twice in a row: fused with a widened covariance"
+            )
         self._refused = False
         size = len(self.pi)
         ekf = ExtendedKalmanFilter(dim_x=size, dim_z=dof)
@@ -230,9 +233,13 @@ class Fusion:
     def compare(self, stamp: float, position: Floats, quaternion: Floats) -> Update:
         """The innovation of a reading that is not fused."""
         innovation = self._innovation(stamp, position, quaternion)
-        return innovation if isinstance(innovation, Update) else replace(innovation[3], reason="fusion is off")
+        return (
+            innovation if isinstance(innovation, Update) else replace(innovation[3], reason="fusion is off")
+        )
 
-    def _innovation(self, stamp: float, position: Floats, quaternion: Floats) -> Update | tuple[Floats, Floats, Floats, Update]:
+    def _innovation(
+        self, stamp: float, position: Floats, quaternion: Floats
+    ) -> Update | tuple[Floats, Floats, Floats, Update]:
         """Step (4): masked innovation, H, R and its record; or the record alone where there is nothing to compare with."""
         unknown = np.full(6, np.nan)
         tip = self.tips.at(stamp - self.tracker.delay - self.bias[DELAY], self.simulator.scheme.dt)
@@ -300,7 +307,14 @@ class Fusion:
         i = (self.tips.count - 1) % self.tips.size
         pose, covariance = np.empty(7), np.empty((12, 12))
         finite = registered_rows(
-            self.tips.means[i], self.tips.columns[i], self.tracker.rotation, self.tracker.lever, self.bias, self.pi, pose, covariance
+            self.tips.means[i],
+            self.tips.columns[i],
+            self.tracker.rotation,
+            self.tracker.lever,
+            self.bias,
+            self.pi,
+            pose,
+            covariance,
         )
         return TipEstimate(pose[:3], pose[3:], self.tips.means[i, 7:13].copy(), covariance, bool(finite))
 
@@ -309,7 +323,8 @@ class Fusion:
     def snapshot(self) -> tuple:
         """The filter's part of a state to which :meth:`restore` can return."""
         return (
-            self.theta.copy(), self.bias.copy(), self.pi.copy(), self.steps, self.force_sigma, self._refused, self.columns.snapshot(), self.tips.snapshot(),
+            self.theta.copy(), self.bias.copy(), self.pi.copy(), self.steps, self.force_sigma, self._refused,
+            self.columns.snapshot(), self.tips.snapshot(),
         )  # fmt: skip
 
     def restore(self, snapshot: tuple) -> None:

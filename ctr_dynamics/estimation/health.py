@@ -87,14 +87,29 @@ class Health:
             return {"mean": None, "dof": 0, "lower95": None, "upper95": None, "within": None}
         mean = self.nis_sum / self.nis_dof
         lower, upper = (float(chi2.ppf(p, self.nis_dof)) / self.nis_dof for p in (0.025, 0.975))
-        return {"mean": mean, "dof": self.nis_dof, "lower95": lower, "upper95": upper, "within": lower <= mean <= upper}
+        return {
+            "mean": mean,
+            "dof": self.nis_dof,
+            "lower95": lower,
+            "upper95": upper,
+            "within": lower <= mean <= upper,
+        }
 
     def statuses(self) -> list[Status]:
         """One status a part."""
-        return [self._output(), self._solver(), self._inputs("joints"), self._tracker(), self._inputs("load"), self._consistency()]
+        return [
+            self._output(),
+            self._solver(),
+            self._inputs("joints"),
+            self._tracker(),
+            self._inputs("load"),
+            self._consistency(),
+        ]
 
     def _output(self) -> Status:
-        return Status("output", ERROR if self.problem else OK, self.problem or "valid", {"steps": str(self.steps)})
+        return Status(
+            "output", ERROR if self.problem else OK, self.problem or "valid", {"steps": str(self.steps)}
+        )
 
     def _solver(self) -> Status:
         values = {
@@ -106,7 +121,9 @@ class Health:
         }
         values.update({f"failed: {reason}": str(count) for reason, count in self.reasons.items()})
         if self.failures:
-            return Status("solver", WARN, f"{self.failures} steps failed; the last reason is in the values", values)
+            return Status(
+                "solver", WARN, f"{self.failures} steps failed; the last reason is in the values", values
+            )
         return Status("solver", OK, "ok", values)
 
     def _inputs(self, group: str) -> Status:

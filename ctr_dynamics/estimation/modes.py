@@ -1,7 +1,8 @@
 """Slowest vibration modes about the current equilibrium, and how much of each the robot is in now.
 
-One backward Euler step of size h maps a perturbation of the fields by (1 - h A)^-1 with A the linearised dynamics, so block Arnoldi on the tangent
-of that step is shift-invert Arnoldi with the shift 1/h: the slowest modes come out first. For an eigenvalue lambda of the step, mu = (1 - 1/lambda) / h.
+One backward Euler step of size h maps a perturbation of the fields by (1 - h A)^-1 with A the linearised dynamics, so
+block Arnoldi on the tangent of that step is shift-invert Arnoldi with the shift 1/h: the slowest modes come out first.
+For an eigenvalue lambda of the step, mu = (1 - 1/lambda) / h.
 """
 
 from __future__ import annotations
@@ -87,7 +88,9 @@ def _follow(model: Model, equilibrium: Equilibrium, par: Floats) -> Floats | Non
     return fields / scale if ok else None
 
 
-def modal_basis(model: Model, equilibrium: Equilibrium, par: Floats, beta: Floats, count: int = 4) -> ModalBasis | None:
+def modal_basis(
+    model: Model, equilibrium: Equilibrium, par: Floats, beta: Floats, count: int = 4
+) -> ModalBasis | None:
     """The ``count`` slowest modes about ``equilibrium`` with the parameter block ``par`` (NP,), actuators and load included; None if there are none.
 
     Friction enters as its slope at rest.
@@ -120,7 +123,9 @@ def modal_basis(model: Model, equilibrium: Equilibrium, par: Floats, beta: Float
         dpar[layout["force"].start + i, i] = 1e-6
         dpar[layout["torque"].start + i, 3 + i] = 1e-8
     for i in range(min(n, BLOCK - 6)):
-        dpar[layout["torsional_stiffness"].start + i, 6 + i] = 1e-4 * par[layout["torsional_stiffness"].start + i]
+        dpar[layout["torsional_stiffness"].start + i, 6 + i] = (
+            1e-4 * par[layout["torsional_stiffness"].start + i]
+        )
     start = apply(np.zeros((size, BLOCK)), dpar)
     if start is None:
         return None
@@ -149,7 +154,12 @@ def modal_basis(model: Model, equilibrium: Equilibrium, par: Floats, beta: Float
     with np.errstate(divide="ignore", invalid="ignore"):
         mu = (1.0 - 1.0 / values) / SHIFT_STEP
     left = np.linalg.pinv(right)
-    wanted = np.isfinite(mu) & (mu.imag > 1.0) & (-mu.real < MAX_DAMPING * np.abs(mu)) & (mu.real < 0.05 * np.abs(mu))
+    wanted = (
+        np.isfinite(mu)
+        & (mu.imag > 1.0)
+        & (-mu.real < MAX_DAMPING * np.abs(mu))
+        & (mu.real < 0.05 * np.abs(mu))
+    )
     order = [int(i) for i in np.flatnonzero(wanted)[np.argsort(np.abs(mu[wanted]))]][:count]
     follow = _follow(model, equilibrium, par)
     if not order or follow is None:
@@ -166,16 +176,15 @@ def modal_basis(model: Model, equilibrium: Equilibrium, par: Floats, beta: Float
         axis = axis * (1.0 if axis[np.argmax(np.abs(axis))] > 0 else -1.0)
         readout.append((left[i] @ Q.T) * weights * (axis @ displacement))
         direction.append(axis)
-    chosen = mu[order]
+    chosen = mu[order].astype(complex)
     return ModalBasis(
         equilibrium.key,
         np.abs(chosen.imag) / (2 * np.pi),
         -chosen.real / np.abs(chosen),
         chosen,
-        np.array(readout),
+        np.array(readout, dtype=complex),
         equilibrium.fields,
         np.array(direction),
         input_vector(par[layout["alpha"]], beta, par[layout["force"]], par[layout["torque"]]),
         follow,
     )
-

@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from .kernels import tip_rows
 from .rotations import conjugate, from_vector, multiply, to_vector
 
 Floats = NDArray[np.float64]
@@ -30,44 +30,6 @@ class Tip:
     columns: Floats
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def tip_rows(node, dnode, insertion_rate, mean, columns):
-    """Tip from the last node's state (S,) and its columns (S, r): ``mean`` (13,) position, quaternion, velocity, rate; ``columns`` (12, r)."""
-    w, x, y, z = node[3], node[4], node[5], node[6]
-    norm2 = w * w + x * x + y * y + z * z
-    k = 2.0 / norm2
-    R = np.empty((3, 3))
-    R[0, 0], R[0, 1], R[0, 2] = 1 - k * (y * y + z * z), k * (x * y - w * z), k * (x * z + w * y)
-    R[1, 0], R[1, 1], R[1, 2] = k * (x * y + w * z), 1 - k * (x * x + z * z), k * (y * z - w * x)
-    R[2, 0], R[2, 1], R[2, 2] = k * (x * z - w * y), k * (y * z + w * x), 1 - k * (x * x + y * y)
-    q2 = node[9] + insertion_rate
-    norm = np.sqrt(norm2)
-    for i in range(3):
-        mean[i] = node[i]
-        mean[7 + i] = R[i, 0] * node[7] + R[i, 1] * node[8] + R[i, 2] * q2
-        mean[10 + i] = R[i, 0] * node[10] + R[i, 1] * node[11] + R[i, 2] * node[12]
-    for i in range(4):
-        mean[3 + i] = node[3 + i] / norm
-    vx, vy, vz, ax, ay, az = mean[7], mean[8], mean[9], mean[10], mean[11], mean[12]
-    for c in range(dnode.shape[1]):
-        dw, dx, dy, dz = dnode[3, c], dnode[4, c], dnode[5, c], dnode[6, c]
-        # rotation vector of dR in base axes: 2 vec(dh h*) / |h|^2
-        tx = k * (-x * dw + w * dx - z * dy + y * dz)
-        ty = k * (-y * dw + z * dx + w * dy - x * dz)
-        tz = k * (-z * dw - y * dx + x * dy + w * dz)
-        columns[3, c], columns[4, c], columns[5, c] = tx, ty, tz
-        for i in range(3):
-            columns[i, c] = dnode[i, c]
-            columns[6 + i, c] = R[i, 0] * dnode[7, c] + R[i, 1] * dnode[8, c] + R[i, 2] * dnode[9, c]
-            columns[9 + i, c] = R[i, 0] * dnode[10, c] + R[i, 1] * dnode[11, c] + R[i, 2] * dnode[12, c]
-        columns[6, c] += ty * vz - tz * vy
-        columns[7, c] += tz * vx - tx * vz
-        columns[8, c] += tx * vy - ty * vx
-        columns[9, c] += ty * az - tz * ay
-        columns[10, c] += tz * ax - tx * az
-        columns[11, c] += tx * ay - ty * ax
-
-
 def between(a: Tip, b: Tip, stamp: float) -> Tip:
     """Tip at a time between two steps (or a little outside): cubic Hermite in position, linear turn on top of the nearer end's rotation."""
     dt = b.stamp - a.stamp
@@ -76,8 +38,12 @@ def between(a: Tip, b: Tip, stamp: float) -> Tip:
     d = 6 * x * (x - 1) / dt, (1 - x) * (1 - 3 * x), 6 * x * (1 - x) / dt, x * (3 * x - 2)
     turn = to_vector(multiply(b.quaternion, conjugate(a.quaternion)))
     columns = np.empty_like(b.columns)
-    columns[0:3] = w[0] * a.columns[0:3] + w[1] * a.columns[6:9] + w[2] * b.columns[0:3] + w[3] * b.columns[6:9]
-    columns[6:9] = d[0] * a.columns[0:3] + d[1] * a.columns[6:9] + d[2] * b.columns[0:3] + d[3] * b.columns[6:9]
+    columns[0:3] = (
+        w[0] * a.columns[0:3] + w[1] * a.columns[6:9] + w[2] * b.columns[0:3] + w[3] * b.columns[6:9]
+    )
+    columns[6:9] = (
+        d[0] * a.columns[0:3] + d[1] * a.columns[6:9] + d[2] * b.columns[0:3] + d[3] * b.columns[6:9]
+    )
     columns[3:6] = (1 - x) * a.columns[3:6] + x * b.columns[3:6]
     columns[9:12] = (1 - x) * a.columns[9:12] + x * b.columns[9:12]
     return Tip(

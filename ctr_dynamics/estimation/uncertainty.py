@@ -10,14 +10,19 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ctr_dynamics.model.layout import Layout
 from ctr_dynamics.model.model import Model
 from ctr_dynamics.robot import Robot
 
 FORCE = ("tip_force.x", "tip_force.y", "tip_force.z")
 
 # Tracker states: name and number of axes, in their order in the filter.
-BIASES = (("registration_rotation", 3), ("registration_translation", 3), ("lever_arm", 3), ("delay", 1), ("drift", 3))
+BIASES = (
+    ("registration_rotation", 3),
+    ("registration_translation", 3),
+    ("lever_arm", 3),
+    ("delay", 1),
+    ("drift", 3),
+)
 
 
 @dataclass(frozen=True)
@@ -95,9 +100,9 @@ def model_uncertainty(model: Model) -> ModelUncertainty:
         column = np.zeros(layout.size)
         column[layout["alpha"].start + i] = 1.0
         add(f"encoder_offset.tube{i + 1}", robot.encoders.offset.tolerance, column)
-    for axis, name in enumerate(FORCE):
+    for number, name in enumerate(FORCE):
         column = np.zeros(layout.size)
-        column[layout["force"].start + axis] = 1.0
+        column[layout["force"].start + number] = 1.0
         names.append(name)
         sigma.append(0.0)
         effect.append(column)
@@ -116,6 +121,3 @@ def bias_sigma(robot: Robot) -> np.ndarray:
             np.full(3, tracker.noise.drift.value),
         ]
     )
-
-
-__all__ = ["BIASES", "FORCE", "Layout", "ModelUncertainty", "bias_sigma", "model_uncertainty"]

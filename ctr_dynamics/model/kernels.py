@@ -104,7 +104,11 @@ def _sincos(x):
             + z
             * (
                 -1.98412698295895385996e-4
-                + z * (2.75573136213857245213e-6 + z * (-2.50507477628578072866e-8 + z * 1.58962301576546568060e-10))
+                + z
+                * (
+                    2.75573136213857245213e-6
+                    + z * (-2.50507477628578072866e-8 + z * 1.58962301576546568060e-10)
+                )
             )
         )
     )
@@ -118,7 +122,15 @@ def _sincos(x):
             + z
             * (
                 -1.38888888888730564116e-3
-                + z * (2.48015872888517045348e-5 + z * (-2.75573141792967388112e-7 + z * (2.08757008419747316778e-9 - z * 1.13585365213876817300e-11)))
+                + z
+                * (
+                    2.48015872888517045348e-5
+                    + z
+                    * (
+                        -2.75573141792967388112e-7
+                        + z * (2.08757008419747316778e-9 - z * 1.13585365213876817300e-11)
+                    )
+                )
             )
         )
     )
@@ -151,7 +163,9 @@ def _curvature(tubes, lanes, W, present, ust, u0, c0):
         W[T + j] = wx
         W[T + L + j] = wy
         gj = W[GJ + j]
-        uz = (W[YS + mz * L + j] + gj * W[KS + j] * uz_ - W[BT + j] * W[HI + 8 * L + j]) / (gj + c0 * W[BT + j])
+        uz = (W[YS + mz * L + j] + gj * W[KS + j] * uz_ - W[BT + j] * W[HI + 8 * L + j]) / (
+            gj + c0 * W[BT + j]
+        )
         W[TMP + 2 * L + j] = uz
         W[TMP + 5 * L + j] = c0 * uz + W[HI + 8 * L + j]
         ei = W[EI + j]
@@ -206,12 +220,23 @@ def _body_forces(tubes, lanes, W):
     Y, YS, K, ACC, HI, OU, TMP, PAR, MA, MB = offsets(tubes, lanes)
     G = PAR + 14 * n * L
     for j in range(L):
-        a, b, c, d = W[YS + H0 * L + j], W[YS + (H0 + 1) * L + j], W[YS + (H0 + 2) * L + j], W[YS + (H0 + 3) * L + j]
+        a, b, c, d = (
+            W[YS + H0 * L + j],
+            W[YS + (H0 + 1) * L + j],
+            W[YS + (H0 + 2) * L + j],
+            W[YS + (H0 + 3) * L + j],
+        )
         k = 2.0 / (a * a + b * b + c * c + d * d)
         gx, gy, gz = W[G + j], W[G + L + j], W[G + 2 * L + j]
-        W[TMP + 10 * L + j] = (1.0 - k * (c * c + d * d)) * gx + k * (b * c + a * d) * gy + k * (b * d - a * c) * gz
-        W[TMP + 11 * L + j] = k * (b * c - a * d) * gx + (1.0 - k * (b * b + d * d)) * gy + k * (c * d + a * b) * gz
-        W[TMP + 12 * L + j] = k * (b * d + a * c) * gx + k * (c * d - a * b) * gy + (1.0 - k * (b * b + c * c)) * gz
+        W[TMP + 10 * L + j] = (
+            (1.0 - k * (c * c + d * d)) * gx + k * (b * c + a * d) * gy + k * (b * d - a * c) * gz
+        )
+        W[TMP + 11 * L + j] = (
+            k * (b * c - a * d) * gx + (1.0 - k * (b * b + d * d)) * gy + k * (c * d + a * b) * gz
+        )
+        W[TMP + 12 * L + j] = (
+            k * (b * d + a * c) * gx + k * (c * d - a * b) * gy + (1.0 - k * (b * b + c * c)) * gz
+        )
 
 
 @njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
@@ -274,7 +299,12 @@ def _derivative(tubes, lanes, W, present, ust, u0, c0):
     # kinematics
     for j in range(L):
         ux, uy, uz = W[TMP + j], W[TMP + L + j], W[TMP + 2 * L + j]
-        a, b, c, d = W[YS + H0 * L + j], W[YS + (H0 + 1) * L + j], W[YS + (H0 + 2) * L + j], W[YS + (H0 + 3) * L + j]
+        a, b, c, d = (
+            W[YS + H0 * L + j],
+            W[YS + (H0 + 1) * L + j],
+            W[YS + (H0 + 2) * L + j],
+            W[YS + (H0 + 3) * L + j],
+        )
         k = 2.0 / (a * a + b * b + c * c + d * d)
         W[K + P0 * L + j] = k * (b * d + a * c)
         W[K + (P0 + 1) * L + j] = k * (c * d - a * b)
@@ -296,10 +326,12 @@ def _derivative(tubes, lanes, W, present, ust, u0, c0):
         W[K + (O0 + 1) * L + j] = W[TMP + 4 * L + j] - (uz * wx - ux * wz)
         W[K + (O0 + 2) * L + j] = W[TMP + 5 * L + j] - (ux * wy - uy * wx)
         ra = W[TMP + 6 * L + j]
-        W[K + N0 * L + j] = ra * (wy * qz - wz * qy + c0 * qx + W[HI + j] - W[TMP + 10 * L + j]) - (uy * nz - uz * ny)
-        W[K + (N0 + 1) * L + j] = ra * (
-            wz * qx - wx * qz + c0 * qy + W[HI + L + j] - W[TMP + 11 * L + j]
-        ) - (uz * nx - ux * nz)
+        W[K + N0 * L + j] = ra * (wy * qz - wz * qy + c0 * qx + W[HI + j] - W[TMP + 10 * L + j]) - (
+            uy * nz - uz * ny
+        )
+        W[K + (N0 + 1) * L + j] = ra * (wz * qx - wx * qz + c0 * qy + W[HI + L + j] - W[TMP + 11 * L + j]) - (
+            uz * nx - ux * nz
+        )
         W[K + (N0 + 2) * L + j] = ra * (
             wx * qy - wy * qx + c0 * qz + W[HI + 2 * L + j] - W[TMP + 12 * L + j]
         ) - (ux * ny - uy * nx)
@@ -364,7 +396,10 @@ def _tube_friction(tubes, lanes, W, present):
             dx, dy = W[B + j] - W[A + j], W[B + L + j] - W[A + L + j]
             rate = W[G2 + j] if first else W[G2 + j] - W[G1 + j]
             eps = W[FR + 2 * L + j]
-            tau = W[FR + j] * math.sqrt(dx * dx + dy * dy) * rate / math.sqrt(rate * rate + eps * eps) + W[FR + L + j] * rate
+            tau = (
+                W[FR + j] * math.sqrt(dx * dx + dy * dy) * rate / math.sqrt(rate * rate + eps * eps)
+                + W[FR + L + j] * rate
+            )
             W[MZ + j] -= tau
             W[MZ + L + j] += tau
 
@@ -379,7 +414,12 @@ def _body(tubes, lanes, W, i, c0):
     n = len(tubes)
     L = lane_count(lanes)
     Y, YS, K, ACC, HI, OU, TMP, PAR, MA, MB = offsets(tubes, lanes)
-    MB, HX, HY, HZ = PAR + (7 * n + i) * L, PAR + (8 * n + i) * L, PAR + (9 * n + i) * L, PAR + (10 * n + i) * L
+    MB, HX, HY, HZ = (
+        PAR + (7 * n + i) * L,
+        PAR + (8 * n + i) * L,
+        PAR + (9 * n + i) * L,
+        PAR + (10 * n + i) * L,
+    )
     TH, GA, HG = Y + (Z0 + n + i - 1) * L, Y + (Z0 + 2 * n - 2 + i) * L, HI + (7 + n + i) * L
     for j in range(L):
         qx, qy, qz = W[Y + Q0 * L + j], W[Y + (Q0 + 1) * L + j], W[Y + (Q0 + 2) * L + j]
@@ -419,7 +459,12 @@ def _below_base(tubes, lanes, W, c0, cells, ust_base, x, histb, outb):
     S, A, B = TMP, TMP + 3 * L, TMP + 6 * L
     DS, CO, US = TMP + 9 * L, TMP + 10 * L, TMP + 11 * L
     for i in range(n):
-        GJ, RI, BT, KS = PAR + (n + i) * L, PAR + (3 * n + i) * L, PAR + (5 * n + i) * L, PAR + (6 * n + i) * L
+        GJ, RI, BT, KS = (
+            PAR + (n + i) * L,
+            PAR + (3 * n + i) * L,
+            PAR + (5 * n + i) * L,
+            PAR + (6 * n + i) * L,
+        )
         AL, AV, BE = PAR + (11 * n + i) * L, PAR + (12 * n + i) * L, PAR + (13 * n + i) * L
         for j in range(L):
             W[S + 2 * L + j] = x[i * L + j]
@@ -465,9 +510,9 @@ def _below_base(tubes, lanes, W, c0, cells, ust_base, x, histb, outb):
         for j in range(L):
             gj, bt = W[GJ + j], W[BT + j]
             outb[end + j] = W[S + L + j]
-            outb[end + L + j] = (W[S + 2 * L + j] + gj * W[KS + j] * ust_base[i * points + 4 * cells] - bt * histb[end + L + j]) / (
-                gj + c0 * bt
-            )
+            outb[end + L + j] = (
+                W[S + 2 * L + j] + gj * W[KS + j] * ust_base[i * points + 4 * cells] - bt * histb[end + L + j]
+            ) / (gj + c0 * bt)
             W[Y + (Z0 + i) * L + j] = W[S + 2 * L + j]
         if i == 0:
             for j in range(L):
@@ -517,13 +562,32 @@ def _base_plate(tubes, lanes, W, ust0):
         mx, my = W[Y + M0 * L + j], W[Y + (M0 + 1) * L + j]
         eps = W[FR + 2 * L + j]
         W[Y + (Z0 + n - 1) * L + j] += (
-            W[FR + 3 * L + j] * math.sqrt(mx * mx + my * my) * rate / math.sqrt(rate * rate + eps * eps) + W[FR + 4 * L + j] * rate
+            W[FR + 3 * L + j] * math.sqrt(mx * mx + my * my) * rate / math.sqrt(rate * rate + eps * eps)
+            + W[FR + 4 * L + j] * rate
         )
 
 
 @njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
 def sweep(
-    tubes, lanes, W, c0, sec_cells, sec_tubes, ust, ust0, ust_base, base_cells, par, seclen, x, hist, histb, out, outb, nodes, res
+    tubes,
+    lanes,
+    W,
+    c0,
+    sec_cells,
+    sec_tubes,
+    ust,
+    ust0,
+    ust_base,
+    base_cells,
+    par,
+    seclen,
+    x,
+    hist,
+    histb,
+    out,
+    outb,
+    nodes,
+    res,
 ):
     """Integrate (18), (19), (13), (20)-(24) from the actuators to the tip with the unknowns ``x``, and return the tip's imbalance.
 
@@ -557,14 +621,16 @@ def sweep(
         _curvature(tubes, lanes, W, present, ust, point * 3 * n, c0)
         _bending_moments(tubes, lanes, W, present, MB)
         _tube_friction(tubes, lanes, W, before)
-        if before > present:  # tube `present` ended here: its own balance about its axis; its m_z holds the body's part already
+        if (
+            before > present
+        ):  # tube `present` ended here: its own balance about its axis; its m_z holds the body's part already
             for j in range(L):
                 res[(5 + present) * L + j] = -W[Y + (Z0 + present) * L + j]
                 W[Y + (Z0 + present) * L + j] = 0.0
         cells = sec_cells[k]
         for j in range(L):
             W[MA + j] = seclen[k * L + j] / cells  # MA is free until the section's end
-        for cell in range(cells):
+        for _cell in range(cells):
             here = np.uint64(node * S * L)
             for r in range(S * L):
                 nodes[here + np.uint64(r)] = W[Y + r]
@@ -620,7 +686,12 @@ def sweep(
     # tip of tube 1: external wrench (base axes) against the internal one and the body, (21)
     FT = PAR + (14 * n + 3) * L
     for j in range(L):
-        a, b_, c, d = W[Y + H0 * L + j], W[Y + (H0 + 1) * L + j], W[Y + (H0 + 2) * L + j], W[Y + (H0 + 3) * L + j]
+        a, b_, c, d = (
+            W[Y + H0 * L + j],
+            W[Y + (H0 + 1) * L + j],
+            W[Y + (H0 + 2) * L + j],
+            W[Y + (H0 + 3) * L + j],
+        )
         k2 = 2.0 / (a * a + b_ * b_ + c * c + d * d)
         r00, r01, r02 = 1.0 - k2 * (c * c + d * d), k2 * (b_ * c - a * d), k2 * (b_ * d + a * c)
         r10, r11, r12 = k2 * (b_ * c + a * d), 1.0 - k2 * (b_ * b_ + d * d), k2 * (c * d - a * b_)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 
 class Layout:
@@ -13,10 +14,22 @@ class Layout:
 
     def __init__(self, n: int) -> None:
         self.n = n
-        groups = (
-            "bending_stiffness torsional_stiffness mass_per_length inertia_per_length bending_damping torsion_damping precurvature "
-            "body_mass body_inertia_x body_inertia_y body_inertia_z alpha alpha_rate beta"
-        ).split()
+        groups = [
+            "bending_stiffness",
+            "torsional_stiffness",
+            "mass_per_length",
+            "inertia_per_length",
+            "bending_damping",
+            "torsion_damping",
+            "precurvature",
+            "body_mass",
+            "body_inertia_x",
+            "body_inertia_y",
+            "body_inertia_z",
+            "alpha",
+            "alpha_rate",
+            "beta",
+        ]
         self._rows = {name: slice(k * n, (k + 1) * n) for k, name in enumerate(groups)}
         base = 14 * n
         for name, size in (("gravity", 3), ("force", 3), ("torque", 3)):
@@ -34,7 +47,7 @@ class Layout:
         """Row numbers of ``name``."""
         return np.arange(self.size)[self._rows[name]]
 
-    def pack(self, **values: object) -> np.ndarray:
+    def pack(self, **values: ArrayLike) -> np.ndarray:
         """Parameter block (size,) from values by name; those not given are 0."""
         block = np.zeros(self.size)
         for name, value in values.items():

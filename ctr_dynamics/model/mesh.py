@@ -8,6 +8,7 @@ or the base plate, or a section has grown or shrunk so far that its cells no lon
 
 from __future__ import annotations
 
+import itertools
 from typing import NamedTuple
 
 import numpy as np
@@ -80,7 +81,9 @@ def breakpoints(tubes: Tubes, beta: np.ndarray) -> list[tuple[float, int, int]]:
     return sorted(points, key=lambda item: (item[0], -item[1]))
 
 
-Key = tuple[tuple[tuple[int, int], ...], tuple[int, ...]]  # order of breakpoints as (tube, segment), cells of each section
+Key = tuple[
+    tuple[tuple[int, int], ...], tuple[int, ...]
+]  # order of breakpoints as (tube, segment), cells of each section
 
 
 def section_key(tubes: Tubes, beta: np.ndarray, nodes: int) -> Key:
@@ -112,7 +115,10 @@ def build_mesh(tubes: Tubes, beta: np.ndarray, key: Key, base_cells: int = 4) ->
     positions = np.array([0.0] + [s for s, _, _ in points])
     lengths = np.diff(positions)
     cells = np.array(key[1], dtype=np.int64)
-    present, active = [], [next(j for j, g in enumerate(t) if beta[i] + g.end > 0.0) for i, t in enumerate(tubes)]
+    present, active = (
+        [],
+        [next(j for j, g in enumerate(t) if beta[i] + g.end > 0.0) for i, t in enumerate(tubes)],
+    )
     ust, remaining = [], n
     for k, (_, i, j) in enumerate(points):
         present.append(remaining)
@@ -136,8 +142,8 @@ def build_mesh(tubes: Tubes, beta: np.ndarray, key: Key, base_cells: int = 4) ->
         if behind:
             ust0[i] = behind[-1].curvature(-beta[i])
             edges = -beta[i] * np.arange(base_cells + 1) / base_cells
-            means = [_mean_twist(segments, a, b) for a, b in zip(edges[:-1], edges[1:], strict=True)]
-            ust_base[i] = np.repeat(means, STAGES).tolist() + [ust0[i, 2]]
+            means = [_mean_twist(segments, a, b) for a, b in itertools.pairwise(edges)]
+            ust_base[i] = [*np.repeat(means, STAGES).tolist(), ust0[i, 2]]
     return Mesh(
         sec_cells=cells,
         sec_tubes=np.array(present, dtype=np.int64),
@@ -202,3 +208,13 @@ def node_positions(mesh: Mesh, beta: np.ndarray) -> np.ndarray:
     return np.concatenate(
         [starts[k] + np.linspace(0.0, 1.0, cells + 1) * seclen[k] for k, cells in enumerate(mesh.sec_cells)]
     )
+
+
+def node_points(sec_cells: np.ndarray) -> np.ndarray:
+    """(P,) number of the point at which each node's fields stand: a cell's first stage, and the section's end."""
+    points: list[int] = []
+    start = 0
+    for cells in sec_cells:
+        points.extend(start + 4 * np.arange(cells + 1))
+        start += 4 * int(cells) + 1
+    return np.array(points)

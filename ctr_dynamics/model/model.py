@@ -6,7 +6,17 @@ import numpy as np
 
 from ctr_dynamics.model.kernels import workspace_rows
 from ctr_dynamics.model.layout import Layout
-from ctr_dynamics.model.mesh import Key, Mesh, Segment, Tubes, build_mesh, fits, node_count, point_count, section_key
+from ctr_dynamics.model.mesh import (
+    Key,
+    Mesh,
+    Segment,
+    Tubes,
+    build_mesh,
+    fits,
+    node_count,
+    point_count,
+    section_key,
+)
 from ctr_dynamics.model.newton import buffers, lanes_for
 from ctr_dynamics.robot import Robot
 
@@ -94,7 +104,4 @@ class Model:
 
     def buffers(self, mesh: Mesh, lanes: int) -> tuple[np.ndarray, ...]:
         """Buffers of a sweep: (W, par, seclen, x, hist, histb, out, outb, nodes, res), flat, ``lanes`` numbers a row."""
-        return buffers(
-            self.n, mesh, point_count(mesh), node_count(mesh), lanes, workspace_rows(self.n)
-        )
-
+        return buffers(self.n, mesh, point_count(mesh), node_count(mesh), lanes, workspace_rows(self.n))

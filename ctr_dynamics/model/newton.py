@@ -99,7 +99,26 @@ def invert(matrix, inverse):
 
 
 @njit(cache=True, nogil=True)
-def solve(tubes, lane, lanes, mesh, c0, par, seclen, x, hist, histb, small, big, scale, step, inverse, fresh, tolerance, limit):
+def solve(
+    tubes,
+    lane,
+    lanes,
+    mesh,
+    c0,
+    par,
+    seclen,
+    x,
+    hist,
+    histb,
+    small,
+    big,
+    scale,
+    step,
+    inverse,
+    fresh,
+    tolerance,
+    limit,
+):
     """Find the unknowns ``x`` (m,) at which the tip is in balance; ``x`` and ``inverse`` are updated in place.
 
     ``small`` and ``big`` are the buffers of one lane and of the Jacobian's lanes; ``scale`` (m,) the unit of each imbalance, ``step`` (m,)
@@ -194,5 +213,16 @@ def buffers(n: int, mesh, points: int, nodes: int, lanes: int, rows: int):
     """Zeroed buffers of a sweep with ``lanes`` lanes: (W, par, seclen, x, hist, histb, out, outb, nodes, res), flat."""
     S, F = 16 + 3 * n, 7 + 2 * n
     base = n * (4 * mesh.base_cells + 1) * 2
-    sizes = (rows, 14 * n + 14, len(mesh.sec_cells), 5 + n, points * F, base, points * F, base, nodes * S, 5 + n)
+    sizes = (
+        rows,
+        14 * n + 14,
+        len(mesh.sec_cells),
+        5 + n,
+        points * F,
+        base,
+        points * F,
+        base,
+        nodes * S,
+        5 + n,
+    )
     return tuple(np.zeros(size * lanes) for size in sizes)

@@ -78,7 +78,9 @@ def make_scheme(name: str, dt: float, alpha: float = -0.45) -> Scheme:
         return _bdf_alpha(name, dt, -0.5, 2)
     if name == "bdf_alpha":
         if not -0.5 <= alpha <= 1.0:
-            raise InputError(f"model.alpha {alpha:g} is outside [-0.5, 1]", do="-0.5 is the trapezoidal rule, 0 is BDF2")
+            raise InputError(
+                f"model.alpha {alpha:g} is outside [-0.5, 1]", do="-0.5 is the trapezoidal rule, 0 is BDF2"
+            )
         return _bdf_alpha(name, dt, alpha, 2)
     if name == "sdirk2":
         g = 1.0 - math.sqrt(0.5)
@@ -89,5 +91,6 @@ def make_scheme(name: str, dt: float, alpha: float = -0.45) -> Scheme:
         b1, b2 = -1.5 * g * g + 4.0 * g - 0.25, 1.5 * g * g - 5.0 * g + 1.25
         return _sdirk(name, dt, np.array([[g, 0.0, 0.0], [0.5 * (1.0 - g), g, 0.0], [b1, b2, g]]), 3)
     raise InputError(
-        f"time scheme '{name}' is not known", do="use backward_euler, bdf2, trapezoid, bdf_alpha, sdirk2 or sdirk3"
+        f"time scheme '{name}' is not known",
+        do="use backward_euler, bdf2, trapezoid, bdf_alpha, sdirk2 or sdirk3",
     )

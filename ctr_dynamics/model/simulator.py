@@ -103,7 +103,11 @@ class Simulator:
     """
 
     def __init__(
-        self, model: Model, scheme: Scheme | None = None, tolerance: float = 1e-7, parameters: np.ndarray | None = None
+        self,
+        model: Model,
+        scheme: Scheme | None = None,
+        tolerance: float = 1e-7,
+        parameters: np.ndarray | None = None,
     ) -> None:
         self.model = model
         self.scheme = scheme or make_scheme("sdirk3", 0.003)
@@ -132,11 +136,25 @@ class Simulator:
         m = 5 + self.model.n
         unknowns = np.tile(equilibrium.x, (stages, 1))
         return State(
-            equilibrium.key, equilibrium.mesh, bank, unknowns, np.stack([unknowns, unknowns]), np.zeros((m, m)), False, equilibrium.nodes, inputs
+            equilibrium.key,
+            equilibrium.mesh,
+            bank,
+            unknowns,
+            np.stack([unknowns, unknowns]),
+            np.zeros((m, m)),
+            False,
+            equilibrium.nodes,
+            inputs,
         )
 
     def step(
-        self, state: State, t: float, inputs_at: InputsAt, *, record: bool = False, lead: np.ndarray | None = None
+        self,
+        state: State,
+        t: float,
+        inputs_at: InputsAt,
+        *,
+        record: bool = False,
+        lead: np.ndarray | None = None,
     ) -> StepResult:
         """Advance ``state`` from t to t + dt (s) in place; ``inputs_at`` gives actuators and load at any time in between.
 
@@ -148,8 +166,12 @@ class Simulator:
         if result.ok:
             return result
         totals = [result.iterations, result.sweeps, result.jacobians]
-        quadratic = state.unknowns - 2.0 * state.earlier[0] + state.earlier[1]  # what a quadratic start adds to the linear one
-        retries = [(1, quadratic), (1, None)] + [(2**halving, None) for halving in range(1, 6) if self.scheme.one_step]
+        quadratic = (
+            state.unknowns - 2.0 * state.earlier[0] + state.earlier[1]
+        )  # what a quadratic start adds to the linear one
+        retries = [(1, quadratic), (1, None)] + [
+            (2**halving, None) for halving in range(1, 6) if self.scheme.one_step
+        ]
         for count, start in retries:
             trial = state.copy()
             if start is None:  # from where the last step ended
@@ -172,13 +194,26 @@ class Simulator:
                 return StepResult(True, how, totals[0], totals[1], totals[2], count, tuple(records))
         return StepResult(False, result.reason, totals[0], totals[1], totals[2])
 
-    def _attempt(self, state: State, scheme: Scheme, t: float, inputs_at: InputsAt, fresh: bool, record: bool, lead: np.ndarray | None = None) -> StepResult:
+    def _attempt(
+        self,
+        state: State,
+        scheme: Scheme,
+        t: float,
+        inputs_at: InputsAt,
+        fresh: bool,
+        record: bool,
+        lead: np.ndarray | None = None,
+    ) -> StepResult:
         n, stages = self.model.n, scheme.stages
         at_stages = [inputs_at(t + c * scheme.dt) for c in scheme.times]
         last = at_stages[-1]
         inputs = np.empty((stages, 3 * n + 6))
         for i, now in enumerate(at_stages):
-            inputs[i, :n], inputs[i, n : 2 * n], inputs[i, 2 * n : 3 * n] = now.alpha, now.alpha_rate, now.beta
+            inputs[i, :n], inputs[i, n : 2 * n], inputs[i, 2 * n : 3 * n] = (
+                now.alpha,
+                now.alpha_rate,
+                now.beta,
+            )
             inputs[i, 3 * n : 3 * n + 3], inputs[i, 3 * n + 3 :] = now.force, now.torque
         if not np.isfinite(inputs).all():
             return StepResult(False, "actuators or load hold a number that is not finite", 0, 0, 0)
@@ -221,7 +256,10 @@ class Simulator:
         if key not in self._buffers:
             W, _, seclen, _, hist, histb, out, outb, nodes, res = self.model.buffers(mesh, 1)
             lanes = 8 * len(self.model.jacobian_lanes)
-            self._buffers[key] = ((W, seclen, hist, histb, out, outb, nodes, res), self.model.buffers(mesh, lanes))
+            self._buffers[key] = (
+                (W, seclen, hist, histb, out, outb, nodes, res),
+                self.model.buffers(mesh, lanes),
+            )
         return self._buffers[key]
 
     def node_positions(self, state: State) -> np.ndarray:
@@ -252,7 +290,9 @@ def remap_fields(
         where = np.flatnonzero(new_section == k)
         s = new_s[where] * old_s[-1] / new_s[-1]
         middle = 0.5 * (s[0] + s[-1])
-        source = k if same else next((j for j, end in enumerate(ends) if middle <= end + 1e-12), len(ends) - 1)
+        source = (
+            k if same else next((j for j, end in enumerate(ends) if middle <= end + 1e-12), len(ends) - 1)
+        )
         points = np.flatnonzero(old_section == source)
         x = old_s[points]
         if same:

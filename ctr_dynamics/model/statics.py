@@ -139,7 +139,9 @@ class Statics:
             return work.newton(par, x, self.tolerance)
         return _continue(work, par, x, rows, self.tolerance)
 
-    def _from_end_angles(self, work: _Work, par: np.ndarray, end_angles: np.ndarray) -> tuple[np.ndarray, bool]:
+    def _from_end_angles(
+        self, work: _Work, par: np.ndarray, end_angles: np.ndarray
+    ) -> tuple[np.ndarray, bool]:
         """Unloaded solution whose end angles are near the given ones.
 
         The unloaded robot is an initial-value problem from its ends: with psi_L given and free ends, torsion integrates backward without
@@ -152,7 +154,12 @@ class Statics:
         return x, work.newton(unloaded, x, self.tolerance)
 
     def stability(
-        self, equilibrium: Equilibrium, beta: ArrayLike, alpha: ArrayLike, force: ArrayLike = (0, 0, 0), torque: ArrayLike = (0, 0, 0)
+        self,
+        equilibrium: Equilibrium,
+        beta: ArrayLike,
+        alpha: ArrayLike,
+        force: ArrayLike = (0, 0, 0),
+        torque: ArrayLike = (0, 0, 0),
     ) -> float:
         """det(d alpha / d psi_L) with the loads held, positive on stable branches (Gilbert et al. 2016, Ha et al. 2016).
 
@@ -268,7 +275,9 @@ class _Work:
                 angles[:, i] = psi + integral + theta
         return angles
 
-    def joint_jacobian(self, par: np.ndarray, x: np.ndarray, step: np.ndarray, alpha_rows: np.ndarray) -> np.ndarray:
+    def joint_jacobian(
+        self, par: np.ndarray, x: np.ndarray, step: np.ndarray, alpha_rows: np.ndarray
+    ) -> np.ndarray:
         """d(r, psi_L)/d(x, alpha), (5 + 2N, 5 + 2N), by perturbed lanes."""
         model, mesh, L = self.model, self.mesh, lane_count(self.lanes)
         n, m = model.n, 5 + model.n
@@ -311,7 +320,9 @@ class _Work:
         angles, torque = end_angles.copy(), np.zeros(n)
         ust = mesh.ust.reshape(-1, n, 3) * KS[:, None]
 
-        def slope(angles: np.ndarray, torque: np.ndarray, present: int, reference: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        def slope(
+            angles: np.ndarray, torque: np.ndarray, present: int, reference: np.ndarray
+        ) -> tuple[np.ndarray, np.ndarray]:
             c, s = np.cos(angles[:present]), np.sin(angles[:present])
             wx = c * reference[:present, 0] - s * reference[:present, 1]
             wy = s * reference[:present, 0] + c * reference[:present, 1]
@@ -332,7 +343,9 @@ class _Work:
                 reference = ust[point + 4 * cell + 1]
                 for _ in range(fine):
                     turn, wind = slope(angles, torque, present, reference)
-                    turn, wind = slope(angles - 0.5 * step * turn, torque - 0.5 * step * wind, present, reference)
+                    turn, wind = slope(
+                        angles - 0.5 * step * turn, torque - 0.5 * step * wind, present, reference
+                    )
                     angles, torque = angles - step * turn, torque - step * wind
         x = np.zeros(5 + n)
         x[:n] = torque

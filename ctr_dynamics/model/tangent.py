@@ -46,7 +46,25 @@ def _perturb(lanes, values, rows, m, columns, epsilon, change):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def linearise(tubes, lanes, mesh, c0, par, dpar, x, hist, histb, dhist, epsilon, perturb, big, inverse, dx, dfields, dnodes):
+def linearise(
+    tubes,
+    lanes,
+    mesh,
+    c0,
+    par,
+    dpar,
+    x,
+    hist,
+    histb,
+    dhist,
+    epsilon,
+    perturb,
+    big,
+    inverse,
+    dx,
+    dfields,
+    dnodes,
+):
     """Linearise one solved two-point problem.
 
     ``par`` (NP,) and ``x`` (m,): where it was solved, with ``hist``, ``histb``. ``dpar`` (NP, r), ``dhist`` (fields, r): columns of perturbations
@@ -106,7 +124,27 @@ def linearise(tubes, lanes, mesh, c0, par, dpar, x, hist, histb, dhist, epsilon,
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def theta_tangent(tubes, lanes, mesh, dt, par, inputs, x, after, rate, dpar, epsilon, perturb, big, work, dy, drate, inverse, dx, dnodes):
+def theta_tangent(
+    tubes,
+    lanes,
+    mesh,
+    dt,
+    par,
+    inputs,
+    x,
+    after,
+    rate,
+    dpar,
+    epsilon,
+    perturb,
+    big,
+    work,
+    dy,
+    drate,
+    inverse,
+    dx,
+    dnodes,
+):
     """Columns over one step by the one-stage theta method, linearised at the step's end: one sweep instead of one a stage.
 
     The covariance does not need the model's own time accuracy. ``after``, ``rate`` (fields,): fields and their rates at the end, ``x`` (m,) the
@@ -130,7 +168,25 @@ def theta_tangent(tubes, lanes, mesh, dt, par, inputs, x, after, rate, dpar, eps
         par[11 * n + i] = inputs[i]
     for i in range(6):
         par[14 * n + 3 + i] = inputs[3 * n + i]
-    if not linearise(tubes, lanes, mesh, c0, par, dpar, x, hist, histb, dhist, epsilon, perturb, big, inverse, dx, dy, dnodes):
+    if not linearise(
+        tubes,
+        lanes,
+        mesh,
+        c0,
+        par,
+        dpar,
+        x,
+        hist,
+        histb,
+        dhist,
+        epsilon,
+        perturb,
+        big,
+        inverse,
+        dx,
+        dy,
+        dnodes,
+    ):
         return False
     for i in range(fields):
         for k in range(columns):

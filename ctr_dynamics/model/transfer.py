@@ -56,7 +56,9 @@ def _weights(cells: int, xi: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _fields(source: np.ndarray, target: np.ndarray, F: int, base: int) -> csr_array:
-    rows, columns, values = [], [], []
+    rows: list[int] = []
+    columns: list[int] = []
+    values: list[float] = []
     row = start = 0
     for old, new in zip(source, target, strict=True):
         xi = [(cell + x) / new for cell in range(new) for x in _STAGE_XI] + [1.0]
@@ -75,7 +77,9 @@ def _fields(source: np.ndarray, target: np.ndarray, F: int, base: int) -> csr_ar
 
 
 def _nodes(source: np.ndarray, target: np.ndarray) -> csr_array:
-    rows, columns, values = [], [], []
+    rows: list[int] = []
+    columns: list[int] = []
+    values: list[float] = []
     row = start = 0
     for old, new in zip(source, target, strict=True):
         for node in range(new + 1):

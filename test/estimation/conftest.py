@@ -5,9 +5,8 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parent))
 
-from estimation_cases import Message, Run, bag_messages, replay_bag
-
 import pytest
+from estimation_cases import Message, Run, bag_messages, replay_bag
 
 
 @pytest.fixture(scope="session")
