@@ -6,3 +6,6 @@ import os
 os.environ["ROS_DOMAIN_ID"] = str(20 + os.getpid() % 200)
 os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
 os.environ.setdefault("MPLBACKEND", "Agg")
+
+# Before anything imports NumPy: the package asks it for one thread, which counts only while it is loaded.
+import ctr_dynamics  # noqa: E402, F401
