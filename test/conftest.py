@@ -8,4 +8,4 @@ os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
 os.environ.setdefault("MPLBACKEND", "Agg")
 
 # Before anything imports NumPy: the package asks it for one thread, which counts only while it is loaded.
-import ctr_dynamics  # noqa: E402, F401
+import ctr_dynamics  # noqa: F401

@@ -22,14 +22,13 @@ from ctr_dynamics.model.mesh import node_points, node_positions
 from ctr_dynamics.model.model import Model
 from ctr_dynamics.model.scheme import make_scheme
 from ctr_dynamics.model.simulator import Inputs, InputsAt, Simulator, State, StepResult
-from ctr_dynamics.model.statics import Statics
 from ctr_dynamics.parameters import Settings, axes_mask
 from ctr_dynamics.robot import Robot
 
 from .fusion import Fusion, FusionOptions
 from .health import Health
 from .kernels import backbone_rows
-from .modes import ModalBasis, input_vector, modal_basis
+from .modes import ModeTracker
 from .outputs import Innovation, Modes, SolverStats, StepOutput
 from .rotations import conjugate, from_vector, matrix
 from .signals import Signal, finite, joint_order
@@ -39,6 +38,8 @@ from .tracker import ROTATION, TRANSLATION, registered, tracker_model
 Floats = NDArray[np.float64]
 DT_NS = 3_000_000
 LOAD_GRACE_NS = 100_000_000  # a first load that comes this soon after the joints is there from the start
+AHEAD_NS = 10_000_000_000  # a pose that far after the newest joint state is on another clock
+WAITING_SAMPLES = 200  # poses kept until the first joint state
 MODES_EVERY = 66  # steps between refreshes of the vibration modes
 MAX_FAILURES = 10  # steps in a row that may fail before the model starts anew at rest
 MAX_BEHIND = 1000  # steps to catch up at once; beyond, the model starts anew
@@ -128,8 +129,7 @@ class Estimator:
         self._alone_tips = TipWindow(self.fusion.tips.size)
         self._innovations: list[Innovation] = []
         self._failures = 0
-        self._modes: ModalBasis | None = None
-        self._modes_k = -MODES_EVERY
+        self._modes = ModeTracker(self.model, MODES_EVERY)
         self._backwards = 0
         self._squares = [0.0, 0.0]
         self._residuals = 0
@@ -197,6 +197,8 @@ class Estimator:
             return
         if self.t0_ns is None:
             self.t0_ns = stamp_ns
+            if self._load.stamps:
+                self._open_load()
             return
         i = self._joints.stamps.index(stamp_ns) if kind == "late" else len(self._joints.stamps) - 1
         self._changed(self._joints.stamps[i - 1] if i else stamp_ns)
@@ -250,11 +252,25 @@ class Estimator:
             )
             self.health.dropped += 1
             return
+        newest = max(self._joints.stamps[-1:] + ([taken] if taken is not None else []), default=None)
+        if newest is not None and stamp_ns - newest > AHEAD_NS:
+            ahead = (stamp_ns - newest) * 1e-9
+            self.health.note(
+                "tracker",
+                "ahead of the joints",
+                f"pose {ahead:.3f} s after the newest joint state, limit {AHEAD_NS * 1e-9:g} s; do both clocks agree?",
+            )
+            self.health.dropped += 1
+            return
         if late > 2 * DT_NS * 1e-9:
             self.health.late += 1
         quaternion = np.array([w, x, y, z]) / norm
         self._samples.append(Sample(stamp_ns, np.array(position, dtype=float), quaternion, late))
         self._samples.sort(key=lambda s: s.stamp_ns)
+        if self.t0_ns is None and len(self._samples) > WAITING_SAMPLES:
+            del self._samples[0]
+            self.health.dropped += 1
+            self.health.note("tracker", "before the joints", "poses come, but no complete joint state has")
 
     def add_tip_load(
         self, stamp_ns: int, force: Sequence[float], torque: Sequence[float], frame_id: str = ""
@@ -273,23 +289,31 @@ class Estimator:
                 f"load at {stamp_ns} ns holds a value that is not finite; it was left out",
             )
             return
-        first = not self._load.stamps
         kind = self._load.add(stamp_ns, np.array([*force, *torque], dtype=float))
         if kind == "duplicate":
             self.health.note(
                 "load", "duplicate stamp", f"a second load of {stamp_ns} ns; the first one counts"
             )
-        elif first:
-            if self.t0_ns is not None and stamp_ns - self.t0_ns <= LOAD_GRACE_NS:
-                self._changed(self.t0_ns)
-            else:
-                self._load.stamps.insert(0, stamp_ns - 1)
-                self._load.values.insert(0, np.zeros(6))
-                self._changed(stamp_ns)
-        else:
-            i = self._load.stamps.index(stamp_ns)
-            if i and (kind == "late" or not np.array_equal(self._load.values[i], self._load.values[i - 1])):
-                self._changed(self._load.stamps[i - 1])
+            return
+        if self.t0_ns is None:
+            self._load.forget(stamp_ns - self.window_ns)
+            return
+        i = self._load.stamps.index(stamp_ns)
+        if len(self._load.stamps) == 1:
+            self._open_load()
+            self._changed((self.t0_ns if len(self._load.stamps) == 1 else stamp_ns) - 1)
+        elif i == 0:
+            self._changed(self.t0_ns - 1)
+        elif kind == "late" or not np.array_equal(self._load.values[i], self._load.values[i - 1]):
+            self._changed(self._load.stamps[i - 1])
+
+    def _open_load(self) -> None:
+        """Before the first load there is none, or that one if it comes soon enough after the first joints."""
+        assert self.t0_ns is not None
+        first = self._load.stamps[0]
+        if first - self.t0_ns > LOAD_GRACE_NS:
+            self._load.stamps.insert(0, first - 1)
+            self._load.values.insert(0, np.zeros(6))
 
     def _changed(self, from_ns: int) -> None:
         """Steps after ``from_ns`` were taken with other inputs than are known now."""
@@ -326,6 +350,8 @@ class Estimator:
             return []
         self._skip_ahead(now_ns)
         outputs: list[StepOutput] = []
+        if self._return_to is not None and self._predicting and not self._due(self.k + 1, now_ns):
+            self._go_back()  # now, while nothing waits for it
         while self._due(self.k + 1, now_ns):
             begin = time.perf_counter()
             if self._return_to is not None:
@@ -419,10 +445,11 @@ class Estimator:
         self.fusion.start(self._fused, t)
         self._alone_tips.clear(1)
         self._keep_alone_tip(t)
-        self._modes, self._modes_k = None, k - MODES_EVERY
+        self._modes.clear()
         for sample in self._samples:
             sample.fused_k = None
-        self._kept.clear()
+        while self._kept and self._kept[-1].k >= k:
+            self._kept.pop()
         self._keep(k)
         return ""
 
@@ -455,16 +482,16 @@ class Estimator:
         self._known.clear()
         expected = 2.0 * self._fused.unknowns - self._fused.earlier[0]
         result = self.simulator.step(self._fused, before, self._inputs(True), record=True)
-        if not result.ok:
-            return result
-        if result.substeps > 1:
-            self.health.substeps += 1
-        alone = self.reference.step(
-            self._alone, before, self._inputs(False), lead=self._fused.unknowns - expected
-        )
+        lead = self._fused.unknowns - expected if result.ok else None
+        alone = self.reference.step(self._alone, before, self._inputs(False), lead=lead)
         if not alone.ok:
             return alone
         self._keep_alone_tip(t)
+        if not result.ok:
+            self._start_filter(k)
+            return result
+        if result.substeps > 1:
+            self.health.substeps += 1
         if not self.fusion.predict(self._fused, result, t):
             self.health.note(
                 "tracker", "tangent", "the step could not be linearised; the covariance was held"
@@ -472,6 +499,14 @@ class Estimator:
         self._fuse(k, t)
         self._keep(k)
         return result
+
+    def _start_filter(self, k: int) -> None:
+        """Start the filter anew from the model alone at step ``k``: a correction has led the fused run astray."""
+        assert self._alone is not None
+        self._fused = self._alone.copy()
+        self.fusion.start(self._fused, k * DT_NS * 1e-9)
+        self.health.restarts += 1
+        self._keep(k)
 
     def _keep_alone_tip(self, t: float) -> None:
         assert self._alone is not None
@@ -586,8 +621,9 @@ class Estimator:
             result = self._step(again)
             if not result.ok:
                 self.health.failed(result.reason)
-                self._fused = None
-                break
+                if self._alone_tips.last.stamp < again * DT_NS * 1e-9 - 1e-9:  # the model alone failed too
+                    self._fused = None
+                    break
         self._thaw(counters, before[0], k)
 
     def _frozen(self) -> tuple:
@@ -685,7 +721,7 @@ class Estimator:
         self.health.problem = problem
         return StepOutput(
             stamp, k, not problem, problem, tip.position, tip.quaternion, tip.covariance[:6, :6], tip.twist, tip.covariance[6:, 6:],
-            alone.position.copy(), predicted_q, self._backbone(), self._measure_modes(k), self.fusion.force,
+            alone.position.copy(), predicted_q, self._backbone(), self._modes.measure(self._fused, self.simulator.parameters), self.fusion.force,
             np.sqrt(variance), self._take_innovations(), SolverStats(result.iterations, result.sweeps, result.reason),
         )  # fmt: skip
 
@@ -712,37 +748,6 @@ class Estimator:
             c.position_deviation(np.ascontiguousarray(self.fusion.pi[:r, :r])), rows,
         )  # fmt: skip
         return rows
-
-    def _measure_modes(self, k: int) -> Modes:
-        state = self._fused
-        assert state is not None
-        inputs = state.inputs
-        if k - self._modes_k >= MODES_EVERY or (self._modes is not None and self._modes.key != state.key):
-            self._modes_k = k
-            par = self.simulator.parameters.copy()
-            layout = self.model.layout
-            equilibrium = Statics(self.model, 1e-6).solve(
-                inputs.beta,
-                inputs.alpha,
-                inputs.force,
-                inputs.torque,
-                guess=state.unknowns[-1],
-                parameters=par,
-            )
-            self._modes = None
-            if equilibrium.converged:
-                par[layout["alpha"]], par[layout["beta"]], par[layout["alpha_rate"]] = (
-                    inputs.alpha,
-                    inputs.beta,
-                    0.0,
-                )
-                par[layout["force"]], par[layout["torque"]] = inputs.force, inputs.torque
-                self._modes = modal_basis(self.model, equilibrium, par, inputs.beta)
-        if self._modes is None:
-            return Modes.none()
-        return self._modes.measure(
-            state.fields, input_vector(inputs.alpha, inputs.beta, inputs.force, inputs.torque)
-        )
 
     def snapshot(self) -> dict[str, Any]:
         """Where the estimator stands, for a file."""

@@ -81,7 +81,8 @@ class Fusion:
         self.columns = Columns(self.model, self.uncertainty, options.rank)
         self.theta = np.zeros(len(self.uncertainty.names))
         self.bias = np.zeros(STATES)
-        self.tips = TipWindow(math.ceil(options.window / simulator.scheme.dt) + 3)
+        # a sample at the edge of the window shows a tip that is older still by the delay
+        self.tips = TipWindow(math.ceil((options.window + max(0.0, tracker.delay)) / simulator.scheme.dt) + 5)
         self.pi = np.zeros((0, 0))
         self.steps = 0
         self.force_sigma = options.force_sigma
@@ -98,6 +99,7 @@ class Fusion:
         )
         r = len(pi_aa)
         self.theta[:] = 0.0
+        self._apply_theta()
         self.bias[:] = 0.0
         self.pi = np.zeros((r + STATES, r + STATES))
         self.pi[:r, :r] = pi_aa
@@ -110,6 +112,7 @@ class Fusion:
             i = force.start + axis
             self.pi[i, i] = (self.options.force_sigma / size) ** 2
         self.steps = 0
+        self._refused = False
         self.force_sigma = self.options.force_sigma
         self.tips.clear(r)
         self._reduce()
@@ -246,7 +249,7 @@ class Fusion:
         if tip is None:
             return Update(unknown, unknown, math.nan, 0, False, "outside the window of kept steps")
         mask = self.tracker.mask
-        nu = residual(position, quaternion, *expected(self.tracker, self.bias, tip))[mask]
+        nu = residual(position, quaternion, *expected(self.tracker, self.bias, tip), mask)[mask]
         H = sensitivity(self.tracker, self.bias, tip)[mask]
         R = np.diag(self.tracker.variance[mask])
         S = H @ self.pi @ H.T + R

@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 
 from ctr_dynamics.model.model import Model
 from ctr_dynamics.model.newton import lanes_for
-from ctr_dynamics.model.statics import Equilibrium
+from ctr_dynamics.model.simulator import State
+from ctr_dynamics.model.statics import Equilibrium, Statics
 from ctr_dynamics.model.tangent import linearise
 
 from .columns import field_weights
@@ -68,7 +69,7 @@ def input_vector(alpha: Floats, beta: Floats, force: Floats, torque: Floats) -> 
     return np.concatenate([alpha, beta, force, torque])
 
 
-def _follow(model: Model, equilibrium: Equilibrium, par: Floats) -> Floats | None:
+def equilibrium_slope(model: Model, equilibrium: Equilibrium, par: Floats) -> Floats | None:
     """d(equilibrium's fields)/d(alpha, beta, force, torque), (fields, 2N + 6)."""
     n, layout = model.n, model.layout
     rows = np.concatenate([layout.rows(name) for name in ("alpha", "beta", "force", "torque")])
@@ -89,7 +90,12 @@ def _follow(model: Model, equilibrium: Equilibrium, par: Floats) -> Floats | Non
 
 
 def modal_basis(
-    model: Model, equilibrium: Equilibrium, par: Floats, beta: Floats, count: int = 4
+    model: Model,
+    equilibrium: Equilibrium,
+    par: Floats,
+    beta: Floats,
+    count: int = 4,
+    follow: Floats | None = None,
 ) -> ModalBasis | None:
     """The ``count`` slowest modes about ``equilibrium`` with the parameter block ``par`` (NP,), actuators and load included; None if there are none.
 
@@ -116,6 +122,8 @@ def modal_basis(
         )  # fmt: skip
         return dfields / scale if ok else None
 
+    if follow is None:
+        follow = equilibrium_slope(model, equilibrium, par)
     # start: responses to a force and a moment on the tip and a turn of each actuator
     layout = model.layout
     dpar = np.zeros((layout.size, BLOCK))
@@ -161,7 +169,6 @@ def modal_basis(
         & (mu.real < 0.05 * np.abs(mu))
     )
     order = [int(i) for i in np.flatnonzero(wanted)[np.argsort(np.abs(mu[wanted]))]][:count]
-    follow = _follow(model, equilibrium, par)
     if not order or follow is None:
         return None
     R = matrix(equilibrium.tip_quaternion)
@@ -188,3 +195,50 @@ def modal_basis(
         input_vector(par[layout["alpha"]], beta, par[layout["force"]], par[layout["torque"]]),
         follow,
     )
+
+
+class ModeTracker:
+    """The modes of a moving robot: refreshed now and then, one part of the work a step, and read in every step."""
+
+    def __init__(self, model: Model, every: int) -> None:
+        self.model, self.every = model, every
+        self.clear()
+
+    def clear(self) -> None:
+        """Forget the modes."""
+        self._basis: ModalBasis | None = None
+        self._age = self.every
+        self._pending: tuple[Equilibrium, Floats, Floats, Floats | None] | None = None
+
+    def measure(self, state: State, parameters: Floats) -> Modes:
+        """Modes in ``state`` with the parameter block (NP,); to be called once a step."""
+        self._age += 1
+        if self._basis is not None and self._basis.key != state.key:
+            self.clear()
+        if self._pending is not None:
+            equilibrium, par, beta, follow = self._pending
+            if follow is None:
+                follow = equilibrium_slope(self.model, equilibrium, par)
+                self._pending = None if follow is None else (equilibrium, par, beta, follow)
+            else:
+                self._basis = modal_basis(self.model, equilibrium, par, beta, follow=follow)
+                self._pending = None
+        elif self._age > self.every:
+            self._age = 0
+            self._begin(state, parameters)
+        now = state.inputs
+        if self._basis is None:
+            return Modes.none()
+        return self._basis.measure(state.fields, input_vector(now.alpha, now.beta, now.force, now.torque))
+
+    def _begin(self, state: State, parameters: Floats) -> None:
+        now, layout = state.inputs, self.model.layout
+        equilibrium = Statics(self.model, 1e-6).solve(
+            now.beta, now.alpha, now.force, now.torque, guess=state.unknowns[-1], parameters=parameters
+        )
+        if not equilibrium.converged or equilibrium.key != state.key:
+            return
+        par = parameters.copy()
+        par[layout["alpha"]], par[layout["beta"]], par[layout["alpha_rate"]] = now.alpha, now.beta, 0.0
+        par[layout["force"]], par[layout["torque"]] = now.force, now.torque
+        self._pending = (equilibrium, par, now.beta, None)

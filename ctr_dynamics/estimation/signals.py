@@ -47,20 +47,22 @@ class Signal:
             del self.stamps[:i], self.values[:i]
 
     def at(self, time_ns: float, extrapolate_ns: int = 0) -> tuple[Floats, Floats]:
-        """Value and rate (1/s) at a time: linear between samples, the first before all, extrapolated by the last rate for at most
-        ``extrapolate_ns`` after the last and held from there."""
+        """Value and rate (1/s) at a time.
+
+        Linear between samples, the first before all, extrapolated by the last rate for at most ``extrapolate_ns`` after the last and held from
+        there. At a sample the rate is that of the interval before it, so that it does not depend on what comes next.
+        """
         stamps, values = self.stamps, self.values
-        i = bisect.bisect_right(stamps, time_ns)
+        i = bisect.bisect_left(stamps, time_ns)
         if i == 0:
             return values[0], np.zeros(self.size)
         if i < len(stamps):
-            span = stamps[i] - stamps[i - 1]
-            rate = (values[i] - values[i - 1]) * (1e9 / span)
-            return values[i - 1] + (values[i] - values[i - 1]) * ((time_ns - stamps[i - 1]) / span), rate
-        if extrapolate_ns <= 0 or len(stamps) < 2 or time_ns == stamps[-1]:
+            rate = (values[i] - values[i - 1]) * (1e9 / (stamps[i] - stamps[i - 1]))
+            return values[i - 1] + rate * ((time_ns - stamps[i - 1]) * 1e-9), rate
+        ahead = time_ns - stamps[-1]
+        if extrapolate_ns <= 0 or len(stamps) < 2:
             return values[-1], np.zeros(self.size)
         rate = (values[-1] - values[-2]) * (1e9 / (stamps[-1] - stamps[-2]))
-        ahead = time_ns - stamps[-1]
         if ahead > extrapolate_ns:
             return values[-1] + rate * (extrapolate_ns * 1e-9), np.zeros(self.size)
         return values[-1] + rate * (ahead * 1e-9), rate

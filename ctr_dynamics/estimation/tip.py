@@ -98,6 +98,10 @@ class TipWindow:
         if self.count - first == 1:
             return self.last
         i = min(max(int((time - start) / dt), 0), self.count - first - 2) + first
+        while (
+            i > first and self.stamps[i % self.size] > time
+        ):  # steps that failed are missing from the window
+            i -= 1
         return between(self._tip(i), self._tip(i + 1), time)
 
     def transform(self, T: Floats) -> None:

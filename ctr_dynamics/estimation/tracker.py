@@ -5,6 +5,7 @@ reading = R_reg (p + R lever) + t_reg + drift, R_reading = R_reg R, both of the 
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -88,10 +89,25 @@ def expected(model: TrackerModel, bias: Floats, tip: Tip) -> tuple[Floats, Float
 
 
 def residual(
-    position: Floats, quaternion: Floats, expected_position: Floats, expected_quaternion: Floats
+    position: Floats,
+    quaternion: Floats,
+    expected_position: Floats,
+    expected_quaternion: Floats,
+    mask: NDArray[np.bool_] | None = None,
 ) -> Floats:
-    """(6,) reading minus expectation: position in the tracker's axes, rotation vector in the sensor's axes."""
-    turn = to_vector(multiply(conjugate(expected_quaternion), quaternion))
+    """(6,) reading minus expectation: position in the tracker's axes, rotation vector in the sensor's axes.
+
+    Where ``mask`` (6,) leaves out one rotation axis, the sensor's turn about it is arbitrary and often large.
+    It is taken off first, or it would turn the other two components.
+    """
+    turned = multiply(conjugate(expected_quaternion), quaternion)
+    if mask is not None and mask[3:].sum() == 2:
+        axis = 1 + int(np.argmin(mask[3:]))
+        twist = np.zeros(4)
+        twist[0], twist[axis] = turned[0], turned[axis]
+        if twist @ twist > 1e-12:
+            turned = multiply(turned, conjugate(twist / math.sqrt(twist @ twist)))
+    turn = to_vector(turned)
     return np.concatenate([position - expected_position, turn])
 
 

@@ -85,7 +85,8 @@ def test_backbone_follows_the_true_shape(run_of):
         out = run.outputs[round(0.1 * i / 0.003)]
         rows = out.backbone.astype(float)
         assert np.all(np.diff(rows[:, 0]) >= 0)
-        assert np.allclose(rows[-1, 1:4], out.tip_position, atol=2e-6)
+        # the tip pose holds the estimated lever arm of the sensor, 0.2 mm a priori
+        assert np.abs(rows[-1, 1:4] - out.tip_position).max() < 4e-4
         at = np.array([np.interp(arc, rows[:, 0], rows[:, 1 + c]) for c in range(3)]).T
         # linear between nodes 6 mm apart on a curve of radius 0.1 m: 0.05 mm
         worst = max(worst, float(np.abs(at - truth["shape"][i][: len(arc)]).max()))

@@ -1,0 +1,214 @@
+"""What the filter does with masks, outliers, geometry of the tracker, switched-off fusion; and that it repeats itself."""
+
+import copy
+
+import numpy as np
+import pytest
+from estimation_cases import BAGS, Message, check_outputs, play, rms, truth_error
+
+from ctr_dynamics.estimation.rotations import conjugate, from_vector, matrix, multiply
+from ctr_dynamics.estimation.tip import Tip
+from ctr_dynamics.estimation.tracker import STATES, expected, tracker_model
+from ctr_dynamics.robot import load_robot, robot_from_dict, robot_to_dict
+
+
+def reshaped(messages, change):
+    """Messages with every pose (position (3,), quaternion (4,) wxyz) replaced by `change` of it."""
+    found = []
+    for m in messages:
+        if m.kind == "pose":
+            position, (x, y, z, w), frame = m.content
+            p, q = change(np.array(position), np.array([w, x, y, z]), m)
+            m = Message(m.kind, m.stamp, m.arrival, (tuple(p), (q[1], q[2], q[3], q[0]), frame))
+        found.append(m)
+    return found
+
+
+@pytest.fixture(scope="module")
+def plain(release):
+    return play(release)
+
+
+@pytest.mark.parametrize(("axes", "dof"), [("xyz", 3), ("xyzrp", 5), ("xyzrpy", 6)])
+def test_masks(release, axes, dof):
+    run = play(release, {"tracker.axes": axes})
+    check_outputs(run)
+    innovations = [i for out in run.outputs for i in out.innovations]
+    assert {i.dof for i in innovations} == {dof}
+    assert all(np.isfinite(i.residual[:dof]).all() and np.isnan(i.residual[dof:]).all() for i in innovations)
+    assert rms(truth_error(run, "clean_release", "p_trk")[0]) < 0.7e-3
+
+
+def test_five_axis_tracker_may_report_any_roll(release, plain):
+    """A sensor that does not measure its roll reports anything there, and that must not turn its tilt."""
+    rng = np.random.default_rng(3)
+
+    def roll(p, q, m):
+        return p, multiply(q, from_vector(np.array([0.0, 0.0, rng.uniform(-3.0, 3.0)])))
+
+    told = play(release, {"tracker.axes": "xyzrp"})
+    rolled = play(reshaped(release, roll), {"tracker.axes": "xyzrp"})
+    assert rolled.estimator.health.rejected == told.estimator.health.rejected
+    difference = rolled.column("tip_position") - told.column("tip_position")
+    assert rms(difference) < 0.02e-3
+    assert rms(truth_error(rolled, "clean_release", "p_trk")[0]) < 0.5e-3
+
+
+def test_unmeasured_axes_do_not_matter(release):
+    told = play(release, {"tracker.axes": "xyz"})
+    turned = play(
+        reshaped(release, lambda p, q, m: (p, np.array([0.5, -0.5, 0.5, 0.5]))), {"tracker.axes": "xyz"}
+    )
+    assert np.array_equal(told.column("tip_position"), turned.column("tip_position"))
+
+
+def test_isolated_outlier_is_rejected(release, plain):
+    at = [m.stamp for m in release if m.kind == "pose"][30]
+    run = play(reshaped(release, lambda p, q, m: (p + [0.05 * (m.stamp == at), 0.0, 0.0], q)))
+    health = run.estimator.health
+    assert health.rejected == plain.estimator.health.rejected + 1
+    refused = [i for out in run.outputs for i in out.innovations if not i.accepted]
+    assert len(refused) == 1
+    assert refused[0].nis > 1000
+    assert refused[0].reason == "outside the gate"
+    assert refused[0].residual[0] == pytest.approx(0.05, abs=3e-3)
+    assert all(out.valid for out in run.outputs)
+    assert rms(run.column("tip_position") - plain.column("tip_position")) < 0.1e-3
+
+
+def test_lasting_contradiction_is_said(release):
+    """A tracker that is decimetres beside itself all the time is no outlier: output becomes invalid."""
+    rng = np.random.default_rng(0)
+    run = play(reshaped(release, lambda p, q, m: (p + rng.uniform(-0.3, 0.3, 3), q)))
+    check_outputs(run)
+    invalid = [out for out in run.outputs if not out.valid]
+    assert any("tracker contradicts the model" in out.reason for out in invalid)
+    status = next(s for s in run.estimator.health.statuses() if s.name == "tracker")
+    assert status.level == 2
+    assert "limit half" in status.message
+
+
+def test_fusion_off_is_the_model_alone(release):
+    run = play(release, {"filter.enabled": False})
+    assert np.abs(run.column("tip_position") - run.column("predicted_position")).max() < 1e-6
+    innovations = [i for out in run.outputs for i in out.innovations]
+    assert len(innovations) == sum(m.kind == "pose" for m in release)
+    assert not any(i.accepted for i in innovations)
+    assert run.estimator.summary()["residual_rms_m"]["fused"] is None
+    alone = play([m for m in release if m.kind != "pose"])
+    assert np.abs(run.column("tip_position") - alone.column("tip_position")).max() < 1e-6
+
+
+def test_predicted_pose_is_never_corrected(release, plain):
+    moved = play(reshaped(release, lambda p, q, m: (p + [0.004, 0.0, 0.0], q)))
+    difference = moved.column("predicted_position") - plain.column("predicted_position")
+    assert np.nanmax(np.abs(difference)) < 2e-5
+    fused = moved.column("tip_position")[150:] - plain.column("tip_position")[150:]
+    assert np.nanmean(fused[:, 0]) > 1e-3
+
+
+def test_fusion_can_be_switched_while_running(release):
+    from estimation_cases import START_NS, estimator
+
+    made, outputs = estimator(), []
+    made.set_fusion(False)
+    for m in sorted(release, key=lambda m: m.arrival):
+        if m.stamp >= 0.7e9:
+            made.set_fusion(True)
+        m.give(made)
+        outputs += made.advance(START_NS + m.arrival)
+    difference = [np.linalg.norm(out.tip_position - out.predicted_position) for out in outputs]
+    assert max(difference[:230]) < 1e-6
+    assert max(difference[240:]) > 0.3e-3
+
+
+def test_two_runs_are_the_same_bytes(release, plain):
+    again = play(release)
+    assert len(again.outputs) == len(plain.outputs)
+    for a, b in zip(again.outputs, plain.outputs, strict=True):
+        for name, value in vars(a).items():
+            other = getattr(b, name)
+            if isinstance(value, np.ndarray):
+                assert value.tobytes() == other.tobytes(), (a.k, name)
+        assert a.modes.amplitude.tobytes() == b.modes.amplitude.tobytes()
+        assert [i.nis for i in a.innovations] == [i.nis for i in b.innovations]
+
+
+def test_registration_parameter_undoes_a_moved_tracker(release, plain):
+    rotation, shift = np.array([0.4, -1.1, 0.7]), np.array([0.8, -0.3, 1.2])
+    turn = from_vector(rotation)
+    moved = reshaped(release, lambda p, q, m: (matrix(turn) @ p + shift, multiply(turn, q)))
+    settings = {
+        "tracker.registration_rotation_rad": tuple(rotation),
+        "tracker.registration_translation_m": tuple(shift),
+    }
+    run = play(moved, settings)
+    assert np.abs(run.column("tip_position") - plain.column("tip_position")).max() < 2e-6
+    covariance = plain.column("tip_covariance")
+    assert np.abs(run.column("tip_covariance") - covariance).max() < 1e-3 * np.abs(covariance).max()
+    # without the parameter the samples make no sense
+    assert play(moved[:60]).estimator.health.nis_sum > 1e4
+
+
+def test_lever_arm_parameter_undoes_a_sensor_beside_the_tip(release, plain):
+    lever = np.array([0.004, -0.003, 0.010])
+    truth = np.load(BAGS / "truth" / "clean_release.npz")
+
+    def carried(p, q, m):
+        at = np.argmin(np.abs(truth["t"] - m.stamp * 1e-9))
+        return p + matrix(truth["q"][at]) @ lever, q
+
+    run = play(reshaped(release, carried), {"tracker.lever_arm_m": tuple(lever)})
+    assert rms(run.column("tip_position") - plain.column("tip_position")) < 0.05e-3
+
+
+def test_parameters_compose_with_the_robot_file():
+    data = robot_to_dict(load_robot("till2020_tissue"))
+    own = copy.deepcopy(data)
+    own["tracker"]["registration_rotation"]["value"] = [0.1, 0.2, -0.3]
+    own["tracker"]["registration_translation"]["value"] = [0.3, 0.1, 0.2]
+    own["tracker"]["lever_arm"]["value"] = [0.001, 0.002, 0.003]
+    own["tracker"]["delay"]["value"] = 0.004
+    robot = robot_from_dict(own)
+    turn, shift, lever = np.array([-0.5, 0.2, 0.9]), np.array([1.0, 2.0, 3.0]), np.array([0.01, 0.0, -0.02])
+    rng = np.random.default_rng(5)
+    q = rng.normal(size=4)
+    tip = Tip(0.0, rng.normal(size=3), q / np.linalg.norm(q), np.zeros(3), np.zeros(3), np.zeros((12, 1)))
+    plain = expected(tracker_model(robot), np.zeros(STATES), tip)
+    both = tracker_model(robot, delay=0.002, lever=lever, rotation=turn, translation=shift)
+    assert both.delay == pytest.approx(0.006)
+    position, quaternion = expected(both, np.zeros(STATES), tip)
+    R = matrix(from_vector(turn))
+    carried = plain[0] + matrix(plain[1]) @ lever
+    assert np.allclose(position, R @ carried + shift, atol=1e-12)
+    assert np.allclose(matrix(quaternion), R @ matrix(plain[1]), atol=1e-12)
+    back = both.to_base(position, quaternion)
+    assert np.allclose(back[0], tip.position, atol=1e-12)
+    assert np.allclose(matrix(multiply(conjugate(back[1]), tip.quaternion)), np.eye(3), atol=1e-12)
+
+
+def test_reset_waits_for_joints_and_starts_anew(release):
+    run = play([m for m in release if m.stamp < 0.3e9])
+    made = run.estimator
+    made.reset()
+    assert made.t0_ns is None
+    assert made.advance(1_700_000_001_000_000_000) == []
+    assert "waiting" in made.health.problem
+    outputs = []
+    for m in [m for m in release if 0.4e9 <= m.stamp < 0.6e9]:
+        m.give(made)
+        outputs += made.advance()
+    assert outputs[0].k == 0
+    assert outputs[0].stamp_ns == 1_700_000_000_400_000_000
+    assert all(out.valid for out in outputs)
+
+
+def test_snapshot_is_plain_data_with_named_parameters(plain):
+    import json
+
+    snapshot = json.loads(json.dumps(plain.estimator.snapshot(), allow_nan=False))
+    assert snapshot["k"] == plain.last.k
+    assert set(snapshot["parameters"]) == set(plain.estimator.fusion.uncertainty.names)
+    young = snapshot["parameters"]["youngs_modulus.tube1"]
+    assert abs(young["value"]) < 0.02
+    assert 0 < young["sigma"] <= 0.0041

@@ -1,0 +1,160 @@
+"""Inputs that come late, out of order or early: roll-back, the window of kept tips, and the two output policies."""
+
+import numpy as np
+import pytest
+from estimation_cases import bag_messages, check_outputs, estimator, play
+
+STEP = 0.003
+
+
+def apart(a, b):
+    """Distance of the last fused tips in m."""
+    assert a.last.k == b.last.k
+    return float(np.linalg.norm(a.last.tip_position - b.last.tip_position))
+
+
+@pytest.fixture(scope="module")
+def in_time(sweep):
+    return play(sweep)
+
+
+@pytest.mark.parametrize(("bag", "delay"), [("clean_sweep", 0.0), ("latency_sweep", 0.018)])
+def test_late_and_shuffled_poses_give_nearly_the_same(bag, delay):
+    settings = {"tracker.delay_s": delay}
+    sweep = bag_messages(bag, 1.2)
+    rng = np.random.default_rng(4)
+    late = [m.late(rng.uniform(0.0, 0.195)) if m.kind == "pose" and m.stamp < 0.95e9 else m for m in sweep]
+    order = [m.stamp for m in sorted(late, key=lambda m: m.arrival) if m.kind == "pose"]
+    assert order != sorted(order)
+    run, reference = play(late, settings), play(sweep, settings)
+    check_outputs(run)
+    health = run.estimator.health
+    assert health.dropped == reference.estimator.health.dropped
+    assert (
+        health.accepted + health.rejected
+        == reference.estimator.health.accepted + reference.estimator.health.rejected
+    )
+    assert health.late > 20
+    assert apart(run, reference) < 0.05e-3
+    without = play([m for m in sweep if m.kind != "pose"], settings)
+    assert apart(without, reference) > 0.2e-3, (
+        "the poses make no difference here: the comparison shows nothing"
+    )
+    delays = [i.delay_s for out in run.outputs for i in out.innovations]
+    assert 0.15 < max(delays) < 0.2
+
+
+def test_poses_later_than_the_window_are_dropped_and_counted(sweep, in_time):
+    poses = [m for m in sweep if m.kind == "pose"]
+    chosen = poses[10:14]
+    run = play([m.late(0.21) if m in chosen else m for m in sweep])
+    health = run.estimator.health
+    assert health.dropped == in_time.estimator.health.dropped + 4
+    assert health.accepted == in_time.estimator.health.accepted - 4
+    assert health.tracker["too late"].count == 4
+    assert "limit 0.2 s" in health.tracker["too late"].last
+    left_out = play([m for m in sweep if m not in chosen])
+    assert np.array_equal(run.column("tip_position"), left_out.column("tip_position"))
+
+
+def test_late_joints_under_predict_end_as_in_time_under_wait(sweep, in_time):
+    late = [m.late(0.030) if m.kind == "joints" and 0 < m.stamp < 1.1e9 else m for m in sweep]
+    run = play(late, {"output.policy": "predict"}, tick=STEP)
+    check_outputs(run)
+    assert [out.k for out in run.outputs] == list(range(len(run.outputs)))
+    assert run.estimator.health.rolled_back > 100
+    assert all(out.valid for out in run.outputs)
+    # a step of its own time was published on extrapolated joints, and differs
+    differences = [
+        np.abs(a.tip_position - b.tip_position).max()
+        for a, b in zip(run.outputs, in_time.outputs, strict=False)
+    ]
+    assert max(differences) > 1e-6
+    last = in_time.last
+    assert run.last.k == last.k
+    assert np.abs(run.last.tip_position - last.tip_position).max() < 1e-9
+    assert np.abs(run.last.tip_velocity - last.tip_velocity).max() < 1e-6
+    assert np.abs(run.last.tip_covariance - last.tip_covariance).max() < 1e-12
+    assert np.abs(run.last.predicted_position - last.predicted_position).max() < 1e-9
+    # samples are counted once, however often they were fused again
+    assert run.estimator.health.accepted == in_time.estimator.health.accepted
+
+
+def test_predict_with_joints_in_time_extrapolates_for_less_than_their_period(sweep, in_time):
+    run = play(sweep, {"output.policy": "predict"}, tick=STEP)
+    differences = [
+        float(np.linalg.norm(a.tip_position - b.tip_position))
+        for a, b in zip(run.outputs, in_time.outputs, strict=False)
+    ]
+    assert max(differences) < 0.1e-3
+
+
+@pytest.mark.parametrize("policy", ["wait", "predict"])
+def test_late_load_ends_as_in_time(release, policy):
+    settings = {"output.policy": policy}
+    late = [m.late(0.050) if m.kind == "load" and 0.9e9 < m.stamp < 1.3e9 else m for m in release]
+    assert sum(a.arrival != b.arrival for a, b in zip(late, release, strict=True)) > 1
+    reference = play(release, settings, tick=STEP)
+    run = play(late, settings, tick=STEP)
+    check_outputs(run)
+    assert run.estimator.health.rolled_back > 5
+    # the cut was noticed late
+    worst = max(
+        np.abs(a.tip_position - b.tip_position).max()
+        for a, b in zip(run.outputs, reference.outputs, strict=True)
+    )
+    assert worst > 1e-3
+    assert np.abs(run.last.tip_position - reference.last.tip_position).max() < 1e-9
+    assert np.abs(run.last.predicted_position - reference.last.predicted_position).max() < 1e-9
+
+
+@pytest.mark.parametrize("late", [0.004, 0.040, 0.090])
+@pytest.mark.parametrize("policy", ["wait", "predict"])
+def test_first_load_soon_after_the_joints_is_there_from_the_start(release, late, policy):
+    """The robot starts in the equilibrium under that load, however late the message comes."""
+    messages = [m for m in release if m.stamp <= 0.5e9]
+    settings = {"output.policy": policy}
+    run = play(
+        [m.late(late) if m.kind == "load" and m.stamp < 0.3e9 else m for m in messages], settings, tick=STEP
+    )
+    reference = play(messages, settings, tick=STEP)
+    assert np.abs(run.last.tip_position - reference.last.tip_position).max() < 1e-7
+    assert np.abs(run.last.predicted_position - reference.last.predicted_position).max() < 1e-7
+
+
+def test_load_that_came_before_the_joints_counts_from_their_start(release):
+    messages = [m for m in release if m.stamp <= 0.3e9]
+    first = [m for m in messages if m.kind == "load"][0]
+    early = [m if m is not first else m.late(-0.1) for m in messages]
+    a, b = play(early), play(messages)
+    assert np.array_equal(a.column("tip_position"), b.column("tip_position"))
+
+
+def test_first_load_much_later_acts_from_its_stamp_on(release):
+    joints = [m for m in release if m.kind == "joints" and m.stamp <= 0.6e9]
+    run = play(joints + [m for m in release if m.kind == "load" and 0.3e9 <= m.stamp <= 0.6e9])
+    unloaded = play(joints)
+    before = round(0.299 / STEP)
+    assert np.array_equal(
+        run.column("predicted_position")[:before], unloaded.column("predicted_position")[:before]
+    )
+    assert np.abs(run.last.predicted_position - unloaded.last.predicted_position).max() > 1e-3
+
+
+def test_wait_takes_a_step_when_its_joints_are_in_or_the_timeout_is_over(sweep):
+    made = estimator()
+    states = [m for m in sweep if m.kind == "joints"]
+    start = 1_700_000_000_000_000_000
+    states[0].give(made)
+    assert [out.k for out in made.advance(start)] == [0]
+    assert made.advance(start + 50_000_000) == []
+    states[1].give(made)
+    assert [out.k for out in made.advance(start + 50_000_000)] == [1, 2, 3]
+    assert [out.k for out in made.advance(start + 115_000_000)] == [4, 5]
+
+
+def test_predict_takes_a_step_on_time(sweep):
+    made = estimator({"output.policy": "predict"})
+    sweep[0].give(made)
+    start = 1_700_000_000_000_000_000
+    assert [out.k for out in made.advance(start + 9_500_000)] == [0, 1, 2, 3]
