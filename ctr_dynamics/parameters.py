@@ -61,7 +61,7 @@ PARAMETERS: tuple[Parameter, ...] = (
     Parameter(
         "filter.tip_force_sigma_N",
         "float",
-        0.001,
+        0.0006,
         "N",
         "Least deviation per axis of the unknown tip force.",
         0.0,

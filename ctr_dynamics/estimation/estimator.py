@@ -41,6 +41,7 @@ LOAD_GRACE_NS = 100_000_000  # a first load that comes this soon after the joint
 AHEAD_NS = 10_000_000_000  # a pose that far after the newest joint state is on another clock
 WAITING_SAMPLES = 200  # poses kept until the first joint state
 MODES_EVERY = 66  # steps between refreshes of the vibration modes
+RETRY_EVERY = 33  # steps between starts while there is no equilibrium: looking for one in vain takes long
 MAX_FAILURES = 10  # steps in a row that may fail before the model starts anew at rest
 MAX_BEHIND = 1000  # steps to catch up at once; beyond, the model starts anew
 
@@ -129,8 +130,10 @@ class Estimator:
         self._alone_tips = TipWindow(self.fusion.tips.size)
         self._innovations: list[Innovation] = []
         self._failures = 0
+        self._no_start: tuple[int, str] | None = None  # step and reason of a start that found no equilibrium
         self._modes = ModeTracker(self.model, MODES_EVERY)
         self._backwards = 0
+        self._sampled_ns: int | None = None
         self._squares = [0.0, 0.0]
         self._residuals = 0
         self._known: dict[
@@ -457,7 +460,10 @@ class Estimator:
         """Take step ``k`` and describe it."""
         self.health.steps += 1
         if self._fused is None:
+            if self._no_start and k < self._no_start[0] + RETRY_EVERY:
+                return self._invalid(k, self._no_start[1])
             reason = self._start(k)
+            self._no_start = (k, reason) if reason else None
             if reason:
                 self.health.failed("no static equilibrium")
                 return self._invalid(k, reason)
@@ -531,6 +537,7 @@ class Estimator:
             else:
                 update = self.fusion.compare(time_s, sample.position, sample.quaternion)
             if update.dof:
+                self._sampled_ns = max(self._sampled_ns or 0, sample.stamp_ns)
                 self.health.measured(
                     update.nis, update.dof, update.accepted, update.accepted and not update.reason
                 )
@@ -719,6 +726,8 @@ class Estimator:
             return self._invalid(k, "the estimate is not finite; the model starts anew at rest")
         problem = self._problem(k)
         self.health.problem = problem
+        since = self._sampled_ns if self._sampled_ns is not None else self.t0_ns
+        self.health.tracker_age_s = max(0.0, (stamp - (since or stamp)) * 1e-9)
         return StepOutput(
             stamp, k, not problem, problem, tip.position, tip.quaternion, tip.covariance[:6, :6], tip.twist, tip.covariance[6:, 6:],
             alone.position.copy(), predicted_q, self._backbone(), self._modes.measure(self._fused, self.simulator.parameters), self.fusion.force,

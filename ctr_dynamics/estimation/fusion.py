@@ -26,6 +26,10 @@ from .uncertainty import bias_sigma, model_uncertainty
 
 Floats = NDArray[np.float64]
 
+PLAUSIBLE = (
+    8.0  # prior deviations that a parameter may move: what lies beyond is another effect, not this parameter
+)
+
 
 @dataclass(frozen=True)
 class FusionOptions:
@@ -33,11 +37,10 @@ class FusionOptions:
 
     rank: int = 24
     gate_probability: float = 0.9999
-    force_sigma: float = 0.002
+    force_sigma: float = 0.0006
     force_sigma_max: float = 0.2
     adaptation: float = 0.1
-    ratio_cap: float = 10.0
-    force_time: float = 0.2
+    force_time: float = 0.3
     window: float = 0.2
     reduce_every: int = 8
     retain: float = 1.0
@@ -285,7 +288,7 @@ class Fusion:
     def _adapt(self, ratio: float) -> None:
         """Raise the drive of the tip force while innovations are larger than predicted, lower it while they are smaller."""
         o = self.options
-        size = self.force_sigma * math.exp(o.adaptation * (min(ratio, self.options.ratio_cap) - 1.0))
+        size = self.force_sigma * math.exp(o.adaptation * (min(ratio, 10.0) - 1.0))
         self.force_sigma = min(max(size, o.force_sigma), o.force_sigma_max)
 
     def _correct(self, state: State, x: Floats) -> None:
@@ -295,6 +298,8 @@ class Fusion:
         a = x[:r]
         self.bias += x[r:]
         self.theta += c.theta @ a
+        limit = np.where(self.uncertainty.sigma > 0, PLAUSIBLE * self.uncertainty.sigma, np.inf)
+        np.clip(self.theta, -limit, limit, out=self.theta)
         self._apply_theta()
         state.bank[:2] += c.fields_change(a)
         shift = c.dx @ a

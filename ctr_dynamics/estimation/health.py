@@ -10,6 +10,8 @@ from scipy.stats import chi2
 
 from .outputs import ERROR, OK, WARN, Status
 
+TRACKER_LIMIT_S = 1.0  # without a usable sample for longer than this the status says so
+
 
 @dataclass
 class Counter:
@@ -29,7 +31,7 @@ class Health:
     """Counters and running figures of the estimator.
 
     ``joints``, ``tracker``, ``load``: input problems by kind. ``nis_sum``, ``nis_dof``, ``nis_count``: over all samples that reached the gate.
-    ``recent``: (nis / dof, within the gate) of the last second's samples.
+    ``tracker_age_s``: since the newest sample that reached the gate, or the start. ``recent``: (nis / dof, within the gate) of the last second's samples.
     """
 
     joints: dict[str, Counter] = field(default_factory=dict)
@@ -53,6 +55,7 @@ class Health:
     rolled_back: int = 0
     fusing: bool = True
     force_sigma: float = 0.0
+    tracker_age_s: float = 0.0
     _within: int = 0
 
     def note(self, group: str, kind: str, what: str) -> None:
@@ -151,6 +154,12 @@ class Health:
                 "check the tracker's frame, units, stamps and the robot file"
             )
             return Status("tracker", ERROR, message, values)
+        if self.tracker_age_s > TRACKER_LIMIT_S:
+            message = (
+                f"no usable sample for {self.tracker_age_s:.1f} s, limit {TRACKER_LIMIT_S:g} s: "
+                "the pose is the model's prediction since then"
+            )
+            return Status("tracker", WARN, message, values)
         return Status("tracker", status.level, status.message, values)
 
     def _consistency(self) -> Status:

@@ -124,7 +124,7 @@ def test_first_load_soon_after_the_joints_is_there_from_the_start(release, late,
 
 def test_load_that_came_before_the_joints_counts_from_their_start(release):
     messages = [m for m in release if m.stamp <= 0.3e9]
-    first = [m for m in messages if m.kind == "load"][0]
+    first = next(m for m in messages if m.kind == "load")
     early = [m if m is not first else m.late(-0.1) for m in messages]
     a, b = play(early), play(messages)
     assert np.array_equal(a.column("tip_position"), b.column("tip_position"))

@@ -1,0 +1,280 @@
+"""Tip kinematics, the window of kept tips, and the tracker's sensitivities against finite differences."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from ctr_dynamics.estimation.rotations import conjugate, from_vector, matrix, multiply, to_vector
+from ctr_dynamics.estimation.tip import Tip, TipWindow, tip_rows
+from ctr_dynamics.estimation.tracker import (
+    DELAY,
+    STATES,
+    TrackerModel,
+    expected,
+    registered_rows,
+    residual,
+    sensitivity,
+)
+
+RNG = np.random.default_rng(11)
+COLUMNS, STEP = 5, 1e-6
+
+
+def random_unit():
+    q = RNG.normal(size=4)
+    return q / np.linalg.norm(q)
+
+
+def random_tip():
+    return Tip(
+        0.0,
+        *(0.1 * RNG.normal(size=3), random_unit(), RNG.normal(size=3), RNG.normal(size=3)),
+        RNG.normal(size=(12, COLUMNS)),
+    )
+
+
+def random_tracker():
+    return TrackerModel(
+        random_unit(),
+        RNG.normal(size=3),
+        0.02 * RNG.normal(size=3),
+        0.004,
+        np.ones(6, dtype=bool),
+        np.full(6, 1e-7),
+    )
+
+
+def moved(tip, a, seconds=0.0):
+    """The tip with its columns times `a` (r,) added, `seconds` later on its way."""
+    d = tip.columns @ a
+    turn = multiply(from_vector(d[3:6] + seconds * tip.rate), tip.quaternion)
+    return Tip(
+        0.0,
+        tip.position + d[0:3] + seconds * tip.velocity,
+        turn,
+        tip.velocity + d[6:9],
+        tip.rate + d[9:12],
+        tip.columns,
+    )
+
+
+def bias_of(scale):
+    bias = scale * RNG.normal(size=STATES)
+    bias[DELAY] = 0.0
+    return bias
+
+
+def test_tip_rows_are_the_kinematics_and_their_derivative():
+    node, change = RNG.normal(size=22), RNG.normal(size=(22, COLUMNS))
+
+    def rows(at):
+        mean, columns = np.empty(13), np.empty((12, COLUMNS))
+        tip_rows(at, change, 0.05, mean, columns)
+        return mean, columns
+
+    mean, columns = rows(node)
+    R = Rotation.from_quat(node[[4, 5, 6, 3]]).as_matrix()
+    assert np.allclose(mean[0:3], node[0:3])
+    assert np.allclose(matrix(mean[3:7]), R)
+    assert np.allclose(mean[7:10], R @ ([*node[7:10], 0.0, 0.0, 0.05]))
+    assert np.allclose(mean[10:13], R @ node[10:13])
+    for c in range(COLUMNS):
+        plus, minus = rows(node + STEP * change[:, c])[0], rows(node - STEP * change[:, c])[0]
+        turn = to_vector(multiply(plus[3:7], conjugate(minus[3:7]))) / (2 * STEP)
+        rest = (plus - minus) / (2 * STEP)
+        assert np.allclose(columns[:, c], np.concatenate([rest[:3], turn, rest[7:]]), rtol=1e-6, atol=1e-7)
+
+
+def test_sensitivity_equals_finite_differences():
+    tip, tracker, bias = random_tip(), random_tracker(), bias_of(0.0)
+    H = sensitivity(tracker, bias, tip)
+    assert H.shape == (6, COLUMNS + STATES)
+    for column in range(COLUMNS + STATES):
+        readings = []
+        for h in (STEP, -STEP):
+            a, b = np.zeros(COLUMNS), bias.copy()
+            if column < COLUMNS:
+                a[column] = h
+            else:
+                b[column - COLUMNS] += h
+            # an older pose is that of an earlier time
+            readings.append(expected(tracker, b, moved(tip, a, seconds=-(b[DELAY] - bias[DELAY]))))
+        difference = residual(*readings[0], *readings[1]) / (2 * STEP)
+        assert np.allclose(H[:, column], difference, rtol=1e-6, atol=1e-7), column
+
+
+def test_residual_of_a_masked_rotation_leaves_the_arbitrary_turn_out():
+    tip, tracker = random_tip(), random_tracker()
+    position, quaternion = expected(tracker, np.zeros(STATES), tip)
+    tilt = np.array([0.01, -0.02, 0.0])
+    for roll in (0.0, 1.0, -2.5, np.pi):
+        read = multiply(multiply(quaternion, from_vector(tilt)), from_vector(np.array([0.0, 0.0, roll])))
+        five = np.array([1, 1, 1, 1, 1, 0], dtype=bool)
+        assert np.allclose(residual(position, read, position, quaternion, five)[3:5], tilt[:2], atol=1e-5)
+
+
+def test_registered_pose_and_covariance_equal_finite_differences():
+    tip, tracker, bias = random_tip(), random_tracker(), bias_of(1e-4)
+
+    def pose_of(a, b):
+        at = moved(tip, a)
+        mean = np.concatenate([at.position, at.quaternion, at.velocity, at.rate])
+        pose, covariance = np.empty(7), np.empty((12, 12))
+        finite = registered_rows(mean, tip.columns, tracker.rotation, tracker.lever, b, pi, pose, covariance)
+        assert finite
+        return pose, covariance
+
+    pi = np.eye(COLUMNS + STATES)
+    _, covariance = pose_of(np.zeros(COLUMNS), bias)
+    J = np.zeros((12, COLUMNS + STATES))
+    for column in range(COLUMNS + STATES):
+        ends = []
+        for h in (STEP, -STEP):
+            a, b = np.zeros(COLUMNS), bias.copy()
+            if column < COLUMNS:
+                a[column] = h
+            else:
+                b[column - COLUMNS] += h
+            ends.append(pose_of(a, b)[0])
+        J[0:3, column] = (ends[0] - ends[1])[:3] / (2 * STEP)
+        J[3:6, column] = to_vector(multiply(ends[0][3:], conjugate(ends[1][3:]))) / (2 * STEP)
+    J[6:, :COLUMNS] = tip.columns[6:]
+    assert np.allclose(covariance, J @ J.T, rtol=1e-3, atol=1e-3 * np.abs(covariance).max())
+    assert np.allclose(covariance, covariance.T)
+
+
+def test_registered_pose_is_what_a_perfect_tracker_with_nominal_geometry_sees():
+    tip, tracker, bias = random_tip(), random_tracker(), bias_of(1e-2)
+    bias[10:13] = 0.0
+    position, quaternion = tracker.to_base(*expected(tracker, bias, tip))
+    pose, covariance = np.empty(7), np.empty((12, 12))
+    mean = np.concatenate([tip.position, tip.quaternion, tip.velocity, tip.rate])
+    registered_rows(
+        mean, tip.columns, tracker.rotation, tracker.lever, bias, np.eye(COLUMNS + STATES), pose, covariance
+    )
+    assert np.allclose(pose[:3], position, atol=1e-12)
+    assert np.allclose(matrix(pose[3:]), matrix(quaternion), atol=1e-12)
+
+
+def test_what_is_not_finite_is_noticed():
+    tip, tracker = random_tip(), random_tracker()
+    mean = np.concatenate([tip.position, tip.quaternion, tip.velocity, tip.rate])
+    pose, covariance = np.empty(7), np.empty((12, 12))
+    pi = np.eye(COLUMNS + STATES)
+    pi[0, 0] = np.nan
+    assert not registered_rows(
+        mean, tip.columns, tracker.rotation, tracker.lever, np.zeros(STATES), pi, pose, covariance
+    )
+
+
+# -- the window --
+
+RATE = np.array([0.3, -2.0, 1.0])
+CUBIC = np.array([[0.1, 0.2, 0.3], [1.0, -2.0, 0.5], [3.0, 2.0, -4.0], [-50.0, 20.0, 10.0]])
+DT = 0.003
+
+
+def node_at(t):
+    """Node state (22,) on a cubic path with a constant turn about a fixed axis; q and omega in the tip's frame."""
+    h = from_vector(RATE * t)
+    R = matrix(h)
+    node = np.zeros(22)
+    powers = np.array([1.0, t, t * t, t**3])
+    node[0:3], node[3:7] = powers @ CUBIC, h
+    node[7:10] = R.T @ (np.array([0.0, 1.0, 2 * t, 3 * t * t]) @ CUBIC)
+    node[10:13] = R.T @ RATE
+    return node
+
+
+def filled(stamps, size=10):
+    window = TipWindow(size)
+    window.clear(1)
+    for t in stamps:
+        window.append(t, node_at(t), np.zeros((22, 1)), 0.0)
+    return window
+
+
+@pytest.mark.parametrize("count", [4, 25])
+@pytest.mark.parametrize("back", [0.0, 0.0004, 0.0031, 0.008, -0.002])
+def test_window_is_exact_on_cubic_paths_and_steady_turns(count, back):
+    window = filled(DT * np.arange(count))
+    time = DT * (count - 1) - back
+    tip, node = window.at(time, DT), node_at(time)
+    assert np.allclose(tip.position, node[0:3], atol=1e-12)
+    assert np.allclose(matrix(tip.quaternion), matrix(node[3:7]), atol=1e-9)
+    assert np.allclose(tip.velocity, matrix(node[3:7]) @ node[7:10], atol=1e-9)
+    assert np.allclose(tip.rate, RATE, atol=1e-9)
+
+
+def test_window_knows_its_ends():
+    window = filled(DT * np.arange(25))
+    assert window.at(DT * 25.1, DT) is None
+    assert window.at(DT * 14.9, DT) is None
+    assert window.at(DT * 15.0, DT) is not None
+    assert TipWindow(5).at(0.0, DT) is None
+
+
+def test_window_with_steps_missing():
+    """Steps that failed leave no tip; times after them must not be taken from the wrong pair."""
+    stamps = np.delete(DT * np.arange(12), [3, 4, 8])
+    window = filled(stamps, size=20)
+    for time in (0.004, 0.0115, 0.0195, 0.0255, 0.0325):
+        assert np.allclose(window.at(time, DT).position, node_at(time)[0:3], atol=1e-12)
+
+
+def test_columns_are_interpolated_like_the_tip():
+    """The columns' interpolation is the derivative of the tip's: move all kept tips along a column and compare."""
+    changes = [0.1 * RNG.normal(size=(22, 2)) for _ in range(3)]
+
+    def window(along):
+        made = TipWindow(3)
+        made.clear(2)
+        for i, change in enumerate(changes):
+            made.append(i * DT, node_at(i * DT) + change @ along, change, 0.0)
+        return made
+
+    time = 1.3 * DT
+    columns = window(np.zeros(2)).at(time, DT).columns
+    for c in range(2):
+        along = np.zeros(2)
+        along[c] = STEP
+        plus, minus = window(along).at(time, DT), window(-along).at(time, DT)
+        assert np.allclose(columns[0:3, c], (plus.position - minus.position) / (2 * STEP), atol=1e-6)
+        assert np.allclose(
+            columns[6:9, c], (plus.velocity - minus.velocity) / (2 * STEP), rtol=1e-5, atol=1e-5
+        )
+        turn = to_vector(multiply(plus.quaternion, conjugate(minus.quaternion))) / (2 * STEP)
+        # linear between the ends, while the rotations are of small difference
+        assert np.allclose(columns[3:6, c], turn, atol=2e-2 * np.abs(turn).max())
+
+
+def test_shift_moves_every_kept_tip_along_its_columns():
+    window = TipWindow(4)
+    window.clear(3)
+    for i in range(6):
+        window.append(i * DT, node_at(i * DT), RNG.normal(size=(22, 3)), 0.0)
+    a = 1e-4 * RNG.normal(size=3)
+    before = window.snapshot()
+    old = [window.at(i * DT, DT) for i in range(2, 6)]
+    window.shift(a)
+    for i, was in zip(range(2, 6), old, strict=True):
+        now, d = window.at(i * DT, DT), was.columns @ a
+        assert np.allclose(now.position, was.position + d[0:3], atol=1e-12)
+        assert np.allclose(now.velocity, was.velocity + d[6:9], atol=1e-9)
+        turn = to_vector(multiply(now.quaternion, conjugate(was.quaternion)))
+        assert np.allclose(turn, d[3:6], atol=1e-6 * np.abs(d[3:6]).max() + 1e-9)
+    window.restore(before)
+    assert np.array_equal(window.at(4 * DT, DT).position, old[2].position)
+
+
+def test_window_follows_changes_of_the_columns():
+    window = TipWindow(3)
+    window.clear(2)
+    change = RNG.normal(size=(22, 2))
+    window.append(0.0, node_at(0.0), change, 0.0)
+    columns = window.last.columns.copy()
+    window.widen(1)
+    assert np.allclose(window.last.columns, np.c_[columns, np.zeros(12)])
+    T = RNG.normal(size=(3, 2))
+    window.transform(T)
+    assert np.allclose(window.last.columns, np.c_[columns, np.zeros(12)] @ T)
