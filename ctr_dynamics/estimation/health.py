@@ -31,7 +31,7 @@ class Health:
     """Counters and running figures of the estimator.
 
     ``joints``, ``tracker``, ``load``: input problems by kind. ``nis_sum``, ``nis_dof``, ``nis_count``: over all samples that reached the gate.
-    ``tracker_age_s``: since the newest sample that reached the gate, or the start. 
+    ``tracker_age_s``: since the newest sample that reached the gate, or the start.
     ``recent``: (nis / dof, within the gate) of the last samples.
     """
 

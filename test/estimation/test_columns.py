@@ -7,12 +7,11 @@ from scipy.optimize import curve_fit
 from ctr_dynamics.estimation.columns import Columns
 from ctr_dynamics.estimation.modes import input_vector, modal_basis
 from ctr_dynamics.estimation.uncertainty import bias_sigma, model_uncertainty
-from ctr_dynamics.model.mesh import STAGES
+from ctr_dynamics.model.mesh import STAGES, build_mesh
 from ctr_dynamics.model.model import Model
 from ctr_dynamics.model.simulator import Inputs, Simulator
 from ctr_dynamics.model.statics import Statics
 from ctr_dynamics.model.transfer import coarse_key, transfer
-from ctr_dynamics.model.mesh import build_mesh
 from ctr_dynamics.robot import load_robot
 
 BETA, ALPHA, ZERO = np.array([-0.2521, -0.1977]), np.array([1.5708, 1.5708]), np.zeros(2)
@@ -116,7 +115,7 @@ def simulated(model, parameters, turn, steps):
 def test_columns_follow_finite_differences_of_the_simulation(robot, nodes):
     model = Model(robot, nodes=nodes)
     unc = model_uncertainty(model)
-    start, state, records = simulated(model, model.parameters, (0.0, 0.0), 20)
+    start, _state, records = simulated(model, model.parameters, (0.0, 0.0), 20)
     columns = Columns(model, unc, rank=24)
     par = model.parameters.copy()
     par[model.layout["force"]] = start.inputs.force
@@ -124,7 +123,15 @@ def test_columns_follow_finite_differences_of_the_simulation(robot, nodes):
     for record in records:
         assert columns.propagate(record, model.parameters)
     weight = columns.weights()
-    for name in ("youngs_modulus.tube1", "precurvature.tube2", "payload_mass.tube1", "density", "base_viscous", "gravity_direction.1", "encoder_offset.tube2"):
+    for name in (
+        "youngs_modulus.tube1",
+        "precurvature.tube2",
+        "payload_mass.tube1",
+        "density",
+        "base_viscous",
+        "gravity_direction.1",
+        "encoder_offset.tube2",
+    ):
         i = unc.names.index(name)
         size = unc.sigma[i]
         ends = []
@@ -233,7 +240,7 @@ def test_modes_at_rest_are_zero_also_where_actuators_have_moved(model):
     basis = modal_basis(model, equilibrium, par, BETA)
     there = input_vector(ALPHA, BETA, np.zeros(3), np.zeros(3))
     assert np.abs(basis.measure(equilibrium.fields, there).amplitude).max() < 1e-9
-    alpha = ALPHA + [0.004, -0.002]
+    alpha = [*ALPHA, 0.004, -0.002]
     near = Statics(model, 1e-10).solve(BETA, alpha, np.zeros(3), np.zeros(3))
     moved = basis.measure(near.fields, input_vector(alpha, BETA, np.zeros(3), np.zeros(3)))
     still = basis.measure(near.fields, there)
