@@ -77,7 +77,7 @@ class Health:
         self._within = sum(inside for _, inside in self.recent)
         if accepted:
             self.accepted += 1
-        else:
+        elif self.fusing:
             self.rejected += 1
 
     @property

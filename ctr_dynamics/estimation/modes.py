@@ -7,6 +7,7 @@ For an eigenvalue lambda of the step, mu = (1 - 1/lambda) / h.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -24,9 +25,10 @@ from .outputs import Modes
 from .rotations import matrix
 
 Floats = NDArray[np.float64]
-SHIFT_STEP = 0.01  # s: the shift 100 / s lies among the slow bending modes
+SHIFT_STEP = 0.02  # s: the shift 50 / s lies among the slow bending modes
 BLOCK = 8
-ROUNDS = 2
+ROUNDS = 4
+_END = object()
 MAX_DAMPING = 0.7  # more is no vibration
 
 
@@ -95,12 +97,21 @@ def modal_basis(
     par: Floats,
     beta: Floats,
     count: int = 4,
-    follow: Floats | None = None,
 ) -> ModalBasis | None:
     """The ``count`` slowest modes about ``equilibrium`` with the parameter block ``par`` (NP,), actuators and load included; None if there are none.
 
     Friction enters as its slope at rest.
     """
+    found = None
+    for part in modal_parts(model, equilibrium, par, beta, count):
+        found = part
+    return found
+
+
+def modal_parts(
+    model: Model, equilibrium: Equilibrium, par: Floats, beta: Floats, count: int = 4
+) -> Iterator[ModalBasis | None]:
+    """The work of :func:`modal_basis` in parts of about equal cost, each ended by a None; the last item is the result."""
     mesh = equilibrium.mesh
     n, m = model.n, 5 + model.n
     lanes = lanes_for(1 + m + BLOCK)
@@ -122,8 +133,10 @@ def modal_basis(
         )  # fmt: skip
         return dfields / scale if ok else None
 
+    follow = equilibrium_slope(model, equilibrium, par)
     if follow is None:
-        follow = equilibrium_slope(model, equilibrium, par)
+        return
+    yield None
     # start: responses to a force and a moment on the tip and a turn of each actuator
     layout = model.layout
     dpar = np.zeros((layout.size, BLOCK))
@@ -136,26 +149,33 @@ def modal_basis(
         )
     start = apply(np.zeros((size, BLOCK)), dpar)
     if start is None:
-        return None
+        return
+    yield None
     dpar[:] = 0.0
     basis: list[Floats] = []
+    whole: list[Floats] = []
     images: list[Floats] = []
     block = start
     tip_rows = slice(main - (7 + 2 * n), main)
     for _ in range(ROUNDS):
-        weighted = weights[:, None] * block
+        # Gram-Schmidt in the energy norm on whole vectors: the points at section ends have no energy of their own, but their
+        # history carries the bodies' inertia
+        block = block / np.maximum(np.linalg.norm(weights[:, None] * block, axis=0), 1e-300)
         for _ in range(2):
-            for q in basis:
-                weighted = weighted - q @ (q.T @ weighted)
-        q, triangle = np.linalg.qr(weighted)
-        keep = np.abs(np.diag(triangle)) > 1e-9 * np.abs(np.diag(triangle)).max()
-        q = np.where(keep, q, 0.0)
-        image = apply(np.where(weights[:, None] > 0, q / np.maximum(weights, 1e-300)[:, None], 0.0), dpar)
+            for q, v in zip(basis, whole, strict=True):
+                block = block - v @ (q.T @ (weights[:, None] * block))
+        left_vectors, sizes, turn = np.linalg.svd(weights[:, None] * block, full_matrices=False)
+        keep = sizes > 1e-9 * sizes.max()
+        q = np.where(keep, left_vectors, 0.0)
+        v = np.where(keep, block @ turn.T / np.where(keep, sizes, 1.0), 0.0)
+        image = apply(v, dpar)
         if image is None:
-            return None
+            return
         basis.append(q)
+        whole.append(v)
         images.append(image)
         block = image
+        yield None
     Q, image = np.concatenate(basis, axis=1), np.concatenate(images, axis=1)
     reduced = Q.T @ (weights[:, None] * image)
     values, right = np.linalg.eig(reduced)
@@ -169,8 +189,8 @@ def modal_basis(
         & (mu.real < 0.05 * np.abs(mu))
     )
     order = [int(i) for i in np.flatnonzero(wanted)[np.argsort(np.abs(mu[wanted]))]][:count]
-    if not order or follow is None:
-        return None
+    if not order:
+        return
     R = matrix(equilibrium.tip_quaternion)
     readout, direction = [], []
     for i in order:
@@ -184,7 +204,7 @@ def modal_basis(
         readout.append((left[i] @ Q.T) * weights * (axis @ displacement))
         direction.append(axis)
     chosen = mu[order].astype(complex)
-    return ModalBasis(
+    yield ModalBasis(
         equilibrium.key,
         np.abs(chosen.imag) / (2 * np.pi),
         -chosen.real / np.abs(chosen),
@@ -208,7 +228,7 @@ class ModeTracker:
         """Forget the modes."""
         self._basis: ModalBasis | None = None
         self._age = self.every
-        self._pending: tuple[Equilibrium, Floats, Floats, Floats | None] | None = None
+        self._pending: Iterator[ModalBasis | None] | None = None
 
     def measure(self, state: State, parameters: Floats) -> Modes:
         """Modes in ``state`` with the parameter block (NP,); to be called once a step."""
@@ -216,13 +236,11 @@ class ModeTracker:
         if self._basis is not None and self._basis.key != state.key:
             self.clear()
         if self._pending is not None:
-            equilibrium, par, beta, follow = self._pending
-            if follow is None:
-                follow = equilibrium_slope(self.model, equilibrium, par)
-                self._pending = None if follow is None else (equilibrium, par, beta, follow)
-            else:
-                self._basis = modal_basis(self.model, equilibrium, par, beta, follow=follow)
+            part = next(self._pending, _END)
+            if part is _END:
                 self._pending = None
+            elif isinstance(part, ModalBasis):
+                self._basis, self._pending = part, None
         elif self._age > self.every:
             self._age = 0
             self._begin(state, parameters)
@@ -241,4 +259,4 @@ class ModeTracker:
         par = parameters.copy()
         par[layout["alpha"]], par[layout["beta"]], par[layout["alpha_rate"]] = now.alpha, now.beta, 0.0
         par[layout["force"]], par[layout["torque"]] = now.force, now.torque
-        self._pending = (equilibrium, par, now.beta, None)
+        self._pending = modal_parts(self.model, equilibrium, par, now.beta.copy())

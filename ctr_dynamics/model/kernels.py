@@ -39,8 +39,8 @@ from numba import njit
 P0, H0, Q0, O0, N0, M0, Z0 = 0, 3, 7, 10, 13, 16, 18
 RESIDUAL_ROWS_COMMON = 5  # n (3) and m_xy (2); one m_z per tube follows
 
-# Reassociation and fused operations, but no licence to assume that NaN and infinity do not occur: the solver looks for them.
-FAST = {"reassoc", "nsz", "arcp", "contract", "afn"}
+# No fast-math flags: which copy of a kernel runs depends on what was compiled before, and copies would round differently. Plain IEEE arithmetic
+# makes every result the same, first run or cached, and NaN stays visible to the solver.
 
 _TWO_OVER_PI = 2.0 / math.pi
 _PIO2_HI = 1.57079632679489655800e00
@@ -90,7 +90,7 @@ def workspace_rows(n):
     return 4 * state_rows(n) + 2 * field_rows(n) + (13 + 7 * n) + parameter_rows(n) + 4 * n
 
 
-@njit(cache=True, inline="always", fastmath=FAST, error_model="numpy")
+@njit(cache=True, inline="always", error_model="numpy")
 def _sincos(x):
     """(sin x, cos x) by polynomials, without library calls, so that lane loops vectorise; error below 1e-12 for abs(x) < 1e4."""
     k = math.floor(x * _TWO_OVER_PI + 0.5)
@@ -143,7 +143,7 @@ def _sincos(x):
     return sin_x, cos_x
 
 
-@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy")
 def _curvature(tubes, lanes, W, present, ust, u0, c0):
     """Strains from moments: (16), (17) with the damping history of every tube taken exactly (docs/model.md).
 
@@ -212,7 +212,7 @@ def _curvature(tubes, lanes, W, present, ust, u0, c0):
         W[TMP + 4 * L + j] = c0 * uy + W[HI + 7 * L + j]
 
 
-@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy")
 def _body_forces(tubes, lanes, W):
     """Gravity in the frame of tube 1, R_1^T g, into ``TMP`` rows 10-12 (non-unit quaternion, normalised when read)."""
     n = len(tubes)
@@ -239,7 +239,7 @@ def _body_forces(tubes, lanes, W):
         )
 
 
-@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy")
 def _derivative(tubes, lanes, W, present, ust, u0, c0):
     """Arc-length derivative of the state, (13), and the fields at this point (``OU``)."""
     n = len(tubes)
@@ -350,7 +350,7 @@ def _derivative(tubes, lanes, W, present, ust, u0, c0):
         W[OU + 8 * L + j] = uz
 
 
-@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy")
 def _bending_moments(tubes, lanes, W, present, dst):
     """Internal bending moment of each tube, (14), in the frame of tube 1, into rows ``dst``; zero for tubes that have ended."""
     n = len(tubes)
@@ -379,7 +379,7 @@ def _bending_moments(tubes, lanes, W, present, dst):
                 )
 
 
-@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy")
 def _tube_friction(tubes, lanes, W, present):
     """Friction between neighbouring tubes at a transition, (22), (23): proportional to the jump of the inner tube's moment."""
     n = len(tubes)
@@ -404,7 +404,7 @@ def _tube_friction(tubes, lanes, W, present):
             W[MZ + L + j] += tau
 
 
-@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy")
 def _body(tubes, lanes, W, i, c0):
     """Inertial wrench and weight of the rigid body at the end of tube ``i``, (20), (21), in the frame of tube 1.
 
@@ -448,7 +448,7 @@ def _body(tubes, lanes, W, i, c0):
             W[TMP + 5 * L + j] = hz * tz + (hy - hx) * ox * oy
 
 
-@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy")
 def _below_base(tubes, lanes, W, c0, cells, ust_base, x, histb, outb):
     """Torsion of the straight lengths behind the base plate, (18), and the coupling (19) into the state at s = 0-."""
     n = len(tubes)
@@ -539,7 +539,7 @@ def _below_base(tubes, lanes, W, c0, cells, ust_base, x, histb, outb):
         W[Y + (M0 + 1) * L + j] = x[(n + 4) * L + j]
 
 
-@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy")
 def _base_plate(tubes, lanes, W, ust0):
     """Near side of s = 0: moments of precurved lengths held straight into ``MA``, and the friction of the plate on the outermost tube, (24)."""
     n = len(tubes)
@@ -567,7 +567,7 @@ def _base_plate(tubes, lanes, W, ust0):
         )
 
 
-@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy")
 def sweep(
     tubes,
     lanes,

@@ -16,7 +16,7 @@ from ctr_dynamics.model.step import history
 THETA = 0.55  # of the one-stage tangent: nearly the trapezoidal rule, with a little damping of what the step does not resolve
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "contract"})
+@njit(cache=True, nogil=True, error_model="numpy")
 def _combine(lanes, values, rows, m, columns, scale, perturb, dx, target):
     """d(values)/d(column) with the boundary values following: target (rows, columns) from perturbed lanes of ``values`` (rows, L)."""
     # unsigned indices: a signed one may count from the end of the array, and LLVM does not vectorise over that choice

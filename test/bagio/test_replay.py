@@ -173,7 +173,7 @@ def test_output_bag(bags, stand_in, tmp_path):
     assert metadata["version"] == __version__
     assert json.loads(metadata["robot"])["sha256"] == load_robot("till2020_tissue").sha256
     assert json.loads(metadata["inputs"])[0]["sha256"] == sha256_of(bags / "clean_release.mcap")
-    assert json.loads(metadata["parameters"])["filter.rank"] == 16
+    assert json.loads(metadata["parameters"])["filter.rank"] == Settings()["filter.rank"]
     stamps = [m.log_ns for m in out.messages({topics.VALID})]
     assert stamps == [T0 + k * 3_000_000 for k in range(1997)]
     for message in out.messages():

@@ -216,14 +216,13 @@ def test_modes_equal_a_simulated_small_vibration(model):
     size = np.abs(path[after]).max()
     start = (size, 3.0, peak, 0.0, 0.3 * size, 3.0, 1.6 * peak, 0.0)
     found = np.reshape(curve_fit(waves, t[after], path[after], p0=start, maxfev=20000)[0], (2, 4))
-    found = found[np.argsort(found[:, 2])]
     assert np.std(path[after] - waves(t[after], *found.ravel())) < 0.02 * np.std(path[after])
-    for mode in range(2):
-        _, decay, frequency, _ = found[mode]
-        assert np.hypot(decay / (2 * np.pi), frequency) == pytest.approx(
-            basis.frequency_hz[mode] / np.sqrt(1 - basis.damping[mode] ** 2), rel=0.02
+    for _, decay, frequency, _ in found:
+        mode = int(np.argmin(np.abs(basis.frequency_hz - frequency)))
+        assert basis.frequency_hz[mode] == pytest.approx(frequency, rel=0.01)
+        assert basis.damping[mode] == pytest.approx(
+            decay / np.hypot(decay, 2 * np.pi * frequency), rel=0.1, abs=5e-4
         )
-        assert basis.damping[mode] == pytest.approx(decay / np.hypot(decay, 2 * np.pi * frequency), rel=0.15)
 
     amplitude, rate = (np.array([getattr(m, name) for m in modes]) for name in ("amplitude", "rate"))
     along = amplitude @ (basis.direction @ slowest)
@@ -240,7 +239,7 @@ def test_modes_at_rest_are_zero_also_where_actuators_have_moved(model):
     basis = modal_basis(model, equilibrium, par, BETA)
     there = input_vector(ALPHA, BETA, np.zeros(3), np.zeros(3))
     assert np.abs(basis.measure(equilibrium.fields, there).amplitude).max() < 1e-9
-    alpha = [*ALPHA, 0.004, -0.002]
+    alpha = ALPHA + np.array([0.004, -0.002])
     near = Statics(model, 1e-10).solve(BETA, alpha, np.zeros(3), np.zeros(3))
     moved = basis.measure(near.fields, input_vector(alpha, BETA, np.zeros(3), np.zeros(3)))
     still = basis.measure(near.fields, there)

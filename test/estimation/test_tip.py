@@ -76,7 +76,7 @@ def test_tip_rows_are_the_kinematics_and_their_derivative():
     R = Rotation.from_quat(node[[4, 5, 6, 3]]).as_matrix()
     assert np.allclose(mean[0:3], node[0:3])
     assert np.allclose(matrix(mean[3:7]), R)
-    assert np.allclose(mean[7:10], R @ ([*node[7:10], 0.0, 0.0, 0.05]))
+    assert np.allclose(mean[7:10], R @ (node[7:10] + np.array([0.0, 0.0, 0.05])))
     assert np.allclose(mean[10:13], R @ node[10:13])
     for c in range(COLUMNS):
         plus, minus = rows(node + STEP * change[:, c])[0], rows(node - STEP * change[:, c])[0]

@@ -1,0 +1,202 @@
+"""The release test: a weight of 60 g hangs beyond the tip and is cut at 1 s while the tubes stand still. Costs, and errors in time and space."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ctr_dynamics.bench.sweeps import sweep_cost
+from ctr_dynamics.model.model import Model
+from ctr_dynamics.model.scheme import make_scheme
+from ctr_dynamics.model.simulator import Inputs, Simulator
+from ctr_dynamics.robot import Robot, load_robot
+from ctr_dynamics.simulation import load_scenario
+from ctr_dynamics.simulation import simulate as run_scenario
+
+Floats = NDArray[np.float64]
+DT = 0.003
+SCHEMES = ("backward_euler", "bdf2", "bdf_alpha", "trapezoid", "sdirk2", "sdirk3")
+
+
+@cache
+def release_robot() -> Robot:
+    """The robot of the test."""
+    return load_robot("till2020_tissue")
+
+
+@dataclass(frozen=True)
+class Release:
+    """Robot and load of the test: the weight's wrench (6,), and how much earlier than at 1 s it is cut (s)."""
+
+    wrench: Floats
+    early: float
+
+    @classmethod
+    def make(cls, cut: float) -> Release:
+        """The shipped scenario's weight on `till2020_tissue`, cut at `cut` s within 10 ms."""
+        scenario = load_scenario("release")
+        short = scenario.model_copy(update={"duration_s": 0.002})
+        return cls(run_scenario(short, release_robot()).wrench(0.0), 1.0 - cut)
+
+    def at(self, t: float) -> Inputs:
+        """Inputs at `t` s."""
+        rest = release_robot().rest
+        share = min(max((1.01 - self.early - t) / 0.01, 0.0), 1.0)
+        still = np.zeros(2)
+        wrench = share * self.wrench
+        return Inputs(
+            np.array(rest.alpha.value), still, np.array(rest.beta.value), still, wrench[:3], wrench[3:]
+        )
+
+
+@dataclass(frozen=True)
+class Path:
+    """A simulated release: tips (steps + 1, 3) m, wall time in s, work of all steps; `failure` is empty when it went well."""
+
+    dt: float
+    tips: Floats
+    wall: float
+    solves: int
+    sweeps: int
+    jacobians: int
+    failure: str = ""
+
+    @property
+    def steps(self) -> int:
+        """Steps taken."""
+        return len(self.tips) - 1
+
+    @property
+    def realtime(self) -> float:
+        """Time simulated over time spent."""
+        return self.steps * self.dt / self.wall
+
+
+def run(test: Release, scheme: str, dt: float, nodes: int, duration: float, tolerance: float = 1e-7) -> Path:
+    """Simulate the release at a fixed step."""
+    simulator = Simulator(Model(release_robot(), nodes=nodes), make_scheme(scheme, dt), tolerance=tolerance)
+    state = simulator.rest(test.at(0.0))
+    tips = [state.nodes[-1, :3].copy()]
+    sweeps = jacobians = 0
+    failure = ""
+    steps = round(duration / dt)
+    begin = time.perf_counter()
+    for k in range(steps):
+        result = simulator.step(state, k * dt, test.at)
+        if not result.ok:
+            failure = f"step at {k * dt:.4f} s: {result.reason}"
+            break
+        sweeps += result.sweeps
+        jacobians += result.jacobians
+        tips.append(state.nodes[-1, :3])
+    wall = time.perf_counter() - begin
+    return Path(
+        dt, np.array(tips), wall, simulator.scheme.stages * (len(tips) - 1), sweeps, jacobians, failure
+    )
+
+
+def rms_difference(path: Path, reference: Path, since: float) -> float | None:
+    """3-D rms (m) between two runs from `since` s on, at the coarser steps; None if the run failed."""
+    if path.failure:
+        return None
+    ratio = round(path.dt / reference.dt)
+    other = reference.tips[::ratio]
+    count = min(len(path.tips), len(other))
+    first = round(since / path.dt)
+    return float(np.sqrt(np.mean(np.sum((path.tips[first:count] - other[first:count]) ** 2, axis=1))))
+
+
+def work(
+    test: Release, nodes_list: tuple[int, ...], duration: float, tolerance: float
+) -> list[dict[str, Any]]:
+    """Sweeps a solve and a step, and the cost of a step in plain sweeps of the same nodes, at the default scheme."""
+    rows = []
+    for nodes in nodes_list:
+        run(test, "sdirk3", DT, nodes, 0.03, tolerance)
+        path = run(test, "sdirk3", DT, nodes, duration, tolerance)
+        plain = sweep_cost(Model(release_robot(), nodes=nodes), (), max(3, 4000 // nodes))
+        step = path.wall / path.steps
+        rows.append(
+            {
+                "nodes": nodes,
+                "tolerance": tolerance,
+                "steps": path.steps,
+                "sweeps_per_solve": path.sweeps / path.solves,
+                "sweeps_per_step": path.sweeps / path.steps,
+                "jacobians_per_step": path.jacobians / path.steps,
+                "step_us": 1e6 * step,
+                "plain_sweep_us": 1e6 * plain,
+                "step_ratio_to_plain_sweep": step / plain,
+                "realtime_ratio": path.realtime,
+                "failure": path.failure,
+            }
+        )
+    return rows
+
+
+def time_error(test: Release, nodes: int, duration: float, fine_dt: float, since: float) -> dict[str, Any]:
+    """Error of every scheme at 3 ms against `sdirk3` at `fine_dt` on the same nodes."""
+    reference = run(test, "sdirk3", fine_dt, nodes, duration)
+    rows = []
+    for scheme in SCHEMES:
+        path = run(test, scheme, DT, nodes, duration)
+        rows.append(
+            {
+                "scheme": scheme,
+                "error_m": rms_difference(path, reference, since),
+                "realtime_ratio": path.realtime,
+                "failure": path.failure,
+            }
+        )
+    return {"nodes": nodes, "reference": {"scheme": "sdirk3", "dt_s": fine_dt}, "schemes": rows}
+
+
+def grid(
+    test: Release, dts: tuple[float, ...], nodes_list: tuple[int, ...], duration: float
+) -> list[dict[str, Any]]:
+    """The paper's Figure 13: real-time ratio over time step and node spacing, at the default scheme and tolerance of the estimator."""
+    reach = tip_length()
+    rows = []
+    for nodes in nodes_list:
+        for dt in dts:
+            path = run(test, "sdirk3", dt, nodes, duration, 1e-4)
+            rows.append(
+                {
+                    "nodes": nodes,
+                    "spacing_m": reach / (nodes - 1),
+                    "dt_s": dt,
+                    "realtime_ratio": path.realtime,
+                    "failure": path.failure,
+                }
+            )
+    return rows
+
+
+def space_error(test: Release, nodes_list: tuple[int, ...], fine: int, duration: float) -> dict[str, Any]:
+    """The paper's Figure 14: error over node spacing at 3 ms against `fine` nodes (fourth-order Runge-Kutta throughout)."""
+    reach = tip_length()
+    reference = run(test, "sdirk3", DT, fine, duration)
+    rows = []
+    for nodes in nodes_list:
+        path = run(test, "sdirk3", DT, nodes, duration)
+        rows.append(
+            {
+                "nodes": nodes,
+                "spacing_m": reach / (nodes - 1),
+                "error_m": rms_difference(path, reference, 0.0),
+                "realtime_ratio": path.realtime,
+                "failure": path.failure,
+            }
+        )
+    return {"reference_nodes": fine, "reference_spacing_m": reach / (fine - 1), "rows": rows}
+
+
+def tip_length() -> float:
+    """Length of the robot beyond the plate in m."""
+    robot = release_robot()
+    return float(robot.lengths[0] + robot.rest.beta.value[0])

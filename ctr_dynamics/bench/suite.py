@@ -1,0 +1,101 @@
+"""The whole set of measurements, in a short and a long form."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from ctr_dynamics.bagio.replay import plain
+from ctr_dynamics.bench.fused import fused_replay
+from ctr_dynamics.bench.machine import machine
+from ctr_dynamics.bench.release import Release, grid, space_error, time_error, work
+from ctr_dynamics.bench.sweeps import sweeps
+from ctr_dynamics.parameters import Settings
+
+
+@dataclass(frozen=True)
+class Size:
+    """How much is measured; times in s, `cut` when the weight is cut."""
+
+    cut: float
+    work_s: float
+    work_nodes: tuple[int, ...]
+    replay_nodes: tuple[int | None, ...]
+    replay_s: float | None
+    time_nodes: int
+    time_s: float
+    fine_dt: float
+    since: float
+    grid_s: float
+    grid_dts: tuple[float, ...]
+    grid_nodes: tuple[int, ...]
+    space_s: float
+    space_nodes: tuple[int, ...]
+    fine_nodes: int
+
+
+LONG = Size(
+    cut=1.0,
+    work_s=2.0,
+    work_nodes=(24, 100, 400),
+    replay_nodes=(None, 100),
+    replay_s=None,
+    time_nodes=100,
+    time_s=6.0,
+    fine_dt=0.00025,
+    since=1.0,
+    grid_s=2.0,
+    grid_dts=(0.001, 0.002, 0.003, 0.005, 0.01),
+    grid_nodes=(12, 24, 50, 100, 200, 400),
+    space_s=3.0,
+    space_nodes=(10, 14, 20, 24, 32, 50, 75, 100, 150, 200),
+    fine_nodes=400,
+)
+QUICK = Size(
+    cut=0.06,
+    work_s=0.3,
+    work_nodes=(24, 100),
+    replay_nodes=(None,),
+    replay_s=0.6,
+    time_nodes=24,
+    time_s=0.3,
+    fine_dt=0.001,
+    since=0.06,
+    grid_s=0.15,
+    grid_dts=(0.003, 0.005),
+    grid_nodes=(24, 50),
+    space_s=0.15,
+    space_nodes=(12, 24, 48),
+    fine_nodes=100,
+)
+
+
+def measure(bag: Path, quick: bool, say: Callable[[str], None]) -> dict[str, Any]:
+    """All figures, as plain data for JSON; numbers that are not finite become null.
+
+    Args:
+        bag: bag for the replay, of a robot `till2020_tissue`.
+        quick: few and short measurements.
+        say: called with the name of each part before it begins.
+    """
+    size = QUICK if quick else LONG
+    result: dict[str, Any] = {"quick": quick, "machine": machine()}
+    say("cost of a sweep")
+    result["sweeps"] = sweeps(quick)
+    test = Release.make(size.cut)
+    say("release test: sweeps a solve, cost of a step")
+    tolerance = float(Settings()["model.tolerance"])
+    result["simulate"] = work(test, size.work_nodes, size.work_s, tolerance)
+    say("replay with fusion")
+    result["replay"] = [
+        fused_replay(bag, "till2020_tissue", nodes, size.replay_s) for nodes in size.replay_nodes
+    ]
+    say("release test: error of the time schemes")
+    result["time_error"] = time_error(test, size.time_nodes, size.time_s, size.fine_dt, size.since)
+    say("real-time ratio over time step and node spacing")
+    result["figure_13"] = grid(test, size.grid_dts, size.grid_nodes, size.grid_s)
+    say("error over node spacing")
+    result["figure_14"] = space_error(test, size.space_nodes, size.fine_nodes, size.space_s)
+    return dict(plain(result))
