@@ -101,8 +101,8 @@ def run(test: Release, scheme: str, dt: float, nodes: int, duration: float, tole
 
 
 def rms_difference(path: Path, reference: Path, since: float) -> float | None:
-    """3-D rms (m) between two runs from `since` s on, at the coarser steps; None if the run failed."""
-    if path.failure:
+    """3-D rms (m) between two runs from `since` s on, at the coarser steps; None if one of them failed."""
+    if path.failure or reference.failure:
         return None
     ratio = round(path.dt / reference.dt)
     other = reference.tips[::ratio]
@@ -139,21 +139,24 @@ def work(
     return rows
 
 
-def time_error(test: Release, nodes: int, duration: float, fine_dt: float, since: float) -> dict[str, Any]:
-    """Error of every scheme at 3 ms against `sdirk3` at `fine_dt` on the same nodes."""
-    reference = run(test, "sdirk3", fine_dt, nodes, duration)
+def time_error(
+    test: Release, nodes: int, duration: float, reference: tuple[str, float], since: float
+) -> dict[str, Any]:
+    """Error of every scheme at 3 ms against the scheme and step (s) `reference` on the same nodes."""
+    scheme, fine_dt = reference
+    fine = run(test, scheme, fine_dt, nodes, duration)
     rows = []
-    for scheme in SCHEMES:
-        path = run(test, scheme, DT, nodes, duration)
+    for name in SCHEMES:
+        path = run(test, name, DT, nodes, duration)
         rows.append(
             {
-                "scheme": scheme,
-                "error_m": rms_difference(path, reference, since),
+                "scheme": name,
+                "error_m": rms_difference(path, fine, since),
                 "realtime_ratio": path.realtime,
-                "failure": path.failure,
+                "failure": path.failure or fine.failure,
             }
         )
-    return {"nodes": nodes, "reference": {"scheme": "sdirk3", "dt_s": fine_dt}, "schemes": rows}
+    return {"nodes": nodes, "reference": {"scheme": scheme, "dt_s": fine_dt}, "schemes": rows}
 
 
 def grid(
@@ -190,7 +193,7 @@ def space_error(test: Release, nodes_list: tuple[int, ...], fine: int, duration:
                 "spacing_m": reach / (nodes - 1),
                 "error_m": rms_difference(path, reference, 0.0),
                 "realtime_ratio": path.realtime,
-                "failure": path.failure,
+                "failure": path.failure or reference.failure,
             }
         )
     return {"reference_nodes": fine, "reference_spacing_m": reach / (fine - 1), "rows": rows}

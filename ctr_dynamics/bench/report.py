@@ -51,7 +51,7 @@ def text(result: Result) -> str:
     error = result["time_error"]
     lines += [
         "",
-        f"error at 3 ms against sdirk3 at {1e3 * error['reference']['dt_s']:g} ms, {error['nodes']} nodes (tip, rms, mm)",
+        f"error at 3 ms against {error['reference']['scheme']} at {1e3 * error['reference']['dt_s']:g} ms, {error['nodes']} nodes (tip, rms, mm)",
     ]
     lines += [
         f"{r['scheme']:15s}  {_number(None if r['error_m'] is None else 1e3 * r['error_m'], '.4f'):>8s}"
