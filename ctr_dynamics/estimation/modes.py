@@ -8,19 +8,21 @@ For an eigenvalue lambda of the step, mu = (1 - 1/lambda) / h.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ctr_dynamics.model.mesh import Key
 from ctr_dynamics.model.model import Model
 from ctr_dynamics.model.newton import lanes_for
 from ctr_dynamics.model.simulator import State
 from ctr_dynamics.model.statics import Equilibrium, Statics
 from ctr_dynamics.model.tangent import linearise
+from ctr_dynamics.model.transfer import Transfer, transfer
 
-from .columns import field_weights
+from .columns import COLUMN_NODES, field_weights
 from .outputs import Modes
 from .rotations import matrix
 
@@ -218,10 +220,17 @@ def modal_parts(
 
 
 class ModeTracker:
-    """The modes of a moving robot: refreshed now and then, one part of the work a step, and read in every step."""
+    """The modes of a moving robot: refreshed now and then, one part of the work a step, and read in every step.
+
+    They are found on at most ``COLUMN_NODES`` nodes, like the covariance; the equilibrium that amplitudes count from is the model's own.
+    """
 
     def __init__(self, model: Model, every: int) -> None:
         self.model, self.every = model, every
+        self.coarse = (
+            model if model.nodes <= COLUMN_NODES else Model(model.robot, COLUMN_NODES, model.base_cells)
+        )
+        self._transfers: dict[tuple[Key, Key], Transfer] = {}
         self.clear()
 
     def clear(self) -> None:
@@ -229,25 +238,33 @@ class ModeTracker:
         self._basis: ModalBasis | None = None
         self._age = self.every
         self._pending: Iterator[ModalBasis | None] | None = None
+        self._own: Equilibrium | None = None
+        self._transfer: Transfer | None = None
 
     def measure(self, state: State, parameters: Floats) -> Modes:
         """Modes in ``state`` with the parameter block (NP,); to be called once a step."""
         self._age += 1
-        if self._basis is not None and self._basis.key != state.key:
+        if self._own is not None and self._own.key != state.key:
             self.clear()
         if self._pending is not None:
             part = next(self._pending, _END)
             if part is _END:
                 self._pending = None
             elif isinstance(part, ModalBasis):
-                self._basis, self._pending = part, None
+                assert self._own is not None
+                self._basis, self._pending = replace(part, rest=self._restricted(self._own.fields)), None
         elif self._age > self.every:
             self._age = 0
             self._begin(state, parameters)
         now = state.inputs
         if self._basis is None:
             return Modes.none()
-        return self._basis.measure(state.fields, input_vector(now.alpha, now.beta, now.force, now.torque))
+        fields = self._restricted(state.fields)
+        return self._basis.measure(fields, input_vector(now.alpha, now.beta, now.force, now.torque))
+
+    def _restricted(self, fields: Floats) -> Floats:
+        """The model's fields on the sections of the modes."""
+        return fields if self._transfer is None else self._transfer.restrict @ fields
 
     def _begin(self, state: State, parameters: Floats) -> None:
         now, layout = state.inputs, self.model.layout
@@ -259,4 +276,18 @@ class ModeTracker:
         par = parameters.copy()
         par[layout["alpha"]], par[layout["beta"]], par[layout["alpha_rate"]] = now.alpha, now.beta, 0.0
         par[layout["force"]], par[layout["torque"]] = now.force, now.torque
-        self._pending = modal_parts(self.model, equilibrium, par, now.beta.copy())
+        on = equilibrium
+        if self.coarse is not self.model:
+            on = Statics(self.coarse, 1e-6).solve(
+                now.beta, now.alpha, now.force, now.torque, guess=equilibrium.x, parameters=parameters
+            )
+            if not on.converged:
+                return
+            pair = (equilibrium.key, on.key)
+            if pair not in self._transfers:
+                self._transfers[pair] = transfer(self.model.n, equilibrium.mesh, on.mesh)
+            if self._basis is not None and self._basis.key != on.key:
+                self._basis = None  # of other sections than the new transfer
+            self._transfer = self._transfers[pair]
+        self._own = equilibrium
+        self._pending = modal_parts(self.coarse, on, par, now.beta.copy())
