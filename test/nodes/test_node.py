@@ -23,13 +23,25 @@ pytestmark = pytest.mark.ros
 def test_topics_services_and_qos_are_the_contract(start):
     with start() as live:
         node = live.listener.node
+
+        def known(ends):
+            """Discovery tells endpoints before the name of their node."""
+            return len(ends) == 1 and "UNKNOWN" not in ends[0].node_name
+
         for topic in topics.OUTPUTS:
+            live.wait(
+                lambda name=topic.name: known(node.get_publishers_info_by_topic(name)),
+                f"the publisher of {topic.name}",
+            )
             [end] = node.get_publishers_info_by_topic(topic.name)
             assert (end.node_namespace, end.node_name) == ("/ctr", "estimator")
             assert end.topic_type == topic.ros_type
             assert end.qos_profile.reliability == ReliabilityPolicy.RELIABLE
         for topic in topics.INPUTS:
-            live.wait(lambda name=topic.name: node.count_subscribers(name), f"a subscription to {topic.name}")
+            live.wait(
+                lambda name=topic.name: known(node.get_subscriptions_info_by_topic(name)),
+                f"a subscription to {topic.name}",
+            )
             [end] = node.get_subscriptions_info_by_topic(topic.name)
             assert (end.node_namespace, end.node_name) == ("/ctr", "estimator")
             assert end.topic_type == topic.ros_type
