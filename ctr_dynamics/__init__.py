@@ -5,7 +5,7 @@ import os
 from pathlib import Path
 
 # The filter's matrices are small: a second BLAS thread gains nothing and, on a busy machine, waits for its time slice for up to 100 ms.
-for _name in ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
 
 

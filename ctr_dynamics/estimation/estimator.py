@@ -113,6 +113,7 @@ class Estimator:
         ]
         self._nominal_offset = robot.encoders.offset.value
         self.step_times_s = array("d")
+        self._reported: deque[Innovation] = deque(maxlen=200)
         self._clear()
         self.health = Health()
         self.health.fusing = self._fusing = bool(settings["filter.enabled"])
@@ -675,12 +676,6 @@ class Estimator:
                     innovation.accepted and not innovation.reason,
                 )
             self._innovations.append(innovation)
-
-    @property
-    def _reported(self) -> deque[Innovation]:
-        if not hasattr(self, "_reported_store"):
-            self._reported_store: deque[Innovation] = deque(maxlen=200)
-        return self._reported_store
 
     # -- outputs --
 

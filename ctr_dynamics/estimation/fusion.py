@@ -43,7 +43,6 @@ class FusionOptions:
     force_time: float = 0.3
     window: float = 0.2
     reduce_every: int = 8
-    retain: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -176,7 +175,7 @@ class Fusion:
         sigma = np.where(self.uncertainty.sigma > 0, self.uncertainty.sigma, self.options.force_sigma)
         V = c.fields
         gram = V.T @ (c.weights()[:, None] * V)
-        unit = max(float(np.trace(gram)) / r, 1e-12) * self.options.retain
+        unit = max(float(np.trace(gram)) / r, 1e-12)
         scaled = c.theta / sigma[:, None]
         gram = gram + unit * 0.01 * (scaled.T @ scaled)
         pi_aa = 0.5 * (self.pi[:r, :r] + self.pi[:r, :r].T)

@@ -37,7 +37,6 @@ from numba import njit
 
 # Rows of the state that every robot has.
 P0, H0, Q0, O0, N0, M0, Z0 = 0, 3, 7, 10, 13, 16, 18
-RESIDUAL_ROWS_COMMON = 5  # n (3) and m_xy (2); one m_z per tube follows
 
 # No fast-math flags: which copy of a kernel runs depends on what was compiled before, and copies would round differently. Plain IEEE arithmetic
 # makes every result the same, first run or cached, and NaN stays visible to the solver.

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 
 from ctr_dynamics.errors import InputError
-from ctr_dynamics.model.mesh import Mesh, node_positions, point_positions
+from ctr_dynamics.model.mesh import Mesh, point_positions
 from ctr_dynamics.model.model import Model
 from ctr_dynamics.model.newton import CONVERGED, NOT_FINITE
 from ctr_dynamics.model.scheme import RATES, Y_BEFORE, Y_NOW, Scheme, make_scheme
@@ -261,10 +261,6 @@ class Simulator:
                 self.model.buffers(mesh, lanes),
             )
         return self._buffers[key]
-
-    def node_positions(self, state: State) -> np.ndarray:
-        """Arc length (m) of the rows of ``state.nodes``."""
-        return node_positions(state.mesh, state.inputs.beta)
 
 
 def remap_fields(
