@@ -65,6 +65,13 @@ def parameter_rows(n):
 
 
 @njit(cache=True, inline="always")
+def input_row(tubes, i):
+    """Row of the parameters that holds input ``i``: alpha, its rate and beta of every tube, then force and torque on the tip."""
+    n = len(tubes)
+    return 11 * n + i if i < 3 * n else 11 * n + 3 + i
+
+
+@njit(cache=True, inline="always")
 def lane_count(lanes):
     """Lanes that a lane tuple stands for: none for one, else eight for each entry."""
     return max(1, 8 * len(lanes))

@@ -63,6 +63,7 @@ class Record:
     rates: np.ndarray
     inputs: np.ndarray
     found: np.ndarray
+    times: np.ndarray
 
 
 @dataclass
@@ -249,7 +250,7 @@ class Simulator:
         records: tuple[Record, ...] = ()
         if record:
             rates = bank[RATES : RATES + stages].copy()
-            records = (Record(scheme, key, mesh, before, state.fields.copy(), rates, inputs, found.copy()),)
+            records = (Record(scheme, key, mesh, before, state.fields.copy(), rates, inputs, found.copy(), t + scheme.times * scheme.dt),)
         return StepResult(True, "ok", iterations, sweeps, jacobians, records=records)
 
     def _work(self, key: tuple, mesh: Mesh) -> tuple:

@@ -3,6 +3,7 @@
 import numpy as np
 from numba import njit
 
+from ctr_dynamics.model.kernels import input_row
 from ctr_dynamics.model.mesh import section_lengths
 from ctr_dynamics.model.newton import CONVERGED, solve
 from ctr_dynamics.model.scheme import RATE_NOW, RATES, Y_BEFORE, Y_NOW
@@ -40,13 +41,10 @@ def step(tubes, lane, lanes, mesh, c0, weights, par, inputs, bank, guess, found,
     W, seclen, hist, histb, out, outb, nodes, res = small
     x = np.empty(5 + n)
     iterations, sweeps, jacobians = 0, 0, 0
-    base = 14 * n
     for stage in range(stages):
         history(weights[stage], bank, hist, histb)
-        for i in range(3 * n):
-            par[11 * n + i] = inputs[stage, i]
-        for i in range(6):
-            par[base + 3 + i] = inputs[stage, 3 * n + i]
+        for i in range(inputs.shape[1]):
+            par[input_row(tubes, i)] = inputs[stage, i]
         section_lengths(mesh.bp_tube, mesh.bp_offset, par[13 * n : 14 * n], seclen)
         for i in range(5 + n):
             # what the guess missed at the stage before, it misses here too

@@ -7,7 +7,7 @@ the unknowns give the Jacobian of the shooting problem, through which every colu
 import numpy as np
 from numba import njit
 
-from ctr_dynamics.model.kernels import lane_count, sweep
+from ctr_dynamics.model.kernels import input_row, lane_count, sweep
 from ctr_dynamics.model.mesh import section_lengths
 from ctr_dynamics.model.newton import broadcast, invert
 from ctr_dynamics.model.scheme import RATE_NOW, RATES, Y_BEFORE, Y_NOW
@@ -68,8 +68,8 @@ def linearise(
     """Linearise one solved two-point problem.
 
     ``par`` (NP,) and ``x`` (m,): where it was solved, with ``hist``, ``histb``. ``dpar`` (NP, r), ``dhist`` (fields, r): columns of perturbations
-    in units in which a step of ``epsilon`` is small. Writes ``dx`` (m, r), ``dfields`` (fields, r), ``dnodes`` (nodes * S, r) and the inverse
-    shooting Jacobian ``inverse`` (m, m). False if that is singular or anything is not finite.
+    in units in which a step of ``epsilon`` is small. Writes ``dx`` (m, r), ``dfields`` (fields, r), ``dnodes`` (rows, r; the last rows of the
+    node states, nodes * S for all of them) and the inverse shooting Jacobian ``inverse`` (m, m). False if that is singular or anything is not finite.
     """
     n = len(tubes)
     L = lane_count(lanes)
@@ -119,7 +119,8 @@ def linearise(
                 dx[i, k] -= inverse[i, q] * slope
     _combine(lanes, outL, main, m, columns, 1.0 / epsilon, perturb, dx, dfields)
     _combine(lanes, outbL, len(histb), m, columns, 1.0 / epsilon, perturb, dx, dfields[main:])
-    _combine(lanes, nodesL, dnodes.shape[0], m, columns, 1.0 / epsilon, perturb, dx, dnodes)
+    last = nodesL[len(nodesL) - dnodes.shape[0] * L :]
+    _combine(lanes, last, dnodes.shape[0], m, columns, 1.0 / epsilon, perturb, dx, dnodes)
     return True
 
 
@@ -151,7 +152,6 @@ def theta_tangent(
     unknowns there, ``inputs`` (3N + 6,). ``dy``, ``drate`` (fields, r): columns of the fields and of their rates, advanced in place.
     Returns False where the step's end cannot be linearised.
     """
-    n = len(tubes)
     hist, histb, dhist = work
     main = len(hist)
     c0 = 1.0 / (THETA * dt)
@@ -164,10 +164,8 @@ def theta_tangent(
     for i in range(fields):
         for k in range(columns):
             dhist[i, k] = -c0 * dy[i, k] - ratio * drate[i, k]
-    for i in range(3 * n):
-        par[11 * n + i] = inputs[i]
-    for i in range(6):
-        par[14 * n + 3 + i] = inputs[3 * n + i]
+    for i in range(len(inputs)):
+        par[input_row(tubes, i)] = inputs[i]
     if not linearise(
         tubes,
         lanes,
@@ -195,26 +193,27 @@ def theta_tangent(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def step_tangent(tubes, lanes, mesh, c0, weights, par, inputs, found, before, rates, dpar, epsilon, perturb, big, work, dbank,
-                 inverse, dx, dnodes):  # fmt: skip
+def step_tangent(tubes, lanes, mesh, c0, weights, par, inputs, found, before, rates, dpar, dinputs, epsilon, perturb, big, work,
+                 dbank, inverse, dx, dnodes):  # fmt: skip
     """Tangent of a whole step.
 
     ``before`` (slots, fields): stored fields before the step; ``rates`` (stages, fields): the stages' rates; ``found`` (stages, m): their
-    unknowns; ``inputs`` as in :func:`ctr_dynamics.model.step.step`. ``dbank`` (3 + stages, fields, r): columns of the stored fields, advanced
-    in place like the fields themselves. ``work`` = (hist, histb, dhist (fields, r)). Returns False where a stage cannot be linearised.
+    unknowns; ``inputs`` as in :func:`ctr_dynamics.model.step.step`, ``dinputs`` (stages, inputs, r) their columns, added to those of the
+    parameters ``dpar`` (NP, r). ``dbank`` (3 + stages, fields, r): columns of the stored fields, advanced in place like the fields themselves.
+    ``work`` = (hist, histb, dhist (fields, r), bank (3 + stages, fields), dfields (fields, r), dpar of a stage (NP, r)).
+    ``dnodes`` (rows, r): columns of the last ``rows`` numbers of the node states. Returns False where a stage cannot be linearised.
     """
-    n = len(tubes)
-    stages = len(c0)
-    hist, histb, dhist = work
+    hist, histb, dhist, bank, dfields, dstage = work
     slots, fields, columns = dbank.shape
-    bank = np.empty((slots, fields))
+    stages = len(c0)
     for i in range(fields):
         for slot in range(RATES):
             bank[slot, i] = before[slot, i]
         for stage in range(stages):
             bank[RATES + stage, i] = rates[stage, i]
-    base = 14 * n
-    dfields = np.empty((fields, columns))
+    for r in range(dpar.shape[0]):
+        for k in range(columns):
+            dstage[r, k] = dpar[r, k]
     for stage in range(stages):
         history(weights[stage], bank, hist, histb)
         dhist[:] = 0.0
@@ -224,11 +223,12 @@ def step_tangent(tubes, lanes, mesh, c0, weights, par, inputs, found, before, ra
                 for i in range(fields):
                     for k in range(columns):
                         dhist[i, k] += w * dbank[slot, i, k]
-        for i in range(3 * n):
-            par[11 * n + i] = inputs[stage, i]
-        for i in range(6):
-            par[base + 3 + i] = inputs[stage, 3 * n + i]
-        if not linearise(tubes, lanes, mesh, c0[stage], par, dpar, found[stage], hist, histb, dhist, epsilon, perturb, big, inverse,
+        for i in range(inputs.shape[1]):
+            row = input_row(tubes, i)
+            par[row] = inputs[stage, i]
+            for k in range(columns):
+                dstage[row, k] = dpar[row, k] + dinputs[stage, i, k]
+        if not linearise(tubes, lanes, mesh, c0[stage], par, dstage, found[stage], hist, histb, dhist, epsilon, perturb, big, inverse,
                          dx, dfields, dnodes):  # fmt: skip
             return False
         for i in range(fields):

@@ -69,11 +69,15 @@ def test_tangent_of_steps_equals_finite_differences(scheme):
     big = model.buffers(state.mesh, 8 * len(lanes))
     points, base = big[4].size // (8 * len(lanes)), big[5].size // (8 * len(lanes))
     inverse, dx, nodes = np.zeros((m, m)), np.zeros((m, COLUMNS)), np.zeros((state.nodes.size, COLUMNS))
-    work = (np.zeros(points), np.zeros(base), np.zeros((fields, COLUMNS)))
+    work = (
+        np.zeros(points), np.zeros(base), np.zeros((fields, COLUMNS)), np.zeros((RATES + stages, fields)),
+        np.zeros((fields, COLUMNS)), np.zeros((layout.size, COLUMNS)),
+    )  # fmt: skip
+    still = np.zeros((stages, 3 * model.n + 6, COLUMNS))
     for record in records:
         assert step_tangent(
             model.tubes, lanes, record.mesh, record.scheme.c0, record.scheme.weights, model.parameters.copy(),
-            record.inputs, record.found, record.before, record.rates, parameters, 1e-6, 0.1 * model.step, big,
+            record.inputs, record.found, record.before, record.rates, parameters, still, 1e-6, 0.1 * model.step, big,
             work, columns, inverse, dx, nodes,
         )  # fmt: skip
 

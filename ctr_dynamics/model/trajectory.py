@@ -1,0 +1,342 @@
+"""Whole simulations in compiled loops: the tip over many steps, and its sensitivities to parameters and inputs.
+
+Steps run without Python in between as long as the sections stay and every step converges; what is harder goes through
+:class:`ctr_dynamics.model.simulator.Simulator` with its retries, one step at a time. Sensitivities follow from the tangent of every step, so
+that the derivatives by dozens of parameters cost a few simulations (docs/model.md).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from ctr_dynamics.errors import InputError
+from ctr_dynamics.model.mesh import Key, Mesh, fits
+from ctr_dynamics.model.model import Model
+from ctr_dynamics.model.newton import CONVERGED, lanes_for
+from ctr_dynamics.model.scheme import RATES, Scheme
+from ctr_dynamics.model.simulator import Inputs, Record, Simulator, State, remap_fields
+from ctr_dynamics.model.step import step
+from ctr_dynamics.model.tangent import linearise, step_tangent
+
+Floats = NDArray[np.float64]
+InputRows = Callable[[Floats], Floats]
+TIP_ROWS = 13  # p, h, q, omega
+CHUNK = 256  # steps between returns to Python
+EPSILON = 1e-6  # of a column's unit: small against the curvature of the step, large against rounding
+
+
+@dataclass
+class Trajectory:
+    """The tip of one simulation.
+
+    Attributes:
+        t: (K,) s. tip: (K, 13) p m, quaternion h (not unit), q m/s and omega rad/s in the tip frame, at every step.
+        beta_rate: (K,) m/s of tube 1.
+        columns: (K, 13, r) derivatives of ``tip``; None when not asked for.
+        failure: why the run ended before its time; empty when it did not.
+        sweeps: plain sweeps of the arc length, counted over all steps.
+    """
+
+    t: Floats
+    tip: Floats
+    beta_rate: Floats
+    columns: Floats | None
+    failure: str = ""
+    sweeps: int = 0
+
+
+@njit(cache=True, nogil=True)
+def _advance(tubes, lane, lanes, mesh, c0, weights, par, inputs, bank, unknowns, earlier, inverse, fresh, small, big, scale, perturb,
+             tolerance, limit, tips):  # fmt: skip
+    """Steps with ``inputs`` (K, stages, inputs) until one fails; returns (steps taken, plain sweeps, outcome of the last)."""
+    nodes = small[6]
+    S = len(nodes) - tips.shape[1]
+    guess, found = np.empty_like(unknowns), np.empty_like(unknowns)
+    total = 0
+    for k in range(len(inputs)):
+        for i in range(unknowns.shape[0]):
+            for j in range(unknowns.shape[1]):
+                guess[i, j] = 2.0 * unknowns[i, j] - earlier[0, i, j]
+        outcome, _, sweeps, _ = step(tubes, lane, lanes, mesh, c0, weights, par, inputs[k], bank, guess, found, inverse, fresh, small, big,
+                                     scale, perturb, tolerance, limit)  # fmt: skip
+        total += sweeps
+        if outcome != CONVERGED:
+            return k, total, outcome
+        fresh = False
+        earlier[1] = earlier[0]
+        earlier[0] = unknowns
+        unknowns[:] = found
+        for i in range(tips.shape[1]):
+            tips[k, i] = nodes[S + i]
+    return len(inputs), total, CONVERGED
+
+
+@njit(cache=True, nogil=True)
+def _advance_tangent(tubes, lane, lanes, wide, mesh, c0, weights, par, inputs, bank, unknowns, earlier, inverse, fresh, small, big, scale,
+                     perturb, fine, tolerance, limit, tips, dpar, dinputs, epsilon, many, work, dbank, before, matrix, dx, dnodes,
+                     dtips):  # fmt: skip
+    """The same with the columns ``dbank`` of the stored fields; ``dtips`` (K, 13, r) takes those of the tip."""
+    nodes = small[6]
+    S = len(nodes) - tips.shape[1]
+    guess, found = np.empty_like(unknowns), np.empty_like(unknowns)
+    stages = len(c0)
+    total = 0
+    for k in range(len(inputs)):
+        for i in range(unknowns.shape[0]):
+            for j in range(unknowns.shape[1]):
+                guess[i, j] = 2.0 * unknowns[i, j] - earlier[0, i, j]
+        before[:] = bank[:RATES]
+        outcome, _, sweeps, _ = step(tubes, lane, lanes, mesh, c0, weights, par, inputs[k], bank, guess, found, inverse, fresh, small, big,
+                                     scale, perturb, tolerance, limit)  # fmt: skip
+        total += sweeps
+        if outcome != CONVERGED:
+            return k, total, outcome
+        fresh = False
+        earlier[1] = earlier[0]
+        earlier[0] = unknowns
+        unknowns[:] = found
+        for i in range(tips.shape[1]):
+            tips[k, i] = nodes[S + i]
+        if not step_tangent(tubes, wide, mesh, c0, weights, par, inputs[k], found, before, bank[RATES : RATES + stages], dpar, dinputs[k],
+                            epsilon, fine, many, work, dbank, matrix, dx, dnodes):  # fmt: skip
+            return k, total, -1
+        for i in range(dtips.shape[1]):
+            for c in range(dtips.shape[2]):
+                dtips[k, i, c] = dnodes[i, c]
+    return len(inputs), total, CONVERGED
+
+
+class _Columns:
+    """Columns of the stored fields along a simulation, with their buffers."""
+
+    def __init__(self, model: Model, effect: Floats, input_effect: Callable[[Floats], Floats]) -> None:
+        self.model, self.effect, self.input_effect = model, np.ascontiguousarray(effect), input_effect
+        self.count = effect.shape[1]
+        self.wide = lanes_for(1 + 5 + model.n + self.count)
+        m = 5 + model.n
+        self.dx, self.matrix = np.zeros((m, self.count)), np.zeros((m, m))
+        self.dnodes = np.zeros((16 + 3 * model.n, self.count))
+        self._buffers: dict[Key, tuple] = {}
+
+    def buffers(self, key: Key, mesh: Mesh, slots: int) -> tuple:
+        """(many, work, before) for the sections ``key``."""
+        if key not in self._buffers:
+            L = 8 * len(self.wide)
+            many = self.model.buffers(mesh, L)
+            main, base = len(many[4]) // L, len(many[5]) // L
+            fields = main + base
+            work = (
+                np.zeros(main), np.zeros(base), np.zeros((fields, self.count)), np.zeros((slots, fields)),
+                np.zeros((fields, self.count)), np.zeros_like(self.effect),
+            )  # fmt: skip
+            self._buffers[key] = many, work, np.zeros((RATES, fields))
+        return self._buffers[key]
+
+    def start(self, state: State, par: Floats, row: Floats, drow: Floats, slots: int) -> Floats:
+        """Columns at rest; returns those of the tip (13, r)."""
+        n, layout = self.model.n, self.model.layout
+        many, work, _ = self.buffers(state.key, state.mesh, slots)
+        hist, histb, dhist, _, dfields, dstage = work
+        hist[:], histb[:], dhist[:] = 0.0, 0.0, 0.0
+        rows = input_rows(n)
+        par = par.copy()
+        par[rows] = row
+        par[layout["alpha_rate"]] = 0.0
+        dstage[:] = self.effect
+        dstage[rows] += drow
+        dstage[layout["alpha_rate"]] = 0.0
+        linearise(
+            self.model.tubes, self.wide, state.mesh, 0.0, par, dstage, state.unknowns[-1], hist, histb, dhist, EPSILON,
+            self.model.tangent_step, many, self.matrix, self.dx, dfields, self.dnodes,
+        )  # fmt: skip
+        self.bank = np.zeros((slots, *dfields.shape))
+        self.bank[:2] = dfields
+        return self.dnodes[:TIP_ROWS].copy()
+
+    def remap(self, old: Mesh, old_beta: Floats, new: Mesh, new_beta: Floats) -> None:
+        """Carry the columns to another set of sections."""
+        slots, _, r = self.bank.shape
+        rows = np.ascontiguousarray(self.bank.transpose(0, 2, 1)).reshape(slots * r, -1)
+        moved = remap_fields(self.model.n, rows, old, old_beta, new, new_beta)
+        self.bank = np.ascontiguousarray(moved.reshape(slots, r, -1).transpose(0, 2, 1))
+
+    def follow(self, record: Record, par: Floats) -> bool:
+        """Move the columns over one recorded (sub)step."""
+        slots = len(self.bank)
+        many, work, _ = self.buffers(record.key, record.mesh, slots)
+        dinputs = self.input_effect(record.times)
+        return step_tangent(
+            self.model.tubes, self.wide, record.mesh, record.scheme.c0, record.scheme.weights, par.copy(), record.inputs, record.found,
+            record.before, record.rates, self.effect, dinputs, EPSILON, self.model.tangent_step, many, work, self.bank, self.matrix,
+            self.dx, self.dnodes,
+        )  # fmt: skip
+
+
+def input_rows(n: int) -> NDArray[np.int64]:
+    """Rows of the parameter block that hold the inputs of ``n`` tubes, in their order."""
+    return np.concatenate([np.arange(11 * n, 14 * n), np.arange(14 * n + 3, 14 * n + 9)])
+
+
+def to_inputs(n: int, row: Floats, beta_rate: Floats | None = None) -> Inputs:
+    """One row of inputs (3N + 6,) as :class:`Inputs`."""
+    rate = np.zeros(n) if beta_rate is None else beta_rate
+    return Inputs(
+        row[:n], row[n : 2 * n], row[2 * n : 3 * n], rate, row[3 * n : 3 * n + 3], row[3 * n + 3 : 3 * n + 6]
+    )
+
+
+def run(
+    model: Model,
+    scheme: Scheme,
+    parameters: Floats,
+    inputs: InputRows,
+    duration: float,
+    *,
+    effect: Floats | None = None,
+    input_effect: Callable[[Floats], Floats] | None = None,
+    tolerance: float = 1e-6,
+    guess: Floats | None = None,
+) -> Trajectory:
+    """Simulate from rest in the static equilibrium of the first inputs.
+
+    Args:
+        parameters: (NP,) block; the actuators and the tip wrench in it are not read.
+        inputs: gives (k, 3N + 6) alpha, alpha rate, beta, force, torque (rad, rad/s, m, N, N m) at times (k,) s.
+        duration: s; the number of steps is the largest that does not pass it.
+        effect: (NP, r) derivative of the parameter block by r quantities, in units in which a millionth is a small change.
+        input_effect: gives (k, 3N + 6, r) derivatives of the inputs at times (k,).
+        guess: (5 + N,) unknowns of the static equilibrium to start from.
+    Raises:
+        InputError: no static equilibrium at the first inputs.
+    """
+    n = model.n
+    simulator = Simulator(model, scheme, tolerance, parameters)
+    dt, stages = scheme.dt, scheme.stages
+    steps = int(np.floor(duration / dt + 1e-9))
+    first = inputs(np.zeros(1))[0]
+    at_rest = to_inputs(n, first)
+    state = simulator.rest(Inputs(at_rest.alpha, np.zeros(n), at_rest.beta, np.zeros(n), at_rest.force, at_rest.torque), guess)
+    tip = np.empty((steps + 1, TIP_ROWS))
+    tip[0] = state.nodes[-1, :TIP_ROWS]
+    columns: _Columns | None = None
+    out: Floats | None = None
+    if effect is not None:
+        rows = 3 * n + 6
+        r = effect.shape[1]
+        give = input_effect or (lambda times: np.zeros((len(times), rows, r)))
+        columns = _Columns(model, effect, give)
+        out = np.empty((steps + 1, TIP_ROWS, r))
+        out[0] = columns.start(state, parameters, first, give(np.zeros(1))[0], RATES + stages)
+    k, sweeps, failure = 0, 0, ""
+    beta_rate = np.zeros(steps + 1)
+    while k < steps:
+        count = min(CHUNK, steps - k)
+        times = (np.arange(k, k + count)[:, None] + scheme.times) * dt
+        rows_now = inputs(times.ravel()).reshape(count, stages, -1)
+        beta = rows_now[:, -1, 2 * n : 3 * n]
+        still = bool(np.all(beta == state.inputs.beta))
+        if not still:
+            previous = np.concatenate([[state.inputs.beta[0]], beta[:-1, 0]])
+            beta_rate[k + 1 : k + 1 + count] = (beta[:, 0] - previous) / dt
+        usable = count
+        if model.moving_precurvature and not still:
+            usable = 0
+        elif not still:
+            usable = _while_fitting(model, state.key, beta)
+        taken, reason = 0, ""
+        if usable:
+            taken, spent, outcome = _fast(model, simulator, state, rows_now[:usable], times[:usable], columns, tip[k + 1 :],
+                                          None if out is None else out[k + 1 :])  # fmt: skip
+            sweeps += spent
+            if taken:
+                state.inputs = to_inputs(n, rows_now[taken - 1, -1])
+            if outcome == -1:
+                failure = f"step at {(k + taken) * dt:.4f} s could not be linearised"
+                break
+        k += taken
+        if taken < count:
+            mesh, before = state.mesh, state.inputs.beta
+            key = state.key
+            result = simulator.step(
+                state, k * dt, lambda t: to_inputs(n, inputs(np.array([t]))[0]), record=columns is not None
+            )
+            sweeps += result.sweeps
+            if not result.ok:
+                failure = f"step at {k * dt:.4f} s failed: {result.reason}"
+                break
+            if columns is not None and out is not None:
+                for record in result.records:
+                    if record.key != key:
+                        columns.remap(mesh, before, record.mesh, record.inputs[-1, 2 * n : 3 * n])
+                        key = record.key
+                    if not columns.follow(record, parameters):
+                        reason = "could not be linearised"
+                if reason:
+                    failure = f"step at {k * dt:.4f} s {reason}"
+                    break
+                out[k + 1] = columns.dnodes[:TIP_ROWS]
+            tip[k + 1] = state.nodes[-1, :TIP_ROWS]
+            k += 1
+    done = k + 1
+    return Trajectory(
+        np.arange(done) * dt, tip[:done], beta_rate[:done], None if out is None else out[:done], failure, sweeps
+    )
+
+
+def _while_fitting(model: Model, key: Key, beta: Floats) -> int:
+    """Number of rows of ``beta`` (k, N) for which the sections ``key`` serve."""
+    for i, row in enumerate(beta):
+        try:
+            if not fits(key, model.segments, row, model.nodes):
+                return i
+        except InputError:
+            return i
+    return len(beta)
+
+
+def _fast(
+    model: Model,
+    simulator: Simulator,
+    state: State,
+    rows: Floats,
+    times: Floats,
+    columns: _Columns | None,
+    tips: Floats,
+    dtips: Floats | None,
+) -> tuple[int, int, int]:
+    """Steps in the compiled loop; returns (steps taken, sweeps, outcome)."""
+    small, big = simulator._work(state.key, state.mesh)
+    scheme = simulator.scheme
+    nodes = small[6]
+    # the compiled loop reads the tip from the last rows of the node states
+    S = 16 + 3 * model.n
+    last = np.empty((len(rows), S))
+    common = (
+        model.tubes, model.lane, model.jacobian_lanes,
+    )  # fmt: skip
+    solver = (
+        state.mesh, scheme.c0, scheme.weights, simulator.parameters, rows, state.bank, state.unknowns, state.earlier, state.inverse,
+        not state.usable, small, big, model.scale, model.step,
+    )  # fmt: skip
+    if columns is None:
+        taken, sweeps, outcome = _advance(*common, *solver, simulator.tolerance, simulator.limit, last)
+    else:
+        assert dtips is not None
+        many, work, before = columns.buffers(state.key, state.mesh, len(state.bank))
+        shape = (*rows.shape, columns.count)
+        dinputs = np.ascontiguousarray(columns.input_effect(times.ravel()).reshape(shape))
+        taken, sweeps, outcome = _advance_tangent(
+            *common, columns.wide, *solver, model.tangent_step, simulator.tolerance, simulator.limit, last, columns.effect, dinputs,
+            EPSILON, many, work, columns.bank, before, columns.matrix, columns.dx, columns.dnodes, dtips,
+        )  # fmt: skip
+    tips[:taken] = last[:taken, :TIP_ROWS]
+    state.usable = outcome == CONVERGED
+    if taken:
+        state.nodes = nodes.reshape(-1, S).copy() if outcome == CONVERGED else state.nodes
+    return taken, sweeps, outcome
+
