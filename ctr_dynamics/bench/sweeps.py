@@ -7,12 +7,13 @@ from typing import Any
 import numpy as np
 
 from ctr_dynamics.bench.machine import best_of
-from ctr_dynamics.model.kernels import lane_count, sweep
+from ctr_dynamics.model.kernels import sweep
 from ctr_dynamics.model.mesh import node_count, section_lengths
 from ctr_dynamics.model.model import Model
 from ctr_dynamics.model.newton import broadcast
 from ctr_dynamics.model.scheme import make_scheme
 from ctr_dynamics.model.statics import Statics
+from ctr_dynamics.model.workspace import lane_count
 from ctr_dynamics.robot import Robot, load_robot, robot_from_dict, robot_to_dict
 
 
@@ -40,7 +41,7 @@ def sweep_cost(model: Model, lanes: tuple[int, ...], repeats: int) -> float:
 
     def once() -> None:
         sweep(
-            model.tubes, lanes, W, c0, mesh.sec_cells, mesh.sec_tubes, mesh.ust, mesh.ust0, mesh.ust_base, mesh.base_cells,
+            model.tubes, lanes, W, c0, mesh,
             par, seclen, x, hist, histb, out, outb, nodes, res,
         )  # fmt: skip
 

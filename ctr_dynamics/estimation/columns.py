@@ -52,6 +52,7 @@ def field_weights(model: Model, mesh: Mesh, beta: Floats) -> Floats:
         stage = np.append(np.tile(np.array([1.0, 2.0, 2.0, 1.0]) / 6.0 * step, mesh.base_cells), 0.0)
         rows.append((stage[:, None] * np.array([2 * RI[i], GJ[i]])).ravel())
         assert len(stage) == base_points
+    rows.append(np.zeros(4 * n))  # what only the extended model moves at the tubes' bases and ends
     weights = np.concatenate(rows)
     body = par[layout["body_mass"]][0]
     main = sum((4 * c + 1) * F for c in mesh.sec_cells)

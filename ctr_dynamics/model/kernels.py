@@ -1,156 +1,35 @@
 """Arc-length kernels of the dynamic model: one sweep from the actuators to the tip, for many lanes at once.
 
-A *lane* is one complete copy of the problem (its own history, parameters, loads and unknowns). The plain sweep has one lane; the
-Jacobian, the tangents of a step and batches of simulations are the same code with 8 to 64 lanes. Lanes are innermost, and
-every number that the equations touch lies in one flat workspace ``W`` at offsets that are constant once the tube and lane counts are known,
-which is what lets LLVM vectorise over the lanes without run-time alias checks.
-
-``tubes`` and ``lanes`` are tuples whose *lengths* carry the counts into the compiler (one entry a tube; one entry for eight lanes, none for
-a single lane); their contents are not read.
-
-Layout of the workspace, in rows of one number a lane (see :func:`offsets`):
-
-==========  =========  =================================================================
-rows        count      content
-==========  =========  =================================================================
-``Y``       S          state at the current node
-``YS``      S          state at the current Runge-Kutta stage
-``K``       S          its arc-length derivative
-``ACC``     S          accumulated Runge-Kutta increment
-``HI``      F          history part of the time derivatives at the current point
-``OU``      F          fields at the current point
-``TMP``     T          intermediate results
-``PAR``     NP         parameters (:mod:`ctr_dynamics.model.layout`)
-``MA``      2N         bending moment of every tube on the near side of a transition
-``MB``      2N         the same on its far side
-==========  =========  =================================================================
-
-State rows (S = 16 + 3N): p 0-2, quaternion h 3-6, q 7-9, omega 10-12, n 13-15, m_xy 16-17, m_z of every tube, then theta and gamma of
-tubes 2..N. p and h are in the base frame; q, omega, n and m are components in the frame of tube 1 (n is R_1^T times the paper's n).
-Field rows (F = 7 + 2N): q 0-2, omega 3-5, u of tube 1 6-8, then u_z and gamma of tubes 2..N.
+Numbers live in the workspace of :mod:`ctr_dynamics.model.workspace`. A robot whose file names extensions that change the physics runs the
+same sweep with the functions of :mod:`ctr_dynamics.model.extended` in their places (:func:`dispatch`).
 """
 
 import math
 
 import numpy as np
-from numba import njit
+from numba import njit, types
+from numba.extending import overload
 
-# Rows of the state that every robot has.
-P0, H0, Q0, O0, N0, M0, Z0 = 0, 3, 7, 10, 13, 16, 18
-
-# No fast-math flags: which copy of a kernel runs depends on what was compiled before, and copies would round differently. Plain IEEE arithmetic
-# makes every result the same, first run or cached, and NaN stays visible to the solver.
-
-_TWO_OVER_PI = 2.0 / math.pi
-_PIO2_HI = 1.57079632679489655800e00
-_PIO2_LO = 6.12323399573676603587e-17
-
-
-@njit(cache=True, inline="always")
-def state_rows(n):
-    """Rows of the state of ``n`` tubes."""
-    return 16 + 3 * n
-
-
-@njit(cache=True, inline="always")
-def field_rows(n):
-    """Rows of the fields that carry history, for ``n`` tubes."""
-    return 7 + 2 * n
-
-
-@njit(cache=True, inline="always")
-def parameter_rows(n):
-    """Rows of the parameters of ``n`` tubes."""
-    return 14 * n + 14
-
-
-@njit(cache=True, inline="always")
-def input_row(tubes, i):
-    """Row of the parameters that holds input ``i``: alpha, its rate and beta of every tube, then force and torque on the tip."""
-    n = len(tubes)
-    return 11 * n + i if i < 3 * n else 11 * n + 3 + i
-
-
-@njit(cache=True, inline="always")
-def lane_count(lanes):
-    """Lanes that a lane tuple stands for: none for one, else eight for each entry."""
-    return max(1, 8 * len(lanes))
-
-
-@njit(cache=True, inline="always")
-def offsets(tubes, lanes):
-    """First index of each block of the workspace: Y, YS, K, ACC, HI, OU, TMP, PAR, MA, MB."""
-    n = len(tubes)
-    L = lane_count(lanes)
-    S = state_rows(n) * L
-    F = field_rows(n) * L
-    tmp = 4 * S + 2 * F
-    par = tmp + (13 + 7 * n) * L
-    near = par + parameter_rows(n) * L
-    return 0, S, 2 * S, 3 * S, 4 * S, 4 * S + F, tmp, par, near, near + 2 * n * L
-
-
-@njit(cache=True, inline="always")
-def workspace_rows(n):
-    """Rows of the workspace of ``n`` tubes."""
-    return 4 * state_rows(n) + 2 * field_rows(n) + (13 + 7 * n) + parameter_rows(n) + 4 * n
-
-
-@njit(cache=True, inline="always", error_model="numpy")
-def _sincos(x):
-    """(sin x, cos x) by polynomials, without library calls, so that lane loops vectorise; error below 1e-12 for abs(x) < 1e4."""
-    k = math.floor(x * _TWO_OVER_PI + 0.5)
-    r = (x - k * _PIO2_HI) - k * _PIO2_LO
-    z = r * r
-    s = r + r * z * (
-        -1.66666666666666307295e-1
-        + z
-        * (
-            8.33333333332211858878e-3
-            + z
-            * (
-                -1.98412698295895385996e-4
-                + z
-                * (
-                    2.75573136213857245213e-6
-                    + z * (-2.50507477628578072866e-8 + z * 1.58962301576546568060e-10)
-                )
-            )
-        )
-    )
-    c = (
-        1.0
-        - 0.5 * z
-        + z
-        * z
-        * (
-            4.16666666666665929218e-2
-            + z
-            * (
-                -1.38888888888730564116e-3
-                + z
-                * (
-                    2.48015872888517045348e-5
-                    + z
-                    * (
-                        -2.75573141792967388112e-7
-                        + z * (2.08757008419747316778e-9 - z * 1.13585365213876817300e-11)
-                    )
-                )
-            )
-        )
-    )
-    half = math.floor(0.5 * k)
-    odd = k - 2.0 * half  # 0 or 1
-    sign = 1.0 - 2.0 * (half - 2.0 * math.floor(0.5 * half))  # cos sign changes every two quadrants
-    # quadrant k: odd quadrants swap sine and cosine
-    sin_x = sign * (s * (1.0 - odd) + c * odd)
-    cos_x = sign * (c * (1.0 - odd) - s * odd)
-    return sin_x, cos_x
+from ctr_dynamics.model import extended
+from ctr_dynamics.model.workspace import (
+    H0,
+    M0,
+    N0,
+    O0,
+    P0,
+    Q0,
+    Z0,
+    field_rows,
+    lane_count,
+    offsets,
+    parameter_rows,
+    sincos,
+    state_rows,
+)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _curvature(tubes, lanes, W, present, ust, u0, c0):
+def _plain_curvature(tubes, lanes, W, present, ust, u0, c0):
     """Strains from moments: (16), (17) with the damping history of every tube taken exactly (docs/model.md).
 
     Reads the state rows at ``YS`` and the history rows at ``HI``; writes to ``TMP``: u_1 (3), its time derivative (3), then per tube
@@ -187,7 +66,7 @@ def _curvature(tubes, lanes, W, present, ust, u0, c0):
         MZi, THi, GAi = YS + (mz + i) * L, YS + (th + i - 1) * L, YS + (ga + i - 1) * L
         HUi = HI + (8 + i) * L
         for j in range(L):
-            s, c = _sincos(W[THi + j])
+            s, c = sincos(W[THi + j])
             ks = W[KSi + j]
             wx = ks * (c * vx_ - s * vy_)
             wy = ks * (s * vx_ + c * vy_)
@@ -246,7 +125,7 @@ def _body_forces(tubes, lanes, W):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _derivative(tubes, lanes, W, present, ust, u0, c0):
+def _plain_derivative(tubes, lanes, W, present, ust, u0, c0):
     """Arc-length derivative of the state, (13), and the fields at this point (``OU``)."""
     n = len(tubes)
     L = lane_count(lanes)
@@ -254,8 +133,7 @@ def _derivative(tubes, lanes, W, present, ust, u0, c0):
     mz, th, ga = Z0, Z0 + n, Z0 + 2 * n - 1
     EI, RA, RI, BB = PAR, PAR + 2 * n * L, PAR + 3 * n * L, PAR + 4 * n * L
     T = TMP + 13 * L
-    _curvature(tubes, lanes, W, present, ust, u0, c0)
-    _body_forces(tubes, lanes, W)
+    _plain_curvature(tubes, lanes, W, present, ust, u0, c0)
     # torsion of tube 1 and the sums over the tubes: rho A, rho I, rho I omega_z + 2 rho I gamma, m_z
     for j in range(L):
         ux, uy = W[TMP + j], W[TMP + L + j]
@@ -357,7 +235,7 @@ def _derivative(tubes, lanes, W, present, ust, u0, c0):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _bending_moments(tubes, lanes, W, present, dst):
+def _plain_bending_moments(tubes, lanes, W, present, dst):
     """Internal bending moment of each tube, (14), in the frame of tube 1, into rows ``dst``; zero for tubes that have ended."""
     n = len(tubes)
     L = lane_count(lanes)
@@ -385,6 +263,79 @@ def _bending_moments(tubes, lanes, W, present, dst):
                 )
 
 
+def dispatch(plain, other):
+    """A function for kernels: ``plain`` for tube tuples of integers, ``other`` for those of floats. The choice is made when it is compiled."""
+
+    def stub(*args):
+        raise NotImplementedError("for compiled code only")
+
+    @overload(stub, strict=False, jit_options={"error_model": "numpy", "nogil": True})
+    def choose(*args):
+        return (other if isinstance(args[0].dtype, types.Float) else plain).py_func
+
+    return stub
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _plain_derivative_at(tubes, lanes, W, present, ust, u0, c0):
+    _body_forces(tubes, lanes, W)
+    _plain_derivative(tubes, lanes, W, present, ust, u0, c0)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _extended_derivative_at(tubes, lanes, W, present, ust, u0, c0):
+    _body_forces(tubes, lanes, W)
+    extended.derivative(tubes, lanes, W, present, ust, u0, c0)
+
+
+@njit(cache=True, inline="always")
+def _nothing4(tubes, lanes, W, a):
+    pass
+
+
+@njit(cache=True, inline="always")
+def _no_motion(tubes, lanes, W, c0, histb, outb):
+    pass
+
+
+@njit(cache=True, inline="always")
+def _no_section(tubes, lanes, W, bp_tube, seclen, k):
+    pass
+
+
+@njit(cache=True, inline="always")
+def _no_tilt(tubes, lanes, W, c0, i, histb, outb):
+    pass
+
+
+@njit(cache=True, inline="always")
+def _one(tubes, lanes, W, j, rate):
+    return 1.0
+
+
+@njit(cache=True, inline="always")
+def _rigid_drive(tubes, lanes, W, c0, i, j, torque, angle, rate, histb, outb):
+    return angle, rate
+
+
+@njit(cache=True, inline="always")
+def _no_stretch(tubes, lanes, W, i, j, beta, u):
+    return 0.0
+
+
+_curvature = dispatch(_plain_curvature, extended.curvature)
+_derivative = dispatch(_plain_derivative_at, _extended_derivative_at)
+_bending_moments = dispatch(_plain_bending_moments, extended.bending_moments)
+_start_motion = dispatch(_no_motion, extended.start_motion)
+_start_section = dispatch(_no_section, extended.start_section)
+_move_grid = dispatch(_nothing4, extended.move_grid)
+_tip_forces = dispatch(_nothing4, extended.tip_forces)
+_coulomb = dispatch(_one, extended.coulomb)
+_drive = dispatch(_rigid_drive, extended.drive)
+_base_stretch = dispatch(_no_stretch, extended.base_stretch)
+_tilt = dispatch(_no_tilt, extended.tilt)
+
+
 @njit(cache=True, nogil=True, error_model="numpy")
 def _tube_friction(tubes, lanes, W, present):
     """Friction between neighbouring tubes at a transition, (22), (23): proportional to the jump of the inner tube's moment."""
@@ -403,7 +354,11 @@ def _tube_friction(tubes, lanes, W, present):
             rate = W[G2 + j] if first else W[G2 + j] - W[G1 + j]
             eps = W[FR + 2 * L + j]
             tau = (
-                W[FR + j] * math.sqrt(dx * dx + dy * dy) * rate / math.sqrt(rate * rate + eps * eps)
+                _coulomb(tubes, lanes, W, j, rate)
+                * W[FR + j]
+                * math.sqrt(dx * dx + dy * dy)
+                * rate
+                / math.sqrt(rate * rate + eps * eps)
                 + W[FR + L + j] * rate
             )
             W[MZ + j] -= tau
@@ -441,7 +396,7 @@ def _body(tubes, lanes, W, i, c0):
             W[TMP + 4 * L + j] = hy * aty + (hx - hz) * wz * wx
             W[TMP + 5 * L + j] = hz * atz + (hy - hx) * wx * wy
         else:
-            s, c = _sincos(W[TH + j])
+            s, c = sincos(W[TH + j])
             g = W[GA + j]
             ox, oy, oz = c * wx + s * wy, c * wy - s * wx, wz + g
             tx = c * atx + s * aty + g * oy
@@ -475,8 +430,9 @@ def _below_base(tubes, lanes, W, c0, cells, ust_base, x, histb, outb):
         for j in range(L):
             W[S + 2 * L + j] = x[i * L + j]
         for j in range(L):
-            W[S + j] = W[AL + j]
-            W[S + L + j] = W[AV + j]
+            psi, psi_t = _drive(tubes, lanes, W, c0, i, j, x[i * L + j], W[AL + j], W[AV + j], histb, outb)
+            W[S + j] = psi
+            W[S + L + j] = psi_t
             W[DS + j] = -W[BE + j] / cells
             W[CO + j] = 1.0 / (W[GJ + j] + c0 * W[BT + j])
             W[US + j] = W[GJ + j] * W[KS + j]
@@ -495,7 +451,8 @@ def _below_base(tubes, lanes, W, c0, cells, ust_base, x, histb, outb):
                 for j in range(L):
                     psi_t = W[A + L + j]
                     u = (W[A + 2 * L + j] + W[US + j] * uz_ref - W[BT + j] * W[HI + L + j]) * W[CO + j]
-                    kv, km = c0 * u + W[HI + L + j], 2.0 * W[RI + j] * (c0 * psi_t + W[HI + j])
+                    kv = c0 * u + W[HI + L + j] + _base_stretch(tubes, lanes, W, i, j, W[BE + j], u)
+                    km = 2.0 * W[RI + j] * (c0 * psi_t + W[HI + j])
                     W[OU + j] = psi_t
                     W[OU + L + j] = u
                     h = ahead * W[DS + j]
@@ -523,7 +480,7 @@ def _below_base(tubes, lanes, W, c0, cells, ust_base, x, histb, outb):
         if i == 0:
             for j in range(L):
                 half = 0.5 * W[S + j]
-                s, c = _sincos(half)
+                s, c = sincos(half)
                 W[Y + H0 * L + j] = c
                 W[Y + (H0 + 1) * L + j] = 0.0
                 W[Y + (H0 + 2) * L + j] = 0.0
@@ -558,7 +515,7 @@ def _base_plate(tubes, lanes, W, ust0):
         for j in range(L):
             s, c = 0.0, 1.0
             if i > 0:
-                s, c = _sincos(W[Y + (Z0 + n + i - 1) * L + j])
+                s, c = sincos(W[Y + (Z0 + n + i - 1) * L + j])
             W[A + j] = -W[EI + j] * W[KS + j] * (c * vx - s * vy)
             W[A + L + j] = -W[EI + j] * W[KS + j] * (s * vx + c * vy)
     for j in range(L):
@@ -568,7 +525,11 @@ def _base_plate(tubes, lanes, W, ust0):
         mx, my = W[Y + M0 * L + j], W[Y + (M0 + 1) * L + j]
         eps = W[FR + 2 * L + j]
         W[Y + (Z0 + n - 1) * L + j] += (
-            W[FR + 3 * L + j] * math.sqrt(mx * mx + my * my) * rate / math.sqrt(rate * rate + eps * eps)
+            _coulomb(tubes, lanes, W, j, rate)
+            * W[FR + 3 * L + j]
+            * math.sqrt(mx * mx + my * my)
+            * rate
+            / math.sqrt(rate * rate + eps * eps)
             + W[FR + 4 * L + j] * rate
         )
 
@@ -579,12 +540,7 @@ def sweep(
     lanes,
     W,
     c0,
-    sec_cells,
-    sec_tubes,
-    ust,
-    ust0,
-    ust_base,
-    base_cells,
+    mesh,
     par,
     seclen,
     x,
@@ -610,8 +566,10 @@ def sweep(
     Y, YS, K, ACC, HI, OU, TMP, PAR, MA, MB = offsets(tubes, lanes)
     for r in range(NP * L):
         W[PAR + r] = par[r]
-    _below_base(tubes, lanes, W, c0, base_cells, ust_base, x, histb, outb)
-    _base_plate(tubes, lanes, W, ust0)
+    sec_cells, sec_tubes, ust = mesh.sec_cells, mesh.sec_tubes, mesh.ust
+    _start_motion(tubes, lanes, W, c0, histb, outb)
+    _below_base(tubes, lanes, W, c0, mesh.base_cells, mesh.ust_base, x, histb, outb)
+    _base_plate(tubes, lanes, W, mesh.ust0)
 
     point = 0
     node = 0
@@ -619,6 +577,7 @@ def sweep(
     for k in range(len(sec_cells)):
         present = sec_tubes[k]
         # transition into this section: friction from the jump of the inner tubes' moments
+        _start_section(tubes, lanes, W, mesh.bp_tube, seclen, k)
         at = np.uint64(point * F * L)
         for r in range(F * L):
             W[HI + r] = hist[at + np.uint64(r)]
@@ -636,7 +595,7 @@ def sweep(
         cells = sec_cells[k]
         for j in range(L):
             W[MA + j] = seclen[k * L + j] / cells  # MA is free until the section's end
-        for _cell in range(cells):
+        for cell in range(cells):
             here = np.uint64(node * S * L)
             for r in range(S * L):
                 nodes[here + np.uint64(r)] = W[Y + r]
@@ -647,6 +606,9 @@ def sweep(
                 at = np.uint64(point * F * L)
                 for r in range(F * L):
                     W[HI + r] = hist[at + np.uint64(r)]
+                _move_grid(
+                    tubes, lanes, W, (cell + (0.0 if stage == 0 else 1.0 if stage == 3 else 0.5)) / cells
+                )
                 _derivative(tubes, lanes, W, present, ust, point * 3 * n, c0)
                 for r in range(F * L):
                     out[at + np.uint64(r)] = W[OU + r]
@@ -671,6 +633,7 @@ def sweep(
             nodes[here + np.uint64(r)] = W[Y + r]
             W[YS + r] = W[Y + r]
         node += 1
+        _move_grid(tubes, lanes, W, 1.0)
         _derivative(tubes, lanes, W, present, ust, point * 3 * n, c0)
         for r in range(F * L):
             out[at + np.uint64(r)] = W[OU + r]
@@ -689,8 +652,13 @@ def sweep(
                     W[Y + M0 * L + j] += W[TMP + 3 * L + j]
                     W[Y + (M0 + 1) * L + j] += W[TMP + 4 * L + j]
                     W[Y + (Z0 + i) * L + j] += W[TMP + 5 * L + j]
+                _tilt(tubes, lanes, W, c0, i, histb, outb)
     # tip of tube 1: external wrench (base axes) against the internal one and the body, (21)
     FT = PAR + (14 * n + 3) * L
+    FE = TMP + 6 * L  # the force on the tip
+    for r in range(3 * L):
+        W[FE + r] = W[FT + r]
+    _tip_forces(tubes, lanes, W, FE)
     for j in range(L):
         a, b_, c, d = (
             W[Y + H0 * L + j],
@@ -702,7 +670,7 @@ def sweep(
         r00, r01, r02 = 1.0 - k2 * (c * c + d * d), k2 * (b_ * c - a * d), k2 * (b_ * d + a * c)
         r10, r11, r12 = k2 * (b_ * c + a * d), 1.0 - k2 * (b_ * b_ + d * d), k2 * (c * d - a * b_)
         r20, r21, r22 = k2 * (b_ * d - a * c), k2 * (c * d + a * b_), 1.0 - k2 * (b_ * b_ + c * c)
-        fx, fy, fz = W[FT + j], W[FT + L + j], W[FT + 2 * L + j]
+        fx, fy, fz = W[FE + j], W[FE + L + j], W[FE + 2 * L + j]
         tx, ty, tz = W[FT + 3 * L + j], W[FT + 4 * L + j], W[FT + 5 * L + j]
         res[j] = r00 * fx + r10 * fy + r20 * fz - W[Y + N0 * L + j] - W[TMP + j]
         res[L + j] = r01 * fx + r11 * fy + r21 * fz - W[Y + (N0 + 1) * L + j] - W[TMP + L + j]

@@ -5,6 +5,25 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
+EXTENDED = (
+    ("stribeck_excess", 1),
+    ("stribeck_inverse_speed", 1),
+    ("overlap_friction", 1),
+    ("drag_linear", 1),
+    ("drag_quadratic", 1),
+    ("play", 1),
+    ("play_moment", 1),
+    ("spring_stiffness", 1),
+    ("spring_damping", 1),
+    ("spring_force", 3),
+    ("contact_stiffness", 1),
+    ("contact_normal", 3),
+    ("contact_offset", 1),
+    ("insertion", 1),
+    ("play_share", 1),
+)
+EXTENDED_TUBES = ("oval_cos", "oval_sin", "softening", "drive_compliance", "drive_inertia", "beta_rate")
+
 
 class Layout:
     """Row numbers of the parameters of ``n`` tubes: one number a tube for the first fourteen groups, then g, the tip wrench and friction.
@@ -38,6 +57,12 @@ class Layout:
         for name in ("tube_coulomb", "tube_viscous", "epsilon", "base_coulomb", "base_viscous"):
             self._rows[name] = slice(base, base + 1)
             base += 1
+        for name, size in EXTENDED:  # read by ctr_dynamics.model.extended only
+            self._rows[name] = slice(base, base + size)
+            base += size
+        for name in EXTENDED_TUBES:
+            self._rows[name] = slice(base, base + n)
+            base += n
         self.size = base
 
     def __getitem__(self, name: str) -> slice:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ctr_dynamics.model.kernels import workspace_rows
+from ctr_dynamics.effects import make_setup
 from ctr_dynamics.model.layout import Layout
 from ctr_dynamics.model.mesh import (
     Key,
@@ -18,7 +18,10 @@ from ctr_dynamics.model.mesh import (
     section_key,
 )
 from ctr_dynamics.model.newton import buffers, lanes_for
+from ctr_dynamics.model.workspace import workspace_rows
 from ctr_dynamics.robot import Robot
+
+PLAY_MOMENT = 0.01  # N m at which 70 % of a tube's play is taken up
 
 
 class Model:
@@ -26,19 +29,20 @@ class Model:
 
     Attributes:
         n: number of tubes; tube 1 is the innermost.
-        tubes, lane: tuples whose lengths tell the compiler the tube count and one lane.
+        tubes, lane: tuples whose lengths tell the compiler the tube count and one lane; ``tubes`` holds floats for the extended kernels.
+        extended: whether those are in use: when the robot file names an extension that changes the physics.
         jacobian_lanes: lanes of the Jacobian's sweep.
         layout: rows of the parameter block.
-        parameters: (NP,) block at the robot file's values; actuators and tip wrench are 0.
+        plain_parameters: (NP,) block at the robot file's values without its extensions; actuators and tip wrench are 0.
+        setup: what a prediction needs besides, extensions included. parameters: its block.
         scale: (5 + N,) N and N m, unit of each shooting residual; step: (5 + N,) perturbation of each unknown for Newton's
             method; tangent_step: a smaller one, for tangents.
         nodes: requested nodes from plate to tip.
     """
 
-    def __init__(self, robot: Robot, nodes: int = 24, base_cells: int = 4) -> None:
+    def __init__(self, robot: Robot, nodes: int = 24, base_cells: int = 4, extended: bool = False) -> None:
         self.robot = robot
         self.n = n = robot.n_tubes
-        self.tubes = (0,) * n
         self.lane = ()
         self.jacobian_lanes = lanes_for(6 + n)
         self.layout = Layout(n)
@@ -55,7 +59,7 @@ class Model:
         )
         bodies = [tube.end_body for tube in robot.tubes]
         inertia = np.array([body.inertia.value if body else (0.0, 0.0, 0.0) for body in bodies])
-        self.parameters = self.layout.pack(
+        self.plain_parameters = self.layout.pack(
             bending_stiffness=[tube.bending_stiffness for tube in robot.tubes],
             torsional_stiffness=[tube.torsion_stiffness for tube in robot.tubes],
             mass_per_length=[tube.density.value * tube.area for tube in robot.tubes],
@@ -73,7 +77,13 @@ class Model:
             epsilon=robot.friction.epsilon.value,
             base_coulomb=robot.friction.base.coulomb.value,
             base_viscous=robot.friction.base.viscous.value,
+            play_moment=PLAY_MOMENT,
+            play_share=1.0,
         )
+        self.setup = make_setup(self)
+        self.parameters = self.setup.block
+        self.extended = extended or self.setup.extended
+        self.tubes: tuple[float, ...] = (0.0,) * n if self.extended else (0,) * n
         reach = float(robot.lengths[0] + robot.rest.beta.value[0])
         stiffness = robot.tubes[0].bending_stiffness
         force, moment = stiffness / reach**2, stiffness / reach
@@ -87,6 +97,11 @@ class Model:
             for segments in self.segments
             for segment in segments
         )
+
+    @property
+    def input_count(self) -> int:
+        """Inputs of a stage: alpha, its rate, beta of every tube, force and torque on the tip, and beta rates in the extended model."""
+        return (4 if self.extended else 3) * self.n + 6
 
     def mesh(self, beta: np.ndarray, key: Key | None = None) -> tuple[Key, Mesh]:
         """Key and mesh of the sections at the translations ``beta`` (N,) m; with ``key`` the sections are kept while they still suit.

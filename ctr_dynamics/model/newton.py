@@ -5,7 +5,8 @@ import math
 import numpy as np
 from numba import njit
 
-from ctr_dynamics.model.kernels import lane_count, sweep
+from ctr_dynamics.model.kernels import sweep
+from ctr_dynamics.model.workspace import base_rows, field_rows, lane_count, parameter_rows, state_rows
 
 CONVERGED, STALLED, NOT_FINITE = 0, 1, 2
 
@@ -45,7 +46,7 @@ def jacobian(tubes, lanes, mesh, c0, par, seclen, x, hist, histb, big, step, inv
     broadcast(lanes, histb, histbL)
     for i in range(m):
         xL[i * L + i + 1] += step[i]
-    sweep(tubes, lanes, W, c0, mesh.sec_cells, mesh.sec_tubes, mesh.ust, mesh.ust0, mesh.ust_base, mesh.base_cells,
+    sweep(tubes, lanes, W, c0, mesh,
           parL, seclenL, xL, histL, histbL, outL, outbL, nodesL, resL)  # fmt: skip
     matrix = np.empty((m, m))
     for i in range(m):
@@ -137,7 +138,7 @@ def solve(
             return NOT_FINITE, 0, 0, 1
         jacobians += 1
         newest = True
-    sweep(tubes, lane, W, c0, mesh.sec_cells, mesh.sec_tubes, mesh.ust, mesh.ust0, mesh.ust_base, mesh.base_cells,
+    sweep(tubes, lane, W, c0, mesh,
           par, seclen, x, hist, histb, out, outb, nodes, res)  # fmt: skip
     sweeps += 1
     norm = scaled_norm(res, scale)
@@ -156,7 +157,7 @@ def solve(
         while True:
             for i in range(m):
                 trial[i] = x[i] + factor * dx[i]
-            sweep(tubes, lane, W, c0, mesh.sec_cells, mesh.sec_tubes, mesh.ust, mesh.ust0, mesh.ust_base, mesh.base_cells,
+            sweep(tubes, lane, W, c0, mesh,
                   par, seclen, trial, hist, histb, out, outb, nodes, res)  # fmt: skip
             sweeps += 1
             best = scaled_norm(res, scale)
@@ -197,7 +198,7 @@ def solve(
         jacobians += 1
         newest = True
         if best >= norm:  # the trial was rejected: res belongs to it, so evaluate at x again
-            sweep(tubes, lane, W, c0, mesh.sec_cells, mesh.sec_tubes, mesh.ust, mesh.ust0, mesh.ust_base, mesh.base_cells,
+            sweep(tubes, lane, W, c0, mesh,
                   par, seclen, x, hist, histb, out, outb, nodes, res)  # fmt: skip
             sweeps += 1
             norm = scaled_norm(res, scale)
@@ -211,11 +212,11 @@ def lanes_for(count: int) -> tuple[int, ...]:
 
 def buffers(n: int, mesh, points: int, nodes: int, lanes: int, rows: int):
     """Zeroed buffers of a sweep with ``lanes`` lanes: (W, par, seclen, x, hist, histb, out, outb, nodes, res), flat."""
-    S, F = 16 + 3 * n, 7 + 2 * n
-    base = n * (4 * mesh.base_cells + 1) * 2
+    S, F = state_rows(n), field_rows(n)
+    base = base_rows(n, mesh.base_cells)
     sizes = (
         rows,
-        14 * n + 14,
+        parameter_rows(n),
         len(mesh.sec_cells),
         5 + n,
         points * F,

@@ -208,14 +208,15 @@ class Simulator:
         n, stages = self.model.n, scheme.stages
         at_stages = [inputs_at(t + c * scheme.dt) for c in scheme.times]
         last = at_stages[-1]
-        inputs = np.empty((stages, 3 * n + 6))
+        inputs = np.empty((stages, self.model.input_count))
         for i, now in enumerate(at_stages):
             inputs[i, :n], inputs[i, n : 2 * n], inputs[i, 2 * n : 3 * n] = (
                 now.alpha,
                 now.alpha_rate,
                 now.beta,
             )
-            inputs[i, 3 * n : 3 * n + 3], inputs[i, 3 * n + 3 :] = now.force, now.torque
+            inputs[i, 3 * n : 3 * n + 3], inputs[i, 3 * n + 3 : 3 * n + 6] = now.force, now.torque
+            inputs[i, 3 * n + 6 :] = now.beta_rate[: self.model.input_count - 3 * n - 6]
         if not np.isfinite(inputs).all():
             return StepResult(False, "actuators or load hold a number that is not finite", 0, 0, 0)
         bank, mesh = state.bank, state.mesh
@@ -250,7 +251,19 @@ class Simulator:
         records: tuple[Record, ...] = ()
         if record:
             rates = bank[RATES : RATES + stages].copy()
-            records = (Record(scheme, key, mesh, before, state.fields.copy(), rates, inputs, found.copy(), t + scheme.times * scheme.dt),)
+            records = (
+                Record(
+                    scheme,
+                    key,
+                    mesh,
+                    before,
+                    state.fields.copy(),
+                    rates,
+                    inputs,
+                    found.copy(),
+                    t + scheme.times * scheme.dt,
+                ),
+            )
         return StepResult(True, "ok", iterations, sweeps, jacobians, records=records)
 
     def _work(self, key: tuple, mesh: Mesh) -> tuple:

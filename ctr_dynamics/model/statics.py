@@ -10,10 +10,11 @@ from itertools import product
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ctr_dynamics.model.kernels import lane_count, sweep
+from ctr_dynamics.model.kernels import sweep
 from ctr_dynamics.model.mesh import Mesh, section_lengths
 from ctr_dynamics.model.model import Model
 from ctr_dynamics.model.newton import CONVERGED, broadcast, lanes_for, solve
+from ctr_dynamics.model.workspace import lane_count
 
 
 @dataclass
@@ -233,8 +234,7 @@ class _Work:
         W, _, _, _, hist, histb, out, outb, nodes, res = self.plain
         mesh = self.mesh
         sweep(
-            self.model.tubes, self.model.lane, W, 0.0, mesh.sec_cells, mesh.sec_tubes, mesh.ust, mesh.ust0, mesh.ust_base,
-            mesh.base_cells, par, self.seclen, x, hist, histb, out, outb, nodes, res,
+            self.model.tubes, self.model.lane, W, 0.0, mesh, par, self.seclen, x, hist, histb, out, outb, nodes, res,
         )  # fmt: skip
 
     def result(self, key: tuple, x: np.ndarray, par: np.ndarray, converged: bool) -> Equilibrium:
@@ -290,7 +290,7 @@ class _Work:
         for i, row in enumerate(alpha_rows):
             parL[row * L + 1 + m + i] += 1e-7
         sweep(
-            model.tubes, self.lanes, W, 0.0, mesh.sec_cells, mesh.sec_tubes, mesh.ust, mesh.ust0, mesh.ust_base, mesh.base_cells,
+            model.tubes, self.lanes, W, 0.0, mesh,
             parL, seclenL, xL, histL, histbL, outL, outbL, nodesL, resL,
         )  # fmt: skip
         out = np.ascontiguousarray(outL.reshape(-1, L).T)

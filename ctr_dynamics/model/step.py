@@ -3,10 +3,10 @@
 import numpy as np
 from numba import njit
 
-from ctr_dynamics.model.kernels import input_row
 from ctr_dynamics.model.mesh import section_lengths
 from ctr_dynamics.model.newton import CONVERGED, solve
 from ctr_dynamics.model.scheme import RATE_NOW, RATES, Y_BEFORE, Y_NOW
+from ctr_dynamics.model.workspace import input_row
 
 
 @njit(cache=True, nogil=True)

@@ -7,11 +7,12 @@ the unknowns give the Jacobian of the shooting problem, through which every colu
 import numpy as np
 from numba import njit
 
-from ctr_dynamics.model.kernels import input_row, lane_count, sweep
+from ctr_dynamics.model.kernels import sweep
 from ctr_dynamics.model.mesh import section_lengths
 from ctr_dynamics.model.newton import broadcast, invert
 from ctr_dynamics.model.scheme import RATE_NOW, RATES, Y_BEFORE, Y_NOW
 from ctr_dynamics.model.step import history
+from ctr_dynamics.model.workspace import input_row, lane_count
 
 THETA = 0.55  # of the one-stage tangent: nearly the trapezoidal rule, with a little damping of what the step does not resolve
 
@@ -97,7 +98,7 @@ def linearise(
         section_lengths(mesh.bp_tube, mesh.bp_offset, beta, lengths)
         for k in range(sections):
             seclenL[k * L + j] = lengths[k]
-    sweep(tubes, lanes, W, c0, mesh.sec_cells, mesh.sec_tubes, mesh.ust, mesh.ust0, mesh.ust_base, mesh.base_cells,
+    sweep(tubes, lanes, W, c0, mesh,
           parL, seclenL, xL, histL, histbL, outL, outbL, nodesL, resL)  # fmt: skip
     jacobian = np.empty((m, m))
     for i in range(m):

@@ -143,13 +143,13 @@ class _Columns:
         many, work, _ = self.buffers(state.key, state.mesh, slots)
         hist, histb, dhist, _, dfields, dstage = work
         hist[:], histb[:], dhist[:] = 0.0, 0.0, 0.0
-        rows = input_rows(n)
+        rows = input_rows(n)[: len(row)]
         par = par.copy()
         par[rows] = row
-        par[layout["alpha_rate"]] = 0.0
+        par[layout["alpha_rate"]] = par[layout["beta_rate"]] = 0.0
         dstage[:] = self.effect
-        dstage[rows] += drow
-        dstage[layout["alpha_rate"]] = 0.0
+        dstage[rows] += drow[: len(rows)]
+        dstage[layout["alpha_rate"]] = dstage[layout["beta_rate"]] = 0.0
         linearise(
             self.model.tubes, self.wide, state.mesh, 0.0, par, dstage, state.unknowns[-1], hist, histb, dhist, EPSILON,
             self.model.tangent_step, many, self.matrix, self.dx, dfields, self.dnodes,
@@ -179,12 +179,14 @@ class _Columns:
 
 def input_rows(n: int) -> NDArray[np.int64]:
     """Rows of the parameter block that hold the inputs of ``n`` tubes, in their order."""
-    return np.concatenate([np.arange(11 * n, 14 * n), np.arange(14 * n + 3, 14 * n + 9)])
+    return np.concatenate(
+        [np.arange(11 * n, 14 * n), np.arange(14 * n + 3, 14 * n + 9), np.arange(19 * n + 33, 20 * n + 33)]
+    )
 
 
-def to_inputs(n: int, row: Floats, beta_rate: Floats | None = None) -> Inputs:
-    """One row of inputs (3N + 6,) as :class:`Inputs`."""
-    rate = np.zeros(n) if beta_rate is None else beta_rate
+def to_inputs(n: int, row: Floats) -> Inputs:
+    """One row of inputs as :class:`Inputs`; without rates of beta they are 0."""
+    rate = row[3 * n + 6 :] if len(row) > 3 * n + 6 else np.zeros(n)
     return Inputs(
         row[:n], row[n : 2 * n], row[2 * n : 3 * n], rate, row[3 * n : 3 * n + 3], row[3 * n + 3 : 3 * n + 6]
     )
@@ -206,10 +208,11 @@ def run(
 
     Args:
         parameters: (NP,) block; the actuators and the tip wrench in it are not read.
-        inputs: gives (k, 3N + 6) alpha, alpha rate, beta, force, torque (rad, rad/s, m, N, N m) at times (k,) s.
+        inputs: gives (k, model.input_count) alpha, alpha rate, beta, force, torque and, for the extended model, beta rate (rad, rad/s, m, N,
+            N m, m/s) at times (k,) s.
         duration: s; the number of steps is the largest that does not pass it.
         effect: (NP, r) derivative of the parameter block by r quantities, in units in which a millionth is a small change.
-        input_effect: gives (k, 3N + 6, r) derivatives of the inputs at times (k,).
+        input_effect: gives (k, inputs, r) derivatives of the inputs at times (k,).
         guess: (5 + N,) unknowns of the static equilibrium to start from.
     Raises:
         InputError: no static equilibrium at the first inputs.
@@ -220,15 +223,16 @@ def run(
     steps = int(np.floor(duration / dt + 1e-9))
     first = inputs(np.zeros(1))[0]
     at_rest = to_inputs(n, first)
-    state = simulator.rest(Inputs(at_rest.alpha, np.zeros(n), at_rest.beta, np.zeros(n), at_rest.force, at_rest.torque), guess)
+    state = simulator.rest(
+        Inputs(at_rest.alpha, np.zeros(n), at_rest.beta, np.zeros(n), at_rest.force, at_rest.torque), guess
+    )
     tip = np.empty((steps + 1, TIP_ROWS))
     tip[0] = state.nodes[-1, :TIP_ROWS]
     columns: _Columns | None = None
     out: Floats | None = None
     if effect is not None:
-        rows = 3 * n + 6
         r = effect.shape[1]
-        give = input_effect or (lambda times: np.zeros((len(times), rows, r)))
+        give = input_effect or (lambda times: np.zeros((len(times), model.input_count, r)))
         columns = _Columns(model, effect, give)
         out = np.empty((steps + 1, TIP_ROWS, r))
         out[0] = columns.start(state, parameters, first, give(np.zeros(1))[0], RATES + stages)
@@ -284,7 +288,12 @@ def run(
             k += 1
     done = k + 1
     return Trajectory(
-        np.arange(done) * dt, tip[:done], beta_rate[:done], None if out is None else out[:done], failure, sweeps
+        np.arange(done) * dt,
+        tip[:done],
+        beta_rate[:done],
+        None if out is None else out[:done],
+        failure,
+        sweeps,
     )
 
 
@@ -339,4 +348,3 @@ def _fast(
     if taken:
         state.nodes = nodes.reshape(-1, S).copy() if outcome == CONVERGED else state.nodes
     return taken, sweeps, outcome
-

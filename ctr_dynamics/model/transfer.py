@@ -8,6 +8,7 @@ import numpy as np
 from scipy.sparse import csr_array
 
 from ctr_dynamics.model.mesh import STAGES, Key, Mesh
+from ctr_dynamics.model.workspace import base_rows
 
 _STAGE_XI = (0.0, 0.5, 0.5, 1.0)
 
@@ -33,7 +34,7 @@ def coarse_key(key: Key, nodes: int) -> Key:
 def transfer(n: int, fine: Mesh, coarse: Mesh) -> Transfer:
     """Cubic interpolation inside each section, between the points that are nodes; fields behind the plate are the same on both meshes."""
     F = 7 + 2 * n
-    base = n * (STAGES * fine.base_cells + 1) * 2
+    base = base_rows(n, fine.base_cells)
     return Transfer(
         _fields(fine.sec_cells, coarse.sec_cells, F, base),
         _fields(coarse.sec_cells, fine.sec_cells, F, base),

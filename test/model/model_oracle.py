@@ -171,7 +171,7 @@ class Oracle:
         """(18) and (19): state at s = 0- and the fields behind the plate."""
         n, p, mesh, c0 = self.n, self.p, self.mesh, self.c0
         points = 4 * mesh.base_cells + 1
-        histb = histb.reshape(n, points, 2)
+        histb = histb[: n * points * 2].reshape(n, points, 2)
         reference = mesh.ust_base.reshape(n, points)
         fields = np.zeros((n, points, 2))
         ends = []

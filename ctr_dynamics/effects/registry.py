@@ -1,0 +1,193 @@
+"""What the model can be extended by: effects, their parameters, and how a parameter's value changes the prediction.
+
+An effect is declared once, with the names, units and signs under which findings and robot files know it. It acts on a :class:`Setup`: the
+model's parameter block, the way from encoder readings to actuators, and the way from the tip to a tracker's reading. At the off-values
+of its parameters it leaves the setup as it is, bit for bit.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from ctr_dynamics.effects.setup import Setup
+    from ctr_dynamics.robot import Robot
+
+Floats = NDArray[np.float64]
+Values = Mapping[str, float]
+Nominal = Callable[["Robot", int], float]  # of a robot and a tube (from 0)
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One parameter of an effect.
+
+    Attributes:
+        name: as in findings and robot files; N in ``tubeN`` stands for a tube's number from 1.
+        unit: SI.
+        off: value at which the effect does nothing; a function where the robot file says it. ``math.inf`` for parameters that act by their
+            reciprocal.
+        scale: 1-sigma of a plausible departure, in the parameter's coordinate (see :meth:`coordinate`); a function where it depends on the robot.
+        tolerance: 1-sigma that the robot file allows, in the same coordinate.
+        low, high: bounds of the coordinate's departure from off, inclusive.
+        text: what it is.
+        power: the coordinate is value^power: -1 for a stiffness that acts as a compliance, -2 where the effect grows with its square.
+        shape: True for a parameter that has no effect by itself (a speed, an axis, a place); its ``off`` is where a search starts.
+    """
+
+    name: str
+    unit: str
+    off: float | Nominal
+    scale: float | Nominal
+    tolerance: Nominal | None = None
+    low: float = -math.inf
+    high: float = math.inf
+    text: str = ""
+    power: int = 1
+    shape: bool = False
+
+    def coordinate(self, value: float) -> float:
+        """The number in which the effect is nearly linear."""
+        if self.power == 1:
+            return value
+        return 0.0 if math.isinf(value) else value**self.power
+
+    def value(self, coordinate: float) -> float:
+        """Inverse of :meth:`coordinate`."""
+        if self.power == 1:
+            return coordinate
+        return math.inf if coordinate <= 0.0 else coordinate ** (1.0 / self.power)
+
+
+@dataclass(frozen=True)
+class Effect:
+    """One entry of the catalogue.
+
+    Attributes:
+        name: its ID.
+        parameters: what it takes.
+        apply: changes a setup by values by name (all names present, ``tubeN`` expanded).
+        text: what it models, one sentence. source: where the physics comes from.
+        extended: whether it needs the extended kernels.
+        smooth: whether the prediction has a derivative at the off-value; others need finite probes.
+        joint: parameters that are only tried together (a vector); else each is a variant of its own.
+    """
+
+    name: str
+    parameters: tuple[Parameter, ...]
+    apply: Callable[[Setup, Values], None]
+    text: str
+    source: str
+    extended: bool = False
+    smooth: bool = True
+    joint: bool = False
+
+    def accepts(self, name: str) -> bool:
+        """Whether ``name`` is one of its parameters."""
+        return any(
+            re.fullmatch(re.escape(p.name).replace("tubeN", "tube[1-9]"), name) for p in self.parameters
+        )
+
+    def find(self, name: str) -> Parameter:
+        """The parameter called ``name``, with a tube's number or without."""
+        generic = re.sub(r"^tube[1-9]", "tubeN", name)
+        return next(p for p in self.parameters if p.name in (name, generic))
+
+
+EFFECTS: dict[str, Effect] = {}
+
+
+def register(effect: Effect) -> Effect:
+    """Make ``effect`` known.
+
+    Raises:
+        ValueError: another effect has its name.
+    """
+    if EFFECTS.setdefault(effect.name, effect) is not effect:
+        raise ValueError(f"effect '{effect.name}' is registered twice")
+    return effect
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """One parameter of one effect for one robot: what diagnosis estimates.
+
+    Attributes:
+        effect: ID. name: parameter, tube expanded. off: coordinate at which nothing happens. tolerance, scale: 1-sigma in the coordinate.
+        low, high: bounds of the coordinate.
+    """
+
+    effect: str
+    name: str
+    off: float
+    tolerance: float
+    scale: float
+    low: float
+    high: float
+    parameter: Parameter = field(compare=False)
+
+    @property
+    def key(self) -> tuple[str, str]:
+        """(effect, name)."""
+        return self.effect, self.name
+
+    @property
+    def extended(self) -> bool:
+        """Whether it needs the extended kernels."""
+        return EFFECTS[self.effect].extended
+
+
+def _number(x: float | Nominal, robot: Robot, tube: int) -> float:
+    return float(x(robot, tube)) if callable(x) else float(x)
+
+
+def quantities(robot: Robot) -> list[Quantity]:
+    """Every parameter of every registered effect for ``robot``, tubes expanded."""
+    found = []
+    for effect in EFFECTS.values():
+        for p in effect.parameters:
+            for tube in range(robot.n_tubes) if p.name.startswith("tubeN") else [0]:
+                scale = _number(p.scale, robot, tube)
+                if scale <= 0.0:
+                    continue
+                off = p.coordinate(_number(p.off, robot, tube))
+                tolerance = p.tolerance(robot, tube) if p.tolerance else 0.0
+                found.append(
+                    Quantity(
+                        effect.name,
+                        p.name.replace("tubeN", f"tube{tube + 1}"),
+                        off,
+                        tolerance,
+                        scale,
+                        max(p.low, -math.inf),
+                        p.high,
+                        p,
+                    )  # fmt: skip
+                )
+    return found
+
+
+def apply_effects(setup: Setup, given: Mapping[str, Mapping[str, Any]]) -> None:
+    """Change ``setup`` by effects and values by name; parameters that are not given stay at their off-values.
+
+    Raises:
+        KeyError: no such effect or parameter (robot files are checked when they are loaded).
+    """
+    for name, values in given.items():
+        effect = EFFECTS[name]
+        full: dict[str, float] = {}
+        for p in effect.parameters:
+            for tube in range(setup.n) if p.name.startswith("tubeN") else [0]:
+                full[p.name.replace("tubeN", f"tube{tube + 1}")] = _number(p.off, setup.robot, tube)
+        unknown = set(values) - set(full)
+        if unknown:
+            raise KeyError(f"{name} has no parameter {sorted(unknown)}")
+        full.update({k: float(v) for k, v in values.items()})
+        effect.apply(setup, full)
