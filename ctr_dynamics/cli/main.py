@@ -6,7 +6,7 @@ import functools
 import inspect
 import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from importlib import import_module
 from importlib.util import find_spec
 from typing import Annotated, Any
@@ -28,6 +28,9 @@ COMMANDS = {
     "warmup": "Compile every kernel into the cache.",
     "demo": "Estimator node and driver live over DDS on a shipped bag.",
 }
+
+# Options of commands that take several values.
+MANY = {"diagnose": ("--validate",)}
 
 FINISHED, PARTLY_FAILED, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
 
@@ -107,6 +110,22 @@ def build_app(requested: str | None) -> typer.Typer:
     return app
 
 
+def spread(arguments: list[str], options: Sequence[str]) -> list[str]:
+    """Options that take every value up to the next option, as one option a value: the parser knows only that."""
+    out: list[str] = []
+    current = ""
+    for argument in arguments:
+        if argument.startswith("-") and argument != "-":
+            current = argument if argument in options else ""
+            if not current:
+                out.append(argument)
+        elif current:
+            out += [current, argument]
+        else:
+            out.append(argument)
+    return out
+
+
 def main(argv: list[str] | None = None) -> int:
     """Run the command line.
 
@@ -118,6 +137,7 @@ def main(argv: list[str] | None = None) -> int:
     """
     arguments = sys.argv[1:] if argv is None else argv
     requested = next((a for a in arguments if not a.startswith("-")), None)
+    arguments = spread(arguments, MANY.get(requested or "", ()))
     try:
         build_app(requested)(args=arguments, prog_name="ctr-dynamics")
     except SystemExit as end:

@@ -53,7 +53,7 @@ register(
                 0.02,
                 lambda robot, i: robot.encoders.offset.tolerance,
                 text="true angle minus gain times reading",
-            ),  # fmt: skip
+            ),
         ),
         _offset,
         "A tube's true angle differs from its reading by a constant.",
@@ -185,5 +185,38 @@ register(
         "Tubes tilt within their clearance at the end of the outer one, about the moment that passes.",
         "smooth saturation of the tilt, play * m / sqrt(m^2 + m0^2) with m0 = 0.01 N m; clearance: Ha, Fritzler, Park and Dupont (2016)",
         extended=True,
+    )
+)
+
+
+def _share(setup: Setup, values: Values) -> None:
+    setup.put("play_share", values["share"])
+
+
+register(
+    Effect(
+        "play_kinematics",
+        (Parameter("share", "1", 1.0, 0.7, lambda robot, i: 0.7, text="part of the tilt by which velocities turn; 1 for rigid tubes"),),
+        _share,
+        "Model-form uncertainty of the clearance: how velocities pass the tilt.",
+        "docs/diagnosis.md",
+        extended=True,
+        nuisance=True,
+    )
+)
+
+
+def _shift(setup: Setup, values: Values) -> None:
+    setup.load_shift += values["delay_s"]
+
+
+register(
+    Effect(
+        "load_time",
+        (Parameter("delay_s", "s", 0.0, 0.001, lambda robot, i: 0.001, text="known loads act this much later than stamped"),),
+        _shift,
+        "Event times, such as the cut of a string, are known to about a millisecond.",
+        "docs/diagnosis.md",
+        nuisance=True,
     )
 )

@@ -84,7 +84,7 @@ for _id, _name, _unit, _where, _kind, _factor, _floor, _text in (
                     _of_file(_where, _kind, 1.0, 0.0, True),
                     low=0.0,
                     text="the coefficient itself, not a factor",
-                ),  # fmt: skip
+                ),
             ),
             _put(_id, _name),
             _text,
@@ -121,6 +121,7 @@ register(
         "Coulomb friction is larger near rest (stick-slip where epsilon is small).",
         "Armstrong-Helouvry, Dupont, Canudas de Wit (1994): Gaussian Stribeck curve",
         extended=True,
+        presets=({"speed_rad_s": 0.5}, {"speed_rad_s": 5.0}),
     )
 )
 

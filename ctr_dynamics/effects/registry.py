@@ -78,6 +78,8 @@ class Effect:
         extended: whether it needs the extended kernels.
         smooth: whether the prediction has a derivative at the off-value; others need finite probes.
         joint: parameters that are only tried together (a vector); else each is a variant of its own.
+        presets: values of the shape parameters from which a search starts, by name; several are tried.
+        nuisance: not a cause by itself: it widens what others may explain, and is not in the catalogue of findings.
     """
 
     name: str
@@ -88,6 +90,8 @@ class Effect:
     extended: bool = False
     smooth: bool = True
     joint: bool = False
+    presets: tuple[Mapping[str, float], ...] = ({},)
+    nuisance: bool = False
 
     def accepts(self, name: str) -> bool:
         """Whether ``name`` is one of its parameters."""
@@ -169,7 +173,7 @@ def quantities(robot: Robot) -> list[Quantity]:
                         max(p.low, -math.inf),
                         p.high,
                         p,
-                    )  # fmt: skip
+                    )
                 )
     return found
 

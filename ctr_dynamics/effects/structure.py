@@ -112,14 +112,8 @@ def _payload(robot: Robot) -> float:
 
 
 def _added(setup: Setup, values: Values) -> None:
-    added = values["added_kg"]
-    if added == 0.0:
-        return
-    mass = _payload(setup.robot)
-    setup.add("body_mass", added)
-    if mass > 0.0:  # the same shape, of another density
-        for axis in "xyz":
-            setup.scale(f"body_inertia_{axis}", 0, (mass + added) / mass)
+    if values["added_kg"] != 0.0:
+        setup.add("body_mass", values["added_kg"])
 
 
 register(
@@ -133,10 +127,10 @@ register(
                 lambda robot, i: max(0.08 * _payload(robot), 2e-4),
                 lambda robot, i: robot.tubes[0].end_body.mass.tolerance if robot.tubes[0].end_body else 0.0,
                 text="mass at the tip that the robot file does not know",
-            ),  # fmt: skip
+            ),
         ),
         _added,
-        "The payload is heavier or lighter; its inertia is in proportion.",
+        "The payload is heavier or lighter, as by a point mass at the tip.",
         "Till et al. (2020), (21)",
     )
 )
@@ -159,7 +153,7 @@ register(
                 lambda robot, i: 0.5 if robot.tubes[0].end_body else 0.0,
                 low=0.0,
                 text="factor on the payload's moments of inertia",
-            ),  # fmt: skip
+            ),
         ),
         _inertia,
         "The payload resists rotation more or less than its mass says.",
@@ -188,7 +182,7 @@ register(
                 lambda robot, i: robot.tubes[i].bending_damping.tolerance,
                 low=0.0,
                 text="Kelvin-Voigt coefficient of bending",
-            ),  # fmt: skip
+            ),
         ),
         _damping("bending_damping"),
         "The material damps bending.",
@@ -207,7 +201,7 @@ register(
                 lambda robot, i: robot.tubes[i].torsion_damping.tolerance,
                 low=0.0,
                 text="Kelvin-Voigt coefficient of torsion",
-            ),  # fmt: skip
+            ),
         ),
         _damping("torsion_damping"),
         "The material damps torsion.",
@@ -251,6 +245,7 @@ register(
         "A tube's cross-section is oval: it bends more easily about one axis, twice a turn.",
         "Timoshenko, Strength of Materials: unsymmetrical bending",
         extended=True,
+        presets=({"axis_rad": 0.0}, {"axis_rad": math.pi / 4}),
     )
 )
 
@@ -275,7 +270,7 @@ register(
                 low=0.0,
                 power=-2,
                 text="k_1 in M = E I k / sqrt(1 + (k / k_1)^2), k the departure from the precurvature",
-            ),  # fmt: skip
+            ),
         ),
         _softening,
         "The moment grows slower than the curvature, as in superelastic Nitinol before its plateau.",

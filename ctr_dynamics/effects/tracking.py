@@ -45,7 +45,7 @@ register(
                 0.015,
                 lambda robot, i: float(np.max(robot.tracker.registration_rotation.tolerance)),
                 text=f"turn about {a}",
-            )  # fmt: skip
+            )
             for a in "xyz"
         ),
         _rotation,
@@ -65,7 +65,7 @@ register(
                 0.002,
                 lambda robot, i: float(np.max(robot.tracker.registration_translation.tolerance)),
                 text=f"shift along {a}",
-            )  # fmt: skip
+            )
             for a in "xyz"
         ),
         _translation,
@@ -85,7 +85,7 @@ register(
                 0.002,
                 lambda robot, i: float(np.max(robot.tracker.lever_arm.tolerance)),
                 text=f"sensor position in the tip frame, {a}",
-            )  # fmt: skip
+            )
             for a in "xyz"
         ),
         _lever,

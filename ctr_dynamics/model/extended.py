@@ -303,9 +303,9 @@ def drive(tubes, lanes, W, c0, i, j, torque, angle, rate, histb, outb):
     c = W[_group(tubes, lanes, COMPLIANCE, i) + j]
     inertia = W[_group(tubes, lanes, INERTIA, i) + j]
     h = histb[at]
-    psi = (angle + c * (torque - inertia * (c0 * h + histb[psi_t_history]))) / (1.0 + c * inertia * c0 * c0)
-    outb[at] = psi
-    return psi, rate if c == 0.0 else c0 * psi + h
+    give = c * (torque - inertia * (c0 * (rate + h) + histb[psi_t_history])) / (1.0 + c * inertia * c0 * c0)
+    outb[at] = give
+    return angle + give, rate + c0 * give + h
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -377,7 +377,7 @@ def tilt(tubes, lanes, W, c0, i, histb, outb):
 @njit(cache=True, nogil=True, error_model="numpy")
 def tip_forces(tubes, lanes, W, F):
     """Add the spring's, the damper's and the contact's force on the tip (base axes) to the rows ``F``."""
-    n, L = len(tubes), lane_count(lanes)
+    L = lane_count(lanes)
     Y = offsets(tubes, lanes)[0]
     KS, CS, F0 = (
         _scalar(tubes, lanes, SPRING),

@@ -75,7 +75,7 @@ def input_row(tubes, i):
 
 @njit(cache=True, inline="always")
 def base_rows(n, cells):
-    """Rows of the base part of the fields: psi_t and u_z at every point behind the plate, then per tube the drive's angle psi, the tilt
+    """Rows of the base part of the fields: psi_t and u_z at every point behind the plate, then per tube what its drive gives way (rad), the tilt
     (x, y) at its end, and beta's rate (the last four move in the extended model only).
     """
     return n * (4 * cells + 1) * 2 + 4 * n

@@ -85,45 +85,51 @@ def _wrenches(scenario: Scenario, model: Model, inputs: Inputs) -> list[Floats]:
     return wrenches
 
 
+Drive = Callable[[float], Inputs]
+
+
+def drives(scenario: Scenario, robot: Robot, model: Model) -> tuple[Drive, Drive]:
+    """Actuators and load of ``scenario`` at a time in s: (all loads, the known loads only).
+
+    Raises:
+        InputError: motions leave the actuators' range, are for more tubes than there are, or there is no
+        equilibrium to begin with.
+    """
+    axes = scenario.axes(robot.n_tubes)
+    rest_alpha, rest_beta = np.array(robot.rest.alpha.value), np.array(robot.rest.beta.value)
+
+    def moving(t: float, wrench: Floats) -> Inputs:
+        alpha = rest_alpha + [rotation.value(t) for rotation, _ in axes]
+        beta = rest_beta + [translation.value(t) for _, translation in axes]
+        alpha_rate = np.array([rotation.rate(t) for rotation, _ in axes])
+        beta_rate = np.array([translation.rate(t) for _, translation in axes])
+        return Inputs(alpha, alpha_rate, beta, beta_rate, wrench[:3], wrench[3:])
+
+    dt = scenario.solver.dt_s
+    for k in range(0, math.ceil(scenario.duration_s / dt - 1e-9) + 1, 5):
+        problem = robot.actuator_problem(moving(k * dt, np.zeros(6)).beta)
+        if problem:
+            raise InputError(f"at {k * dt:.3f} s {problem}", do="mend the translations", where="tubes")
+    pairs = list(zip(scenario.loads, _wrenches(scenario, model, moving(0.0, np.zeros(6))), strict=True))
+
+    def total(t: float, known_only: bool) -> Floats:
+        return sum((load.factor(t) * w for load, w in pairs if load.known or not known_only), np.zeros(6))
+
+    return lambda t: moving(t, total(t, False)), lambda t: moving(t, total(t, True))
+
+
 def simulate(scenario: Scenario, robot: Robot, progress: Progress | None = None) -> Recording:
     """Run ``scenario`` with ``robot`` from rest in the static equilibrium of its first inputs.
 
     A step that the solver cannot take ends the run there; ``failure`` says why.
 
     Raises:
-        InputError: motions leave the actuators' range, are for more tubes than there are, or there is no
-        equilibrium to begin with.
+        InputError: as :func:`drives`.
     """
     model = Model(robot, nodes=scenario.solver.nodes)
-    axes = scenario.axes(robot.n_tubes)
-    rest_alpha, rest_beta = np.array(robot.rest.alpha.value), np.array(robot.rest.beta.value)
-
-    def joints(t: float) -> tuple[Floats, Floats]:
-        alpha = rest_alpha + [rotation.value(t) for rotation, _ in axes]
-        return alpha, rest_beta + [translation.value(t) for _, translation in axes]
-
+    at, known = drives(scenario, robot, model)
     dt = scenario.solver.dt_s
     steps = math.ceil(scenario.duration_s / dt - 1e-9)
-    for k in range(0, steps + 1, 5):
-        problem = robot.actuator_problem(joints(k * dt)[1])
-        if problem:
-            raise InputError(f"at {k * dt:.3f} s {problem}", do="mend the translations", where="tubes")
-
-    def moving(t: float, wrench: Floats) -> Inputs:
-        alpha, beta = joints(t)
-        alpha_rate = np.array([rotation.rate(t) for rotation, _ in axes])
-        beta_rate = np.array([translation.rate(t) for _, translation in axes])
-        return Inputs(alpha, alpha_rate, beta, beta_rate, wrench[:3], wrench[3:])
-
-    wrenches = _wrenches(scenario, model, moving(0.0, np.zeros(6)))
-    pairs = list(zip(scenario.loads, wrenches, strict=True))
-
-    def total(t: float, known_only: bool = False) -> Floats:
-        return sum((load.factor(t) * w for load, w in pairs if load.known or not known_only), np.zeros(6))
-
-    def at(t: float) -> Inputs:
-        return moving(t, total(t))
-
     simulator = Simulator(model, make_scheme(scenario.solver.scheme, dt))
     # the tubes start from rest even when a motion begins with a jump of speed
     state = simulator.rest(at(0.0))
@@ -143,8 +149,8 @@ def simulate(scenario: Scenario, robot: Robot, progress: Progress | None = None)
         dt * np.arange(len(rows), dtype=np.float64),
         rows[:, :3],
         quaternion,
-        lambda t: total(t, True),
-        joints,
+        lambda t: np.concatenate([known(t).force, known(t).torque]),
+        lambda t: (at(t).alpha, at(t).beta),
         failure,
     )
 

@@ -1,0 +1,87 @@
+"""A diagnosis from paths to files: what the command runs here, or on a cluster."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from ctr_dynamics.bagio.writer import atomic_file
+from ctr_dynamics.robot import Robot
+from ctr_dynamics.simulation.scenario import Scenario
+
+from .diagnose import Diagnosis, diagnose
+from .findings import findings, write
+from .planning import Plan, plan
+from .recording import read_recording
+
+SCENARIO = "next_experiment.yaml"
+
+
+@dataclass(frozen=True)
+class Request:
+    """Everything a diagnosis needs, ready to be sent elsewhere; paths as text."""
+
+    robot: Robot
+    bags: list[str]
+    validation: list[str]
+    output: str
+    command: str
+    workers: int = 2
+    report: bool = True
+
+
+def _quiet(text: str) -> None:
+    pass
+
+
+def run(request: Request, note: Callable[[str], None] = _quiet) -> dict[str, Any]:
+    """Read, diagnose, write; returns the content of findings.json.
+
+    Raises:
+        InputError: a bag that cannot be used.
+    """
+    note("reading")
+    recordings = [read_recording(path, request.robot) for path in request.bags]
+    others = [read_recording(path, request.robot) for path in request.validation]
+    diagnosis = diagnose(request.robot, recordings, others, note=note, workers=request.workers)
+    if not others:
+        diagnosis.notes.append("without a validation bag the gain is not measured, and a wrong cause that fits is not found out")
+    note("next experiment")
+    planned = plan(diagnosis)
+    directory = Path(request.output)
+    directory.mkdir(parents=True, exist_ok=True)
+    content = findings(diagnosis, request.command, _experiment(planned, directory))
+    write(directory, diagnosis, content)
+    if request.report:
+        _report(diagnosis, content, directory, note)
+    return content
+
+
+def _experiment(planned: Plan | None, directory: Path) -> dict[str, Any] | None:
+    if planned is None:
+        return None
+    with atomic_file(directory / SCENARIO) as part:
+        part.write_text(_yaml(planned.scenario), encoding="utf-8")
+    return {
+        "description": planned.description,
+        "scenario_file": SCENARIO,
+        "separation_before": planned.before,
+        "separation_after": planned.after,
+    }
+
+
+def _yaml(scenario: Scenario) -> str:
+    return yaml.safe_dump(scenario.model_dump(exclude_none=True, mode="json"), sort_keys=False)
+
+
+def _report(diagnosis: Diagnosis, content: dict[str, Any], directory: Path, note: Callable[[str], None]) -> None:
+    try:
+        from ctr_dynamics.diagnosis.report import write_report
+    except ImportError:
+        return
+    note("report")
+    write_report(directory / "report.html", diagnosis, content)

@@ -1,0 +1,136 @@
+"""Mistakes of configuration: units, signs, orders. Tried one by one when the misfit is gross, each undone in the data or the robot file."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from ctr_dynamics.errors import InputError
+from ctr_dynamics.robot import Robot
+from ctr_dynamics.robot.loader import robot_from_dict, robot_to_dict
+
+from .experiment import Experiment
+from .noise import noise_floor
+from .recording import Recording
+
+Pair = tuple[Recording, Robot]
+GROSS = 8.0  # times the noise floor: below, no mistake is looked for
+IMPROVEMENT = 0.25  # of the misfit: a mistake is named when undoing it leaves no more
+
+
+def _alpha(change: Callable[[Any, int], Any]) -> Callable[[Recording, Robot], Pair]:
+    def apply(recording: Recording, robot: Robot) -> Pair:
+        joints = recording.joints.copy()
+        n = robot.n_tubes
+        joints[:, 1 : 1 + n] = change(joints[:, 1 : 1 + n], n)
+        return replace(recording, joints=joints), robot
+
+    return apply
+
+
+def _tubes_swapped(recording: Recording, robot: Robot) -> Pair:
+    n = robot.n_tubes
+    joints = recording.joints.copy()
+    joints[:, 1 : 1 + n] = joints[:, 1 : 1 + n][:, ::-1]
+    return replace(recording, joints=joints), robot
+
+
+def _gravity(axis: int, sign: float) -> Callable[[Recording, Robot], Pair]:
+    def apply(recording: Recording, robot: Robot) -> Pair:
+        data = robot_to_dict(robot)
+        value = [0.0, 0.0, 0.0]
+        value[axis] = sign * float(np.linalg.norm(robot.gravity.value))
+        data["gravity"]["value"] = value
+        return recording, robot_from_dict(data)
+
+    return apply
+
+
+def _radii(factor: float) -> Callable[[Recording, Robot], Pair]:
+    def apply(recording: Recording, robot: Robot) -> Pair:
+        data = robot_to_dict(robot)
+        for tube in data["tubes"]:
+            for name in ("inner_radius", "outer_radius"):
+                tube[name]["value"] *= factor
+        return recording, robot_from_dict(data)
+
+    return apply
+
+
+def _quaternion(recording: Recording, robot: Robot) -> Pair:
+    # (w, x, y, z) had been sent as (x, y, z, w)
+    return replace(recording, quaternion=np.roll(recording.quaternion, -1, axis=1)), robot
+
+
+def _inverse(recording: Recording, robot: Robot) -> Pair:
+    return replace(recording, quaternion=recording.quaternion * np.array([1.0, -1.0, -1.0, -1.0])), robot
+
+
+def _metres(factor: float) -> Callable[[Recording, Robot], Pair]:
+    return lambda recording, robot: (replace(recording, position=recording.position * factor), robot)
+
+
+def _load(factor: float) -> Callable[[Recording, Robot], Pair]:
+    def apply(recording: Recording, robot: Robot) -> Pair:
+        load = recording.load.copy()
+        load[:, 1:] *= factor
+        return replace(recording, load=load), robot
+
+    return apply
+
+
+MISTAKES: dict[str, Callable[[Recording, Robot], Pair]] = {
+    "sign_of_alpha": _alpha(lambda a, n: -a),
+    "sign_of_alpha_inner": _alpha(lambda a, n: a * np.r_[-1.0, np.ones(n - 1)]),
+    "sign_of_alpha_outer": _alpha(lambda a, n: a * np.r_[np.ones(n - 1), -1.0]),
+    "alpha_in_degrees": _alpha(lambda a, n: a * math.pi / 180.0),
+    "tubes_swapped": _tubes_swapped,
+    "radius_is_diameter": _radii(0.5),
+    "diameter_is_radius": _radii(2.0),
+    "gravity_along_minus_x": _gravity(0, -1.0),
+    "gravity_along_plus_x": _gravity(0, 1.0),
+    "gravity_along_plus_y": _gravity(1, 1.0),
+    "gravity_along_minus_y": _gravity(1, -1.0),
+    "gravity_along_plus_z": _gravity(2, 1.0),
+    "gravity_along_minus_z": _gravity(2, -1.0),
+    "quaternion_order": _quaternion,
+    "quaternion_inverse": _inverse,
+    "tracker_in_millimetres": _metres(1e-3),
+    "load_sign": _load(-1.0),
+}
+
+
+def misfit(recording: Recording, robot: Robot) -> float:
+    """3-D rms in m of the reading against the nominal model, with the rotation's share in units of its noise; infinity where it fails."""
+    try:
+        experiment = Experiment(recording, robot, nodes=16)
+        prediction = experiment.predict({})
+    except InputError:
+        return math.inf
+    if prediction.failure:
+        return math.inf
+    residual = experiment.residual(prediction)
+    noise = robot.tracker.noise
+    rotation = residual[:, 3:] * (noise.position.value / max(noise.rotation.value, 1e-6))
+    squares = np.sum(residual[:, :3] ** 2, axis=1) + np.sum(rotation**2, axis=1)
+    return math.sqrt(float(np.nanmean(squares)))
+
+
+def find_mistake(recording: Recording, robot: Robot, note: Callable[[str], None]) -> tuple[str, float, float] | None:
+    """(name, misfit before, misfit after) of the mistake whose undoing leaves least, where the misfit is gross and it explains nearly all."""
+    before = misfit(recording, robot)
+    if before < GROSS * noise_floor(robot) * math.sqrt(2.0):
+        return None
+    note("gross misfit: trying mistakes of units, signs and orders")
+    after: dict[str, float] = {}
+    for name, undo in MISTAKES.items():
+        try:
+            after[name] = misfit(*undo(recording, robot))
+        except InputError:
+            continue
+    best = min(after, key=lambda name: after[name])
+    return (best, before, after[best]) if after[best] < IMPROVEMENT * before else None

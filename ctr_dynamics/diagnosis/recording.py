@@ -1,0 +1,147 @@
+"""What diagnosis reads of a bag: joints, known loads and tracker poses as arrays on one clock."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ctr_dynamics.bagio.reader import Bag, open_bag
+from ctr_dynamics.errors import InputError
+from ctr_dynamics.estimation.signals import finite, joint_order
+from ctr_dynamics.messages.cdr import JointStateIn, PoseIn
+from ctr_dynamics.robot import Robot
+
+Floats = NDArray[np.float64]
+SHORTEST = 2.0  # s of joints and tracker together, below which nothing can be said
+LOAD_GRACE = 0.1  # s; a first load that comes this soon after the joints is there from the start
+
+
+@dataclass(frozen=True)
+class Recording:
+    """One bag; times in s from the first complete joint state.
+
+    Attributes:
+        name: of the bag. sha256: of its files, by name.
+        joints: (k, 1 + 2N) t, alpha rad, beta m. load: (k, 7) t, force N, torque N m in ``ctr_base``; may be empty.
+        stamps: (s,) s of the tracker poses; position: (s, 3) m; quaternion: (s, 4) wxyz.
+        notes: what was left out or looks odd.
+    """
+
+    name: str
+    path: str
+    sha256: dict[str, str]
+    joints: Floats
+    load: Floats
+    stamps: Floats
+    position: Floats
+    quaternion: Floats
+    notes: tuple[str, ...]
+
+    @property
+    def duration(self) -> float:
+        """s of joints."""
+        return float(self.joints[-1, 0])
+
+
+def read_recording(path: str | Path, robot: Robot) -> Recording:
+    """Read a bag for ``robot``.
+
+    Raises:
+        InputError: not a bag, no complete joint state of this robot, no tracker, or less than ``SHORTEST`` seconds of both.
+    """
+    bag = open_bag(path)
+    bag.check_inputs()
+    joints, poses, loads, notes, wrong = _collect(bag, robot)
+    where = str(path)
+    if not joints:
+        wanted = ", ".join(f"tube{i + 1}_rotation, tube{i + 1}_translation" for i in range(robot.n_tubes))
+        raise InputError(
+            f"no complete joint state of robot '{robot.name}' ({wrong or 'none at all'}; needed: {wanted})",
+            do="check the robot and the joint names with `ctr-dynamics info`",
+            where=where,
+        )
+    if not poses:
+        raise InputError("no usable tracker pose", do="diagnosis needs the tracker on /ctr/tracker/tip", where=where)
+    t0 = joints[0][0]
+    table = np.array([[(stamp - t0) * 1e-9, *value] for stamp, value in _once(joints)])
+    reason = robot.actuator_problem(table[0, 1 + robot.n_tubes :], table[0, 1 : 1 + robot.n_tubes])
+    if reason:
+        raise InputError(f"{reason}; is it a bag of this robot?", do="check the robot file and the units", where=where)
+    tracker = np.array([[(stamp - t0) * 1e-9, *value] for stamp, value in _once(poses)])
+    inside = (tracker[:, 0] >= 0.0) & (tracker[:, 0] <= table[-1, 0])
+    if not inside.all():
+        notes.append(f"{int((~inside).sum())} tracker poses lie outside the time of the joints and were left out")
+    tracker = tracker[inside]
+    span = float(np.ptp(tracker[:, 0])) if len(tracker) else 0.0
+    if span < SHORTEST:
+        raise InputError(
+            f"tracker and joints overlap for {span:.2f} s, less than {SHORTEST:g} s",
+            do="record for longer; ten seconds with motion are enough",
+            where=where,
+        )
+    load = np.array([[(stamp - t0) * 1e-9, *value] for stamp, value in _once(loads)]).reshape(-1, 7)
+    if len(load) and load[0, 0] > LOAD_GRACE:
+        load = np.vstack([np.r_[load[0, 0] - 1e-9, np.zeros(6)], load])
+    gap = float(np.diff(table[:, 0]).max(initial=0.0))
+    if gap > 0.1:
+        notes.append(f"joints are missing for up to {gap:.2f} s; they are taken as straight lines there")
+    return Recording(
+        bag.path.name, where, bag.sha256(), table, load, tracker[:, 0], tracker[:, 1:4], _continuous(tracker[:, 4:8]), tuple(notes)
+    )  # fmt: skip
+
+
+Samples = list[tuple[int, list[float]]]
+
+
+def _collect(bag: Bag, robot: Robot) -> tuple[Samples, Samples, Samples, list[str], str]:
+    joints: Samples = []
+    poses: Samples = []
+    loads: Samples = []
+    left, wrong = 0, ""
+    for item in bag.inputs():
+        message = item.message
+        if isinstance(message, JointStateIn):
+            order = joint_order(message.names, robot.n_tubes)
+            if isinstance(order, str):
+                wrong = order
+                continue
+            value = [float(message.positions[i]) for i in order] if len(message.positions) >= len(message.names) else []
+            if value and finite(value):
+                joints.append((message.stamp_ns, value))
+            else:
+                left += 1
+        elif isinstance(message, PoseIn):
+            x, y, z, w = message.quaternion_xyzw
+            norm = float(np.sqrt(x * x + y * y + z * z + w * w)) if finite(message.quaternion_xyzw) else 0.0
+            if finite(message.position) and 0.9 <= norm <= 1.1:
+                poses.append((message.stamp_ns, [*message.position, w / norm, x / norm, y / norm, z / norm]))
+            else:
+                left += 1
+        elif finite(message.force) and finite(message.torque):
+            loads.append((message.stamp_ns, [*message.force, *message.torque]))
+        else:
+            left += 1
+    notes = [f"{left} messages hold values that cannot be used and were left out"] if left else []
+    if wrong and joints:
+        notes.append(f"some joint states were left out: {wrong}")
+    return joints, poses, loads, notes, wrong
+
+
+def _once(samples: Samples) -> Samples:
+    """In the order of stamps, the first of each."""
+    found: dict[int, list[float]] = {}
+    for stamp, value in samples:
+        found.setdefault(stamp, value)
+    return sorted(found.items())
+
+
+def _continuous(quaternion: Floats) -> Floats:
+    """The same rotations without jumps of sign."""
+    out = quaternion.copy()
+    for i in range(1, len(out)):
+        if out[i] @ out[i - 1] < 0.0:
+            out[i] = -out[i]
+    return out

@@ -1,0 +1,76 @@
+"""Findings in sentences that a roboticist can act on."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from ctr_dynamics.effects import EFFECTS
+
+VERDICTS = {
+    "clean": "The simulation agrees with the data within the tolerances of the robot file.",
+    "named": "The simulation is wrong, and the cause is named.",
+    "ambiguous": "The simulation is wrong; several causes explain it about as well.",
+    "unknown": "The simulation is wrong in a way that no cause of the catalogue explains.",
+    "not_excited": "These bags hardly move the robot: they cannot show what is wrong.",
+}
+# Units for people: factor and text.
+SHOWN = {"kg": (1e3, "g"), "m": (1e3, "mm"), "s": (1e3, "ms"), "rad": (57.29577951, "deg"), "m/s": (1e3, "mm/s")}
+
+
+def shown(value: float | None, unit: str) -> str:
+    """A value with a unit for people."""
+    if value is None:
+        return "-"
+    factor, text = SHOWN.get(unit, (1.0, "" if unit == "1" else unit))
+    return f"{value * factor:.4g}{' ' + text if text else ''}"
+
+
+def cause(entry: dict[str, Any]) -> str:
+    """One cause: what, how much, how sure, and what else it may be."""
+    effect = entry["effect"]
+    if effect == "unknown":
+        return "Cause: outside the catalogue."
+    parts = []
+    for name, p in entry["parameters"].items():
+        if isinstance(p["value"], str):
+            parts.append(p["value"])
+            continue
+        low, high = p["ci90"]
+        parts.append(
+            f"{name} {shown(p['value'], p['unit'])} [{shown(low, p['unit'])}, {shown(high, p['unit'])}], robot file {shown(p['nominal'], p['unit'])}"
+        )
+    sentence = f"Cause: {effect.replace('_', ' ')}, {'; '.join(parts)}; probability {entry['probability']:.2f}."
+    if entry["not_separable_from"]:
+        sentence += f" Not separable from: {', '.join(x.replace('_', ' ') for x in entry['not_separable_from'])}."
+    if effect in EFFECTS:
+        sentence += f" {EFFECTS[effect].text}"
+    return sentence
+
+
+def summary(content: dict[str, Any]) -> list[str]:
+    """The first screen: verdict, causes, gain, what to do next. Lengths in millimetres, and said so."""
+    lines = [f"verdict: {content['verdict']}. {VERDICTS[content['verdict']]}"]
+    lines += [cause(entry) for entry in content["causes"]]
+    r = content["residual"]
+    if r["recalibrated_rms_m"] is not None:
+        lines.append(
+            f"Residual rms against the tracker: nominal {_mm(r['nominal_rms_m'])}, re-calibrated {_mm(r['recalibrated_rms_m'])}, "
+            f"extended {_mm(r['extended_rms_m'])}, noise floor {_mm(r['noise_floor_m'])}."
+        )
+    v = content["validation"]
+    if v is not None:
+        lines.append(
+            f"On bags that were not fitted: {_mm(v['rms_recalibrated_m'])} -> {_mm(v['rms_extended_m'])}, "
+            f"gain {v['gain']:.3f} [{v['ci95'][0]:.3f}, {v['ci95'][1]:.3f}]."
+        )
+    e = content["next_experiment"]
+    if e is not None:
+        worth = ""
+        if e["separation_after"] is not None:
+            worth = f" (separation {e['separation_before']:.1f} -> {e['separation_after']:.1f})"
+        lines.append(f"Next experiment: {e['description']}{worth}; scenario in {e['scenario_file']}.")
+    return lines
+
+
+def _mm(value: float | None) -> str:
+    return "-" if value is None else f"{value * 1e3:.3f} mm"
