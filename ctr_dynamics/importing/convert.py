@@ -30,10 +30,10 @@ from ctr_dynamics.importing.layout import (
     si_unit,
 )
 from ctr_dynamics.importing.table import CsvTable, Faults
-from ctr_dynamics.importing.units import factor
 from ctr_dynamics.messages import topics
 from ctr_dynamics.messages.encode import encode_joint_state, encode_pose_stamped, encode_wrench_stamped
 from ctr_dynamics.robot import Robot
+from ctr_dynamics.units import factor
 
 Floats = NDArray[np.float64]
 TOPIC_OF: dict[Kind, str] = {

@@ -10,8 +10,8 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError
 
 from ctr_dynamics.errors import InputError
-from ctr_dynamics.importing.units import factor, units_of
 from ctr_dynamics.robot.loader import read_yaml
+from ctr_dynamics.units import factor, units_of
 
 Kind = Literal["joints", "tracker", "load"]
 POSITION, QUATERNION = ("x", "y", "z"), ("qx", "qy", "qz", "qw")

@@ -17,9 +17,9 @@ from ctr_dynamics.errors import InputError
 from ctr_dynamics.estimation.rotations import from_vector, matrix, multiply
 from ctr_dynamics.importing.convert import read_log
 from ctr_dynamics.importing.layout import Layout
-from ctr_dynamics.importing.units import measure
 from ctr_dynamics.messages import topics
 from ctr_dynamics.messages.cdr import JointStateIn, PoseIn
+from ctr_dynamics.units import measure
 
 BAG = Path(__file__).parents[1] / "data" / "bags" / "exact_release.mcap"
 ROBOT = "till2020_tissue"
