@@ -33,13 +33,14 @@ setup(
     name=PACKAGE,
     version=version(),
     packages=find_packages(exclude=["test", "test.*"]),
-    package_data={PACKAGE: ["config/*.yaml", "config/*/*.yaml", "data/bags/*", "py.typed"]},
+    package_data={PACKAGE: ["config/*.yaml", "config/*/*.yaml", "config/view/*", "data/bags/*", "py.typed"]},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{PACKAGE}"]),
         (f"share/{PACKAGE}", ["package.xml"]),
         *shared_files(f"{PACKAGE}/config", "config"),
         *shared_files("launch", "launch"),
         *shared_files("msg_docs", "msg_docs"),
+        *shared_files("examples", "examples"),
     ],
     install_requires=[
         "setuptools",
@@ -66,6 +67,8 @@ setup(
             "ros-kilted-std-srvs==5.5.1",
             *(f"ros-kilted-{name}-msgs==5.5.1" for name in ROS_MESSAGES),
         ],
+        # `ctr-dynamics view`, 54 MB.
+        "view": ["foxglove-sdk>=0.14"],
         # colcon runs pytest when it finds it in this extra.
         "test": ["pytest>=8", "hypothesis>=6.100", "ruff", "mypy", "types-PyYAML", "build"],
     },
@@ -83,6 +86,7 @@ setup(
             "ctr-dynamics = ctr_dynamics.cli.main:main",
             "estimator = ctr_dynamics.nodes.estimator_node:main",
             "driver = ctr_dynamics.nodes.driver_node:main",
+            "tube_markers = ctr_dynamics.nodes.view_node:main",
         ],
     },
 )

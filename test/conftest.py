@@ -1,11 +1,65 @@
-"""Isolation of every test run: its own ROS domain on this machine only, its own figures backend."""
+"""Isolation of every test run: its own ROS domain on this machine only, its own figures backend; a browser for the reports."""
+
+from __future__ import annotations
 
 import os
+import shutil
+import subprocess
+from dataclasses import dataclass
+from pathlib import Path
 
 # Set before anything imports rclpy; child processes inherit both. 0 and the low ids are left to people.
 os.environ["ROS_DOMAIN_ID"] = str(20 + os.getpid() % 200)
 os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
 os.environ.setdefault("MPLBACKEND", "Agg")
 
+import pytest
+
 # Before anything imports NumPy: the package asks it for one thread, which counts only while it is loaded.
 import ctr_dynamics  # noqa: F401
+
+
+@dataclass(frozen=True)
+class Shown:
+    """What a browser made of a page: the document after its scripts ran, its console, a screenshot."""
+
+    document: str
+    console: str
+    screenshot: Path
+
+
+class Browser:
+    """Headless Chromium without a network: every name resolves to nothing."""
+
+    def __init__(self, program: str, folder: Path) -> None:
+        self.program, self.folder, self.count = program, folder, 0
+
+    def show(self, page: Path | str, size: tuple[int, int] = (1100, 1400), seconds: float = 3.0) -> Shown:
+        """Open a file (or an address of this machine), let its scripts run, dump the document and take a picture."""
+        self.count += 1
+        address = page.resolve().as_uri() if isinstance(page, Path) else page
+        picture = self.folder / f"shown{self.count}.png"
+        common = [
+            self.program, "--headless", "--no-sandbox", "--disable-gpu", "--hide-scrollbars", "--disable-dev-shm-usage",
+            "--host-resolver-rules=MAP * ~NOTFOUND, EXCLUDE 127.0.0.1", "--no-first-run", "--disable-background-networking",
+            f"--user-data-dir={self.folder / 'profile'}", f"--window-size={size[0]},{size[1]}",
+            f"--virtual-time-budget={round(1e3 * seconds)}", "--enable-logging=stderr",
+        ]  # fmt: skip
+        dumped = subprocess.run(
+            [*common, "--dump-dom", address], capture_output=True, text=True, timeout=120, check=True
+        )
+        subprocess.run(
+            [*common, f"--screenshot={picture}", address], capture_output=True, timeout=120, check=True
+        )
+        console = "\n".join(line for line in dumped.stderr.splitlines() if "CONSOLE" in line)
+        return Shown(dumped.stdout, console, picture)
+
+
+@pytest.fixture(scope="session")
+def browser(tmp_path_factory) -> Browser:
+    """Headless Chromium; .ci/run installs it."""
+    names = ("chromium", "chromium-headless-shell", "chromium-browser", "google-chrome")
+    program = os.environ.get("CHROMIUM") or next(filter(None, map(shutil.which, names)), None)
+    if program is None:
+        pytest.skip("no Chromium on this machine (apt-get install chromium, or set CHROMIUM)")
+    return Browser(program, tmp_path_factory.mktemp("browser"))

@@ -32,6 +32,7 @@ from ctr_dynamics.robot import Robot, load_robot
 
 if TYPE_CHECKING:
     from ctr_dynamics.estimation.estimator import Estimator, StepOutput
+    from ctr_dynamics.report.replay import ReplayLog
 
 MakeEstimator = Callable[[Robot, Settings], "Estimator"]
 Progress = Callable[[float, int], None]
@@ -209,6 +210,7 @@ def replay(
     summary: str | Path | None = None,
     progress: Progress | None = None,
     make_estimator: MakeEstimator | None = None,
+    report: str | Path | None = None,
 ) -> ReplayResult:
     """Run a bag through the estimator.
 
@@ -221,6 +223,7 @@ def replay(
         summary: JSON file for the summary; None for none.
         progress: called now and then with the fraction done and the number of steps.
         make_estimator: another estimator with the same interface.
+        report: HTML file for the report; None for none.
 
     Raises:
         InputError: an input that cannot be used, or no step at all.
@@ -230,7 +233,7 @@ def replay(
     if not isinstance(robot, Robot):
         robot = load_robot(robot)
     settings = settings.replace({"robot": robot.source or robot.name})
-    _check_targets(opened, output, summary)
+    _check_targets(opened, {"output": output, "summary": summary, "report": report})
     inputs = opened.sha256()
     provenance = {
         "version": __version__,
@@ -245,11 +248,18 @@ def replay(
         summary_part = stack.enter_context(atomic_file(Path(summary))) if summary is not None else None
         make = make_estimator or _default_estimator()
         _warm_up(opened, make(robot, settings))
-        numbers = _run(opened, make(robot, settings), robot, settings, writer, progress)
+        report_part = stack.enter_context(atomic_file(Path(report))) if report is not None else None
+        estimator = make(robot, settings)
+        log = _report_log(estimator, opened) if report_part is not None else None
+        numbers, times_s = _run(opened, estimator, robot, settings, writer, progress, log)
         content = plain({**numbers, **provenance, "notes": opened.notes})
         if summary_part is not None:
             text = json.dumps(content, indent=1, allow_nan=False, ensure_ascii=False)
             summary_part.write_text(text + "\n", encoding="utf-8")
+        if report_part is not None and log is not None:
+            from ctr_dynamics.report.replay import replay_page
+
+            report_part.write_text(replay_page(log, content, times_s).text(), encoding="utf-8")
     return ReplayResult(content, opened.notes)
 
 
@@ -260,6 +270,17 @@ def _default_estimator() -> MakeEstimator:
     return Estimator
 
 
+def _report_log(estimator: Estimator, bag: Bag) -> ReplayLog:
+    """What a report collects, with the bag's tracker samples in it."""
+    from ctr_dynamics.report.replay import ReplayLog  # brings the plotting library
+
+    log = ReplayLog(estimator.tracker)
+    for item in bag.inputs():
+        if isinstance(item.message, PoseIn):
+            log.pose(item.message)
+    return log
+
+
 def _run(
     bag: Bag,
     estimator: Estimator,
@@ -267,8 +288,9 @@ def _run(
     settings: Settings,
     writer: BagWriter | None,
     progress: Progress | None,
-) -> dict[str, Any]:
-    """The replay itself; returns the numbers of the summary."""
+    log: ReplayLog | None,
+) -> tuple[dict[str, Any], Sequence[float]]:
+    """The replay itself; returns the numbers of the summary and the time spent on each step, s."""
     encoder = StepEncoder(settings["output.frame_id"], robot.name, settings["output.backbone_every"])
     player = Player(estimator)
     invalid = _Invalid()
@@ -283,6 +305,8 @@ def _run(
         last_ns = out.stamp_ns
         steps += 1
         invalid.add(out, first_ns)
+        if log is not None:
+            log.step(out)
         if writer is not None:
             for message in encoder.encode(out, estimator.health.statuses):
                 writer.write(message.topic, message.stamp_ns, message.data)
@@ -293,7 +317,7 @@ def _run(
         raise _no_step(bag, robot, player.joint_names)
     duration_s = (last_ns - first_ns) * 1e-9
     p50, p99, worst = np.percentile(np.array(player.times_s()) * 1e3, (50, 99, 100))
-    return {
+    numbers = {
         **estimator.summary(),
         "steps": steps,
         "duration_s": duration_s,
@@ -303,6 +327,7 @@ def _run(
         "invalid": {"steps": invalid.steps, "stretches": invalid.stretches},
         "malformed": dict(bag.malformed),
     }
+    return numbers, player.times_s()
 
 
 def _warm_up(bag: Bag, estimator: Estimator) -> None:
@@ -322,10 +347,10 @@ def _metadata(provenance: dict[str, Any]) -> dict[str, str]:
     }
 
 
-def _check_targets(bag: Bag, output: str | Path | None, summary: str | Path | None) -> None:
-    """No output may be an input, nor the other output: said before the work, not after it."""
+def _check_targets(bag: Bag, targets: dict[str, str | Path | None]) -> None:
+    """No output may be an input, nor another output: said before the work, not after it."""
     taken = {file.path.resolve(): "the bag that is read" for file in bag.files}
-    for what, path in (("output", output), ("summary", summary)):
+    for what, path in targets.items():
         if path is None:
             continue
         target = Path(path).resolve()

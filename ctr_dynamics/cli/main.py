@@ -9,6 +9,7 @@ import sys
 from collections.abc import Callable, Sequence
 from importlib import import_module
 from importlib.util import find_spec
+from keyword import iskeyword
 from typing import Annotated, Any
 
 import typer
@@ -23,6 +24,9 @@ COMMANDS = {
     "simulate": "Write a bag of a simulated scenario.",
     "statics": "Solve the static model for a table of actuator positions.",
     "snap": "Snap-through by the finite-difference solver.",
+    "import": "Write CSV logs of actuators and tracker as a bag.",
+    "robot": "Write a robot file from data sheets, or check one.",
+    "view": "Serve a bag or the live topics to Foxglove.",
     "bench": "Measure cost per step, real-time ratios and tick times.",
     "info": "Say what is in a bag: topics, rates, gaps, clock and unit problems.",
     "warmup": "Compile every kernel into the cache.",
@@ -35,9 +39,14 @@ MANY = {"diagnose": ("--validate",)}
 FINISHED, PARTLY_FAILED, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
 
 
+def _attribute(name: str) -> str:
+    """Name of a command's file and function: a word of Python's own gets an underscore."""
+    return f"{name}_" if iskeyword(name) else name
+
+
 def available() -> list[str]:
     """Commands whose file exists, in the order of COMMANDS."""
-    return [name for name in COMMANDS if find_spec(f"ctr_dynamics.cli.{name}") is not None]
+    return [name for name in COMMANDS if find_spec(f"ctr_dynamics.cli.{_attribute(name)}") is not None]
 
 
 def fail(message: str) -> None:
@@ -103,8 +112,15 @@ def build_app(requested: str | None) -> typer.Typer:
 
     for name in available():
         if name == requested:
-            module = import_module(f"ctr_dynamics.cli.{name}")
-            app.command(name)(_with_exit_code(getattr(module, name)))
+            module = import_module(f"ctr_dynamics.cli.{_attribute(name)}")
+            command = getattr(module, _attribute(name))
+            if isinstance(command, dict):  # of subcommands
+                group = typer.Typer(help=COMMANDS[name], no_args_is_help=True)
+                for part, function in command.items():
+                    group.command(part)(_with_exit_code(function))
+                app.add_typer(group, name=name)
+            else:
+                app.command(name)(_with_exit_code(command))
         else:
             app.command(name, help=COMMANDS[name])(_not_imported)
     return app

@@ -112,6 +112,10 @@ def replay(
     summary: Annotated[
         Path | None, typer.Option("--summary", metavar="OUT.json", help="Summary to write.")
     ] = None,
+    report: Annotated[
+        Path | None,
+        typer.Option("--report", metavar="OUT.html", help="Report to write: one file, opens offline."),
+    ] = None,
     params: Annotated[
         Path | None,
         typer.Option("--params", metavar="FILE", help="YAML file with parameters of the estimator."),
@@ -130,14 +134,16 @@ def replay(
     """
     settings = settings_for_replay(params, assignments or [], not no_fusion)
     with _progress(bag.name or str(bag)) as progress:
-        result = run_replay(bag, robot or str(settings["robot"]), settings, output, summary, progress)
+        result = run_replay(
+            bag, robot or str(settings["robot"]), settings, output, summary, progress, report=report
+        )
     for note in result.notes:
         print(f"ctr-dynamics: note: {note}", file=sys.stderr)
     rows = _table(result)
     width = max(len(label) for label, _ in rows)
     for label, text in rows:
         print(f"{label:<{width}}  {text}")
-    for label, path in (("output", output), ("summary", summary)):
+    for label, path in (("output", output), ("summary", summary), ("report", report)):
         if path is not None:
             print(f"{label:<{width}}  {path}")
     return 1 if result.failures else 0

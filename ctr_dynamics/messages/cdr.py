@@ -12,6 +12,9 @@ import struct
 from collections.abc import Sequence
 from typing import NamedTuple
 
+import numpy as np
+from numpy.typing import NDArray
+
 ENCAPSULATION = b"\x00\x01\x00\x00"
 NANOSECONDS = 1_000_000_000
 _MAX_NAMES = 4096
@@ -60,6 +63,14 @@ class CdrWriter:
             return len(self.data)
         offset = self._aligned(8)
         self.data += struct.pack(f"<{len(values)}d", *values)
+        return offset
+
+    def float32s(self, values: Sequence[float]) -> int:
+        """Consecutive float32 fields; nothing at all when empty."""
+        if not len(values):
+            return len(self.data)
+        offset = self._aligned(4)
+        self.data += struct.pack(f"<{len(values)}f", *values)
         return offset
 
     def float64_sequence(self, values: Sequence[float]) -> int:
@@ -229,7 +240,7 @@ def _parse_joint_layout(order: str, data: bytes) -> _JointLayout:
     return _JointLayout(head, frame_id, tuple(names), struct.Struct(f"{order}{count}d"), offset)
 
 
-def _decode_numbers(data: bytes, count: int) -> tuple[int, str, tuple]:
+def decode_numbers(data: bytes, count: int) -> tuple[int, str, tuple]:
     """Stamp, frame and `count` float64 that follow a header."""
     order = _byte_order(data)
     frame_id, offset = _string(order, data, 12)
@@ -243,7 +254,7 @@ def decode_pose_stamped(data: bytes) -> PoseIn:
     Raises:
         CdrError: the bytes are not that message.
     """
-    stamp_ns, frame_id, numbers = _decode_numbers(data, 7)
+    stamp_ns, frame_id, numbers = decode_numbers(data, 7)
     return PoseIn(stamp_ns, frame_id, numbers[:3], numbers[3:])
 
 
@@ -253,5 +264,52 @@ def decode_wrench_stamped(data: bytes) -> WrenchIn:
     Raises:
         CdrError: the bytes are not that message.
     """
-    stamp_ns, frame_id, numbers = _decode_numbers(data, 6)
+    stamp_ns, frame_id, numbers = decode_numbers(data, 6)
     return WrenchIn(stamp_ns, frame_id, numbers[:3], numbers[3:])
+
+
+class PointCloudIn(NamedTuple):
+    """A sensor_msgs/PointCloud2 of float32 fields without gaps: names of the fields and rows (points, fields)."""
+
+    stamp_ns: int
+    frame_id: str
+    names: tuple[str, ...]
+    rows: NDArray[np.float32]
+
+
+def decode_point_cloud(data: bytes) -> PointCloudIn:
+    """Decode a little-endian sensor_msgs/PointCloud2 whose fields are all float32, one after the other.
+
+    Raises:
+        CdrError: the bytes are not such a message.
+    """
+    order = _byte_order(data)
+    frame_id, offset = _string(order, data, 12)
+    offset += -offset % 4
+    height, width, count = _unpack(order + "3I", data, offset)
+    offset += 12
+    if count > _MAX_NAMES:
+        raise CdrError(f"point cloud with {count} fields, at most {_MAX_NAMES} are read")
+    names = []
+    for column in range(count):
+        name, offset = _string(order, data, offset)
+        offset += -offset % 4
+        place, kind = _unpack(order + "IB", data, offset)
+        (repeats,) = _unpack(order + "I", data, offset + 8)
+        offset += 12
+        if (place, kind, repeats) != (4 * column, 7, 1):
+            raise CdrError(f"field '{name}' of the point cloud is no plain float32 at byte {4 * column}")
+        names.append(name)
+    (big,) = _unpack(order + "B", data, offset)
+    offset += 1 + -(offset + 1) % 4
+    step, row_step, size = _unpack(order + "3I", data, offset)
+    offset += 12
+    points = height * width
+    if big or step != 4 * count or row_step != width * step or size != points * step or not count:
+        raise CdrError(
+            f"point cloud of {points} points has a point step of {step} bytes for {count} float32 fields"
+        )
+    if offset + size > len(data):
+        raise CdrError(f"message of {len(data)} bytes cannot hold {size} bytes of points at byte {offset}")
+    rows = np.frombuffer(data, "<f4", points * count, offset).reshape(points, count)
+    return PointCloudIn(decode_stamp(data), frame_id, tuple(names), rows)

@@ -35,7 +35,7 @@ class NodeProcess:
     """A node in its own process; leaving the context stops it.
 
     Args:
-        module: `ESTIMATOR` or `DRIVER`.
+        module: `ESTIMATOR`, `DRIVER`, another module, or the path of a script (.py).
         parameters: its ROS parameters.
         domain_id: ROS domain.
         log: file for its standard output and error.
@@ -51,7 +51,8 @@ class NodeProcess:
         ros_arguments: Sequence[str] = (),
     ) -> None:
         self.log = log
-        command = [sys.executable, "-m", module, "--ros-args", *ros_arguments]
+        program = [module] if module.endswith(".py") else ["-m", module]
+        command = [sys.executable, *program, "--ros-args", *ros_arguments]
         for name, value in parameters.items():
             command += ["-p", f"{name}:={json.dumps(value)}"]  # JSON is YAML, with texts in quotes
         with log.open("wb") as stream:

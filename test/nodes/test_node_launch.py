@@ -8,16 +8,19 @@ from types import ModuleType, SimpleNamespace
 import pytest
 
 from ctr_dynamics.nodes.driver_node import PARAMETERS as DRIVER_PARAMETERS
+from ctr_dynamics.nodes.view_node import PARAMETERS as VIEW_PARAMETERS
 from ctr_dynamics.parameters import PARAMETERS
 
 ROOT = Path(__file__).parents[2]
 KNOWN = {
     "estimator": {p.name for p in PARAMETERS} | {"use_sim_time"},
     "driver": set(DRIVER_PARAMETERS) | {"use_sim_time"},
+    "tube_markers": set(VIEW_PARAMETERS) | {"use_sim_time"},
 }
 MODULES = {
     "launch": ["LaunchDescription"],
     "launch.actions": ["DeclareLaunchArgument", "EmitEvent", "RegisterEventHandler"],
+    "launch.conditions": ["IfCondition"],
     "launch.event_handlers": ["OnProcessExit"],
     "launch.events": ["Shutdown"],
     "launch.substitutions": ["LaunchConfiguration"],
@@ -43,6 +46,7 @@ def launch_file(monkeypatch):
         for name in names:
             setattr(stub, name, stand_in(name))
         monkeypatch.setitem(sys.modules, module, stub)
+    monkeypatch.delitem(sys.modules, "ctr_dynamics.launching", raising=False)
 
     def load(name):
         path = ROOT / "launch" / f"{name}.launch.py"
@@ -64,7 +68,11 @@ def launch_file(monkeypatch):
 
 @pytest.mark.parametrize(
     ("name", "executables"),
-    [("live", {"estimator"}), ("replay", {"estimator", "driver"}), ("demo", {"estimator", "driver"})],
+    [
+        ("live", {"estimator", "tube_markers"}),
+        ("replay", {"estimator", "tube_markers", "driver"}),
+        ("demo", {"estimator", "tube_markers", "driver"}),
+    ],
 )
 def test_launch_files_start_known_executables_with_known_parameters(launch_file, name, executables):
     launched = launch_file(name)
@@ -73,19 +81,23 @@ def test_launch_files_start_known_executables_with_known_parameters(launch_file,
     used = set()
     for executable, node in launched.nodes.items():
         assert f'"{executable} = ' in scripts
-        assert (node["package"], node["namespace"], node["name"]) == ("ctr_dynamics", "ctr", executable)
+        assert (node["package"], node["namespace"]) == ("ctr_dynamics", "ctr")
+        assert node["name"] == {"tube_markers": "view"}.get(executable, executable)
         for group in node["parameters"]:
             if isinstance(group, dict):
                 assert set(group) <= KNOWN[executable]
                 used |= {v.arguments[0] for v in group.values() if type(v).__name__ == "LaunchConfiguration"}
             else:
                 used.add(group.arguments[0])
-    assert used == set(launched.arguments)
+    view = launched.nodes["tube_markers"]["condition"].arguments[0].arguments[0]
+    assert used | {view} == set(launched.arguments)
+    assert launched.arguments[view]["default_value"] == "false"
+    assert all(options["description"] for options in launched.arguments.values())
 
 
 def test_replay_goes_by_the_bags_clock_and_ends_with_it(launch_file):
     launched = launch_file("replay")
-    [parameters] = launched.nodes["estimator"]["parameters"]
+    _, parameters = launched.nodes["estimator"]["parameters"]
     assert parameters["use_sim_time"] is True
     assert launched.arguments["policy"]["default_value"] == "wait"
     [driver] = launched.nodes["driver"]["parameters"]
@@ -93,7 +105,8 @@ def test_replay_goes_by_the_bags_clock_and_ends_with_it(launch_file):
     assert len(launched.handlers) == 1
 
 
-def test_live_takes_the_shipped_parameter_file(launch_file):
-    share = launch_file("live").arguments["params"]["default_value"]
+@pytest.mark.parametrize("name", ["live", "replay", "demo"])
+def test_all_take_the_shipped_parameter_file(launch_file, name):
+    share = launch_file(name).arguments["params"]["default_value"]
     assert share[0].arguments == ("ctr_dynamics",)
     assert (ROOT / "ctr_dynamics" / share[1].lstrip("/")).is_file()

@@ -1,0 +1,200 @@
+"""Which column holds what and in which unit: from the header itself, or from a layout file in YAML."""
+
+from __future__ import annotations
+
+import re
+from difflib import get_close_matches
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError
+
+from ctr_dynamics.errors import InputError
+from ctr_dynamics.robot.loader import read_yaml
+from ctr_dynamics.units import factor, units_of
+
+Kind = Literal["joints", "tracker", "load"]
+POSITION, QUATERNION = ("x", "y", "z"), ("qx", "qy", "qz", "qw")
+FORCE, TORQUE = ("fx", "fy", "fz"), ("mx", "my", "mz")
+_JOINT = re.compile(r"tube[1-9]_(rotation|translation)")
+_TIME = ("t", "time", "stamp", "timestamp")
+_ALIASES = {"tx": "x", "ty": "y", "tz": "z", "px": "x", "py": "y", "pz": "z", "q0": "qw"}
+_BRACKETS = re.compile(r"(.+?)\s*[\[(]\s*(.+?)\s*[\])]")
+Vector = Annotated[list[FiniteFloat], Field(min_length=3, max_length=3)]
+
+
+class Block(BaseModel):
+    """Part of a layout file: no unknown keys."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class Column(Block):
+    """A column of the file: the value is (scale * cell + offset), in `unit`."""
+
+    column: str
+    unit: str = ""
+    scale: FiniteFloat = 1.0
+    offset: FiniteFloat = 0.0
+
+
+class TimeColumn(Block):
+    """The column of time; `start_s` is added to it, in s."""
+
+    column: str
+    unit: str
+    start_s: FiniteFloat | None = None
+
+
+class Source(Block):
+    """Columns of one kind of log.
+
+    Attributes:
+        time: column of the stamp.
+        values: name (`tube1_rotation`, `x`, `qw`, `fx`, ..) to its column.
+        frame: frame that poses and wrenches are given in.
+        registration_rotation_rad: (3,) rotation vector of `ctr_base` in that frame, rad.
+        registration_translation_m: (3,) origin of `ctr_base` in that frame, m.
+    """
+
+    time: TimeColumn
+    values: dict[str, Column]
+    frame: str = ""
+    registration_rotation_rad: Vector | None = None
+    registration_translation_m: Vector | None = None
+
+
+class Layout(Block):
+    """A layout file."""
+
+    joints: Source | None = None
+    tracker: Source | None = None
+    load: Source | None = None
+
+
+def si_unit(name: str) -> str:
+    """SI unit of a value; "1" for components of a quaternion."""
+    if _JOINT.fullmatch(name):
+        return "rad" if name.endswith("rotation") else "m"
+    for names, unit in ((POSITION, "m"), (QUATERNION, "1"), (FORCE, "N"), (TORQUE, "N m")):
+        if name in names:
+            return unit
+    raise KeyError(name)
+
+
+def known(kind: Kind, name: str) -> bool:
+    """Whether a log of that kind has a value of that name."""
+    names = {"tracker": POSITION + QUATERNION, "load": FORCE + TORQUE, "joints": ()}[kind]
+    return name in names or (kind == "joints" and _JOINT.fullmatch(name) is not None)
+
+
+def read_layout(path: Path) -> Layout:
+    """A layout file.
+
+    Raises:
+        InputError: unreadable, an unknown key or value, or a unit that is none.
+    """
+    try:
+        text = path.read_text(encoding="utf-8")
+    except UnicodeDecodeError as error:
+        raise InputError(
+            f"not UTF-8 at byte {error.start}", do="save as UTF-8 text", where=str(path)
+        ) from None
+    except OSError as error:
+        raise InputError(f"cannot be read ({error.strerror})", where=str(path)) from None
+    data = read_yaml(text, str(path))
+    try:
+        layout = Layout.model_validate(data)
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        place = ".".join(str(part) for part in first["loc"])
+        raise InputError(f"{place}: {first['msg']}", do="see docs/data.md", where=str(path)) from None
+    for kind in ("joints", "tracker", "load"):
+        source: Source | None = getattr(layout, kind)
+        for name, column in (source.values if source else {}).items():
+            if not known(kind, name):
+                raise InputError(
+                    f"{kind}.values holds '{name}'", do=f"known names: {_names(kind)}", where=str(path)
+                )
+            if si_unit(name) != "1":
+                factor(column.unit or "none", si_unit(name), f"{path}: {kind}.values.{name}")
+    return layout
+
+
+def layout_of_header(kind: Kind, header: list[str], where: str) -> Source:
+    """Columns by their names: `tube1_rotation [deg]` or `tube1_rotation_deg`, `x [mm]`, `time [s]`, `qw`, ...
+
+    Raises:
+        InputError: no column of time, or a column that needs a unit and names none.
+    """
+    time: TimeColumn | None = None
+    values: dict[str, Column] = {}
+    for cell in header:
+        name, unit = _split(cell)
+        if name in _TIME:
+            factor(unit or "none", "s", f"{where}: column '{cell}'")
+            time = time or TimeColumn(column=cell, unit=unit)
+        elif known(kind, name):
+            if si_unit(name) != "1":
+                factor(unit or "none", si_unit(name), f"{where}: column '{cell}'")
+            values.setdefault(name, Column(column=cell, unit=unit))
+    if time is None:
+        raise InputError(
+            f"no column of time among {_some(header)}", do="name it 'time [s]', or give --layout", where=where
+        )
+    return Source(time=time, values=values)
+
+
+def check_complete(kind: Kind, source: Source, header: list[str], where: str) -> None:
+    """Every named column is there, and every needed value has one.
+
+    Raises:
+        InputError: the first that is not.
+    """
+    for column in (source.time.column, *(column.column for column in source.values.values())):
+        if column not in header:
+            near = get_close_matches(column, header, 1)
+            hint = f"did you mean '{near[0]}'?" if near else f"the file has {_some(header)}"
+            raise InputError(f"no column '{column}'", do=hint, where=where)
+    names = set(source.values)
+    if kind == "joints":
+        numbers = {int(name[4]) for name in names}
+        needed = {
+            f"tube{n}_{axis}"
+            for n in range(1, max(numbers, default=1) + 1)
+            for axis in ("rotation", "translation")
+        }
+    else:
+        needed = set(POSITION if kind == "tracker" else FORCE)
+        for group in (QUATERNION, TORQUE):
+            needed |= set(group) if names & set(group) else set()
+    missing = sorted(needed - names)
+    if missing:
+        raise InputError(
+            f"no column for {', '.join(missing)} among {_some(header)}",
+            do=f"name them so with their unit, e.g. '{missing[0]} [{units_of(si_unit(missing[0]))[-1]}]', or give --layout",
+            where=where,
+        )
+
+
+def _split(cell: str) -> tuple[str, str]:
+    """Name in lower case and unit of a column's name; the unit is empty when there is none."""
+    match = _BRACKETS.fullmatch(cell)
+    if match is not None:
+        name, unit = match[1], match[2]
+    else:
+        name, _, unit = cell.rpartition("_")
+        if not name or unit in ("rotation", "translation"):
+            name, unit = cell, ""
+    name = name.strip().lower()
+    return _ALIASES.get(name, name), unit
+
+
+def _names(kind: Any) -> str:
+    if kind == "joints":
+        return "tube1_rotation, tube1_translation, tube2_rotation, .."
+    return ", ".join(POSITION + QUATERNION if kind == "tracker" else FORCE + TORQUE)
+
+
+def _some(header: list[str]) -> str:
+    return ", ".join(f"'{name}'" for name in header[:12]) + (", .." if len(header) > 12 else "")

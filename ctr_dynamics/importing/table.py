@@ -1,0 +1,122 @@
+"""Rows of a CSV file: delimiter found, header read, bad rows named and left out."""
+
+from __future__ import annotations
+
+import csv
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TextIO
+
+from ctr_dynamics.errors import InputError
+
+MAX_LINE = 100_000  # characters; longer is no log
+_DELIMITERS = ",;\t"
+
+
+@dataclass
+class Faults:
+    """Rows that were left out, the first few by line."""
+
+    count: int = 0
+    examples: list[str] = field(default_factory=list)
+
+    def add(self, line: int, why: str) -> None:
+        self.count += 1
+        if len(self.examples) < 5:
+            self.examples.append(f"line {line}: {why}")
+
+
+class CsvTable:
+    """A CSV file with a header line; blank lines and lines that begin with # are passed over.
+
+    Attributes:
+        header: names of the columns, as written.
+
+    Raises:
+        InputError: the file cannot be read, is not text, or has no header.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        with self._open() as stream:
+            self._first, line = _header_line(stream, path)
+        if not line.strip():
+            raise InputError("the file is empty", do="give a CSV file with a header", where=str(path))
+        self.delimiter = max(_DELIMITERS, key=line.count)
+        self.header = [cell.strip() for cell in next(csv.reader([line], delimiter=self.delimiter))]
+        if len(set(self.header)) < len(self.header):
+            twice = next(name for name in self.header if self.header.count(name) > 1)
+            raise InputError(f"column '{twice}' is there twice", do="rename one", where=str(path))
+        if all(_is_number(cell) for cell in self.header):
+            raise InputError(
+                "the first line holds numbers, not names of columns", do="add a header line", where=str(path)
+            )
+
+    def _open(self) -> TextIO:
+        try:
+            return self.path.open(encoding="utf-8-sig", newline="")
+        except OSError as error:
+            raise InputError(f"cannot be read ({error.strerror})", where=str(self.path)) from None
+
+    def rows(self, wanted: list[str], faults: Faults) -> Iterator[tuple[int, list[str]]]:
+        """Line number and the cells of the columns `wanted`, in that order.
+
+        A row whose wanted cells are all empty is passed over: two logs may share one file.
+
+        Raises:
+            InputError: the file is not UTF-8 text.
+        """
+        places = [self.header.index(name) for name in wanted]
+        with self._open() as stream:
+            for number, line in enumerate(_lines(stream, self.path), 1):
+                if number <= self._first or not line.strip() or line.startswith("#"):
+                    continue
+                try:
+                    [cells] = csv.reader([line.strip("\r\n")], delimiter=self.delimiter)
+                except (csv.Error, ValueError):
+                    faults.add(number, "is not a row of a CSV file")
+                    continue
+                if len(cells) < len(self.header):
+                    faults.add(number, f"{len(cells)} cells for {len(self.header)} columns")
+                    continue
+                chosen = [cells[place].strip() for place in places]
+                if any(chosen[1:]):
+                    yield number, chosen
+
+
+def _header_line(stream: TextIO, path: Path) -> tuple[int, str]:
+    """Number and text of the header: the first line, or the last comment before numbers begin."""
+    comment = (0, "")
+    for number, line in enumerate(_lines(stream, path), 1):
+        text = line.strip("\r\n\ufeff")
+        if text.startswith("#"):
+            comment = (number, text.lstrip("# \t"))
+        elif text.strip():
+            first = re.split(f"[{_DELIMITERS}]", text)[0]
+            return comment if comment[1] and _is_number(first) else (number, text)
+    return comment
+
+
+def _lines(stream: TextIO, path: Path) -> Iterator[str]:
+    """Lines of bounded length."""
+    try:
+        while line := stream.readline(MAX_LINE):
+            if len(line) == MAX_LINE:
+                raise InputError(
+                    f"has a line of more than {MAX_LINE} characters", do="give a CSV file", where=str(path)
+                )
+            yield line
+    except UnicodeDecodeError as error:
+        raise InputError(
+            f"not UTF-8 at byte {error.start}", do="save as UTF-8 text", where=str(path)
+        ) from None
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True

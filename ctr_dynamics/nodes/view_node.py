@@ -1,0 +1,102 @@
+"""Draws the robot for RViz: backbone, joints and covariance in, `/ctr/view/tubes` (MarkerArray) out."""
+
+from __future__ import annotations
+
+import sys
+from typing import Any
+
+import rclpy
+from rcl_interfaces.msg import ParameterDescriptor
+from rclpy.exceptions import ParameterException
+from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
+from rclpy.subscription import RCLError
+
+from ctr_dynamics.errors import InputError
+from ctr_dynamics.messages import topics
+from ctr_dynamics.nodes import qos
+from ctr_dynamics.nodes.naming import NAMESPACE, message_class
+from ctr_dynamics.nodes.spinning import spin_until, stop_on_signals
+from ctr_dynamics.robot import load_robot
+from ctr_dynamics.view.markers import MARKER_ARRAY, TUBES_TOPIC
+from ctr_dynamics.view.scene import Scene
+
+PARAMETERS: dict[str, tuple[Any, str]] = {
+    "robot": ("till2020_tissue", "Shipped robot or path of a robot file."),
+    "rate_hz": (30.0, "Pictures in a second, at most [Hz]."),
+    "diameter_scale": (1.0, "Magnification of the tubes' diameters."),
+    "ellipsoid_scale": (10.0, "Magnification of the tip's 95 % ellipsoid."),
+}
+
+
+class ViewNode(Node):
+    """Node `/ctr/view`.
+
+    Raises:
+        InputError: a parameter or the robot file cannot be used.
+    """
+
+    def __init__(self) -> None:
+        super().__init__("view", namespace=NAMESPACE)
+        values = {
+            name: self.declare_parameter(
+                name, default, ParameterDescriptor(description=text, read_only=True)
+            ).value
+            for name, (default, text) in PARAMETERS.items()
+        }
+        for name in ("rate_hz", "diameter_scale", "ellipsoid_scale"):
+            if not 0.01 <= values[name] <= 1000.0:
+                raise InputError(f"parameter {name} is {values[name]:g}", do="give 0.01 to 1000")
+        self.scene = Scene(
+            load_robot(values["robot"]),
+            values["rate_hz"],
+            values["diameter_scale"],
+            values["ellipsoid_scale"],
+        )
+        self._output = self.create_publisher(
+            message_class(MARKER_ARRAY), TUBES_TOPIC, qos.profile("reliable", 5)
+        )
+        self._inputs = [
+            self.create_subscription(
+                message_class(topics.TOPIC[name].ros_type),
+                name,
+                self._taker(name),
+                qos.profile("best_effort", 10),
+                raw=True,
+            )
+            for name in (topics.JOINT_STATES, topics.TIP_POSE, topics.BACKBONE_STATE)
+        ]
+
+    def _taker(self, topic: str) -> Any:
+        def take(data: bytes) -> None:
+            picture = self.scene.take(topic, data)
+            if picture is not None:
+                self._output.publish(picture[1])
+
+        return take
+
+
+def main(args: list[str] | None = None) -> int:
+    """Run the node; returns 0 after SIGINT or SIGTERM, 2 when it cannot start."""
+    with stop_on_signals() as stop:
+        try:
+            rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
+            node = ViewNode()
+            stop.starting = False
+        except KeyboardInterrupt:
+            rclpy.try_shutdown()
+            return 0
+        except (InputError, ParameterException, RCLError) as error:
+            print(f"view: {' '.join(str(error).split())}", file=sys.stderr)
+            rclpy.try_shutdown()
+            return 2
+        try:
+            spin_until(node, stop)
+        finally:
+            node.destroy_node()
+            rclpy.try_shutdown()
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

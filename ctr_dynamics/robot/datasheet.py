@@ -1,0 +1,274 @@
+"""A robot file from what data sheets say: diameters, lengths, bend radius, moduli, each with its deviation."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from ctr_dynamics.errors import InputError
+from ctr_dynamics.robot.loader import robot_from_dict, robot_to_yaml
+from ctr_dynamics.robot.schema import Robot
+from ctr_dynamics.units import measure
+
+# Friction of a robot that nobody has measured: Till et al. 2020, Table III, with wide deviations.
+FRICTION: dict[str, Any] = {
+    "base": {
+        "coulomb": {"value": 1.09, "unit": "1", "tolerance_percent": 50},
+        "viscous": {"value": 73.9e-7, "unit": "N m s/rad", "tolerance_percent": 50},
+    },
+    "tubes": {
+        "coulomb": {"value": 0.00323, "unit": "1", "tolerance_percent": 50},
+        "viscous": {"value": 1.16e-7, "unit": "N m s/rad", "tolerance_percent": 50},
+    },
+    "epsilon": {"value": 15.0, "unit": "rad/s"},
+}
+GRAVITY = 9.81
+AXES = {"x": 0, "y": 1, "z": 2}
+# Key of a data sheet -> SI unit, whether it is needed, and what it is.
+TUBE_KEYS: dict[str, tuple[str, bool, str]] = {
+    "od": ("m", True, "outer diameter"),
+    "id": ("m", True, "inner diameter, 0 mm for a wire"),
+    "straight": ("m", True, "length of the straight part, from the tube's base"),
+    "curved": ("m", False, "length of the precurved part behind it"),
+    "radius": ("m", False, "bend radius of the centre line in the precurved part"),
+    "E": ("Pa", True, "Young's modulus"),
+    "density": ("kg/m^3", True, "density"),
+    "G": ("Pa", False, "shear modulus; E / 2.6 without it"),
+    "damping": ("N m^2 s", False, "bending damping; 0 without it"),
+}
+
+
+@dataclass(frozen=True)
+class Measured:
+    """A value in SI units with its standard deviation."""
+
+    value: float
+    sigma: float = 0.0
+
+    @property
+    def relative(self) -> float:
+        return self.sigma / abs(self.value) if self.value else 0.0
+
+    def quantity(self, unit: str) -> dict[str, Any]:
+        """As a robot file holds it."""
+        found: dict[str, Any] = {"value": _short(self.value), "unit": unit}
+        if self.sigma:
+            found["tolerance"] = _short(self.sigma)
+        return found
+
+
+def _short(value: float) -> float:
+    """Twelve digits: 1.244 mm is 0.001244 m, not 0.0012440000000000001 m."""
+    return float(f"{value:.12g}")
+
+
+def measured(text: str, si: str, where: str) -> Measured:
+    """A value such as "1.244 mm", "52 GPa +- 2 %" or "0 ms +- 1 ms"; the deviation is one standard deviation.
+
+    Raises:
+        InputError: no number, no fitting unit, or a negative deviation.
+    """
+    head, mark, tail = text.replace("±", "+-").partition("+-")
+    value = measure(head, si, where)
+    if not mark:
+        return Measured(value)
+    if tail.strip().endswith("%"):
+        sigma = abs(value) * measure(tail.strip()[:-1], "1", where) / 100
+    else:
+        sigma = measure(tail, si, where)
+    if not 0 <= sigma < math.inf:
+        raise InputError(f"deviation '{tail.strip()}' is not 0 or more", do="give one sigma", where=where)
+    return Measured(value, sigma)
+
+
+def measures(text: str, si: str, where: str) -> tuple[Measured, ...]:
+    """Several values separated by commas."""
+    return tuple(measured(part, si, where) for part in text.split(","))
+
+
+@dataclass(frozen=True)
+class Sheet:
+    """What is known of a robot; a tuple holds one entry for each tube, innermost first.
+
+    Attributes:
+        tubes: for each tube its name and its data by the keys of `TUBE_KEYS`.
+        gravity: direction of the weight in `ctr_base`: -y, +x, ...
+        tip_mass, tip_diameter: body at the tip, a sphere; kg and m.
+        beta, alpha: rest position of the actuators, m and rad; empty: bases 10 mm apart, angles zero.
+        position_noise, rotation_noise: tracker, one sigma per axis, m and rad.
+        delay: of the tracker, s. lever_arm: (3,) sensor in the tip frame, m.
+        registration_sigma: of the tracker's frame, m and rad per axis.
+        encoder_sigma: offset of a rotary encoder, rad.
+    """
+
+    name: str
+    tubes: tuple[tuple[str, Mapping[str, Measured]], ...]
+    gravity: str = "-y"
+    tip_mass: Measured = Measured(0.0)
+    tip_diameter: Measured = Measured(0.0)
+    beta: tuple[Measured, ...] = ()
+    alpha: tuple[Measured, ...] = ()
+    position_noise: Measured = Measured(0.35e-3)
+    rotation_noise: Measured = Measured(math.radians(0.3))
+    delay: Measured = Measured(0.0, 0.002)
+    lever_arm: tuple[Measured, ...] = field(default_factory=lambda: (Measured(0.0, 0.0005),) * 3)
+    registration_sigma: tuple[float, float] = (0.0005, math.radians(0.3))
+    encoder_sigma: Measured = Measured(math.radians(0.1))
+
+
+def tube_from_text(text: str, number: int) -> tuple[str, dict[str, Measured]]:
+    """A tube such as "name=inner, od=1.244mm, id=1.028mm, straight=301mm, E=52GPa+-2%, density=6.5g/cm^3".
+
+    Raises:
+        InputError: not KEY=VALUE, an unknown key, or a value that cannot be read.
+    """
+    where, name = f"tube {number}", f"tube{number}"
+    found: dict[str, Measured] = {}
+    for part in text.split(","):
+        key, equals, value = (piece.strip() for piece in part.partition("="))
+        if not equals:
+            raise InputError(
+                f"'{part.strip()}' is not KEY=VALUE", do="write for example od=1.2mm", where=where
+            )
+        if key == "name":
+            name = value
+        elif key in TUBE_KEYS:
+            found[key] = measured(value, TUBE_KEYS[key][0], f"{where}: {key}")
+        else:
+            raise InputError(f"unknown key '{key}'", do=f"known: name, {', '.join(TUBE_KEYS)}", where=where)
+    missing = [key for key, (_, needed, _) in TUBE_KEYS.items() if needed and key not in found]
+    if missing:
+        raise InputError(
+            f"{', '.join(missing)} is missing" if len(missing) == 1 else f"{', '.join(missing)} are missing",
+            do=f"{missing[0]} is the {TUBE_KEYS[missing[0]][2]}",
+            where=where,
+        )
+    return name, found
+
+
+def robot_from_sheet(sheet: Sheet) -> Robot:
+    """The robot of a sheet, validated.
+
+    Radii are exact in a robot file; what a deviation of a diameter does to stiffness and mass is therefore added to the
+    deviations of Young's modulus and density (first order: sigma_I / I = 4 sqrt(sum r^6 sigma_r^2) / (ro^4 - ri^4)).
+
+    Raises:
+        InputError: data that no robot can have; the key, the value and the limit are named.
+    """
+    tubes = [_tube(name, data, number) for number, (name, data) in enumerate(sheet.tubes, 1)]
+    if sheet.tip_mass.value:
+        r = sheet.tip_diameter.value / 2
+        inertia = _short(0.4 * sheet.tip_mass.value * r * r)
+        tubes[0]["end_body"] = {
+            "mass": sheet.tip_mass.quantity("kg"),
+            "inertia": {"value": [inertia] * 3, "unit": "kg m^2"},
+        }
+    count = len(tubes)
+    sign, axis = sheet.gravity[:1], sheet.gravity[1:]
+    if sign not in ("+", "-") or axis not in AXES:
+        raise InputError(
+            f"direction of gravity '{sheet.gravity}'", do="write +x, -x, +y, -y, +z or -z", where="gravity"
+        )
+    weight = [0.0, 0.0, 0.0]
+    weight[AXES[axis]] = math.copysign(GRAVITY, -1.0 if sign == "-" else 1.0)
+    beta = [_short(b.value) for b in sheet.beta] or [_short(-0.01 * (count - 1 - i)) for i in range(count)]
+    alpha = [_short(a.value) for a in sheet.alpha] or [0.0] * count
+    if len(sheet.lever_arm) != 3:
+        raise InputError(f"{len(sheet.lever_arm)} numbers", do="give x, y, z", where="lever arm")
+    position, rotation = sheet.registration_sigma
+    data = {
+        "name": sheet.name,
+        "gravity": {"value": weight, "unit": "m/s^2", "direction_tolerance": _short(math.radians(0.2))},
+        "tubes": tubes,
+        "friction": FRICTION,
+        "encoders": {
+            "offset": {"value": 0.0, "unit": "rad", "tolerance": _short(sheet.encoder_sigma.value)},
+            "noise": {"value": _short(math.radians(0.012)), "unit": "rad"},
+        },
+        "tracker": {
+            "registration_rotation": {"value": [0.0] * 3, "unit": "rad", "tolerance": _short(rotation)},
+            "registration_translation": {"value": [0.0] * 3, "unit": "m", "tolerance": _short(position)},
+            "lever_arm": {
+                "value": [_short(part.value) for part in sheet.lever_arm],
+                "unit": "m",
+                "tolerance": [_short(part.sigma) for part in sheet.lever_arm],
+            },
+            "delay": sheet.delay.quantity("s"),
+            "noise": {
+                "position": Measured(sheet.position_noise.value).quantity("m"),
+                "rotation": Measured(sheet.rotation_noise.value).quantity("rad"),
+                "drift": {"value": _short(sheet.position_noise.value / 4), "unit": "m"},
+                "drift_time": {"value": 2.0, "unit": "s"},
+            },
+        },
+        "rest": {"beta": {"value": beta, "unit": "m"}, "alpha": {"value": alpha, "unit": "rad"}},
+        "extensions": {},
+    }
+    return robot_from_dict(data, f"robot '{sheet.name}'")
+
+
+def _tube(name: str, data: Mapping[str, Measured], number: int) -> dict[str, Any]:
+    where = f"tube {number}"
+    outer, inner = data["od"], data["id"]
+    ro, ri, so, si = outer.value / 2, inner.value / 2, outer.sigma / 2, inner.sigma / 2
+    if not 0 <= ri < ro:
+        raise InputError(
+            f"id {1e3 * inner.value:g} mm is not below od {1e3 * outer.value:g} mm",
+            do="check both",
+            where=where,
+        )
+    bending = 4 * math.hypot(ro**3 * so, ri**3 * si) / (ro**4 - ri**4)
+    area = 2 * math.hypot(ro * so, ri * si) / (ro**2 - ri**2)
+    modulus = Measured(data["E"].value, data["E"].value * math.hypot(data["E"].relative, bending))
+    density = Measured(
+        data["density"].value, data["density"].value * math.hypot(data["density"].relative, area)
+    )
+    segments = []
+    if data["straight"].value:
+        segments.append(
+            {
+                "length": data["straight"].quantity("m"),
+                "curvature": {"value": [0.0, 0.0, 0.0], "unit": "1/m"},
+            }
+        )
+    curved = data.get("curved", Measured(0.0))
+    if curved.value:
+        if "radius" not in data or not data["radius"].value:
+            raise InputError("curved is given and radius is not", do="give the bend radius", where=where)
+        radius = data["radius"]
+        curvature = {"value": [_short(1 / radius.value), 0.0, 0.0], "unit": "1/m"}
+        if radius.relative:
+            curvature["tolerance"] = [_short(radius.relative / radius.value), 0.0, 0.0]
+        segments.append({"length": curved.quantity("m"), "curvature": curvature})
+    damping = data.get("damping", Measured(0.0)).quantity("N m^2 s")
+    tube: dict[str, Any] = {
+        "name": name,
+        "inner_radius": Measured(ri).quantity("m"),
+        "outer_radius": Measured(ro).quantity("m"),
+        "youngs_modulus": modulus.quantity("Pa"),
+        "density": density.quantity("kg/m^3"),
+        "bending_damping": damping,
+        "torsion_damping": damping,
+        "precurvature": segments,
+    }
+    if "G" in data:
+        tube["shear_modulus"] = data["G"].quantity("Pa")
+    return tube
+
+
+def robot_file_text(robot: Robot, said: Sequence[str]) -> str:
+    """Text of the robot file, with `said` (what was assumed) as comments at its head."""
+    head = [
+        "SI units and radians; tolerances are standard deviations. Tubes innermost first; arc lengths from a tube's own base,",
+        "curvatures in its own frame. Where shear_modulus is not given, G = E / (2 (1 + 0.3)).",
+        *said,
+    ]
+    return "".join(f"# {line}\n" for line in head) + robot_to_yaml(robot)
+
+
+ASSUMED = (
+    "Assumed, not measured: friction (Till et al. 2020, Table III, 50 %), drift of the tracker (a quarter of its noise over 2 s),",
+    "direction of gravity within 0.2 deg. Deviations of the diameters are contained in those of youngs_modulus and density.",
+)

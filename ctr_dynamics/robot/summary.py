@@ -1,0 +1,88 @@
+"""What a robot file says, in the units of a workshop, and what in it looks doubtful."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ctr_dynamics.robot.schema import Robot
+
+CLEARANCE_M = (5e-6, 0.3e-3)  # radial; outside, a diameter is probably wrong or play matters
+MAX_STRAIN = 0.08  # Nitinol recovers up to about this
+
+
+def tube_rows(robot: Robot) -> list[tuple[str, ...]]:
+    """A header and one row for each tube."""
+    rows: list[tuple[str, ...]] = [
+        ("tube", "od x id mm", "length mm", "precurved mm", "bend radius mm", "E GPa", "EI N m^2", "GJ N m^2")
+    ]
+    for tube in robot.tubes:
+        peaks = [segment.peak_curvature for segment in tube.precurvature]
+        curved = sum(s.length.value for s, peak in zip(tube.precurvature, peaks, strict=True) if peak)
+        radius = f"{1e3 / max(peaks):.1f}" if max(peaks) else "-"
+        rows.append(
+            (
+                tube.name,
+                f"{2e3 * tube.outer_radius.value:.3f} x {2e3 * tube.inner_radius.value:.3f}",
+                f"{1e3 * tube.length:.1f}",
+                f"{1e3 * curved:.1f}",
+                radius,
+                f"{1e-9 * tube.youngs_modulus.value:.1f} +- {100 * tube.youngs_modulus.relative:.1f} %",
+                f"{tube.bending_stiffness:.4g}",
+                f"{tube.torsion_stiffness:.4g}",
+            )
+        )
+    return rows
+
+
+def doubts(robot: Robot) -> list[str]:
+    """What is allowed and yet probably a mistake, one line each."""
+    found: list[str] = []
+    for i, (inside, outside) in enumerate(zip(robot.tubes, robot.tubes[1:], strict=False), 1):
+        gap = outside.inner_radius.value - inside.outer_radius.value
+        low, high = CLEARANCE_M
+        if not low <= gap <= high:
+            found.append(
+                f"clearance between tube {i} and {i + 1} is {1e3 * gap:.4f} mm per side, usual are {1e3 * low:.3f} to "
+                f"{1e3 * high:.1f} mm; check the diameters"
+            )
+    for i, tube in enumerate(robot.tubes, 1):
+        strain = max(segment.peak_curvature for segment in tube.precurvature) * tube.outer_radius.value
+        if strain > MAX_STRAIN:
+            found.append(
+                f"tube {i} is strained by {100 * strain:.1f} % when straight, Nitinol recovers up to about {100 * MAX_STRAIN:.0f} %; "
+                "check bend radius and diameter"
+            )
+    exact = [name for name, value in _deviations(robot) if value == 0.0]
+    if exact:
+        found.append(
+            f"taken as exact, because no tolerance is given: {', '.join(exact)}; the published covariance will be too small if they "
+            "are not"
+        )
+    noise = robot.tracker.noise
+    if noise.position.value == 0 or noise.rotation.value == 0:
+        found.append("the tracker's noise is zero; give its measured standard deviation")
+    return found
+
+
+def _deviations(robot: Robot) -> list[tuple[str, float]]:
+    """Name and size of every deviation that the filter would carry."""
+    found: list[tuple[str, float]] = []
+    for i, tube in enumerate(robot.tubes, 1):
+        found.append((f"youngs_modulus of tube {i}", tube.youngs_modulus.tolerance))
+        if any(np.any(segment.coefficients) for segment in tube.precurvature):
+            found.append((f"precurvature of tube {i}", tube.precurvature_tolerance))
+        if tube.end_body:
+            found.append((f"mass at the end of tube {i}", tube.end_body.mass.tolerance))
+    tracker = robot.tracker
+    return [
+        *found,
+        ("density", max(tube.density.tolerance for tube in robot.tubes)),
+        ("direction of gravity", robot.gravity.direction_tolerance),
+        ("encoder offset", robot.encoders.offset.tolerance),
+        (
+            "registration",
+            max(*tracker.registration_rotation.tolerance, *tracker.registration_translation.tolerance),
+        ),
+        ("lever arm", max(tracker.lever_arm.tolerance)),
+        ("tracker delay", tracker.delay.tolerance),
+    ]

@@ -1,0 +1,108 @@
+"""The loop without ROS and without a clock: plant, estimator and damper in one thread, every delay as it would be.
+
+    python examples/vibration_suppression/offline.py
+
+prints the settling times with and without control. The nodes of this folder do the same over DDS.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections import deque
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ctr_dynamics.estimation.estimator import Estimator
+from ctr_dynamics.messages import topics
+from ctr_dynamics.messages.cdr import decode_joint_state, decode_pose_stamped, decode_wrench_stamped
+from ctr_dynamics.model.model import Model
+from ctr_dynamics.model.statics import Statics
+from ctr_dynamics.parameters import Settings
+from ctr_dynamics.robot import Robot, load_robot
+
+sys.path.insert(0, str(Path(__file__).parent))
+from damper import DriveHistory, Estimate, Limits, ModalDamper, Tuning
+from plant import Hardware, Plant, settling_time
+
+START_NS = 1_700_000_000_000_000_000
+ESTIMATOR_LATENCY_S = 0.006  # from a step's stamp to its message in the controller's hands
+
+
+def tip_jacobian(robot: Robot) -> NDArray[np.float64]:
+    """(3,) m/rad: motion of the static tip when all tubes are turned together from their rest position."""
+    statics = Statics(Model(robot, nodes=24))
+    beta, alpha = np.array(robot.rest.beta.value), np.array(robot.rest.alpha.value)
+    step = 1e-3
+    ahead, behind = (statics.solve(beta, alpha + sign * step).tip_position for sign in (1, -1))
+    return (ahead - behind) / (2 * step)
+
+
+def run(
+    robot: Robot,
+    seconds: float,
+    *,
+    control: bool = True,
+    hardware: Hardware | None = None,
+    tuning: Tuning | None = None,
+    limits: Limits | None = None,
+    period_s: float = 0.01,
+    mode: int = 0,
+) -> Plant:
+    """Release the weight and let the loop run; returns the plant with its truth."""
+    plant = Plant(robot, START_NS, hardware)
+    estimator = Estimator(robot, Settings({"output.policy": "predict"}))
+    jacobian = tip_jacobian(robot)
+    axis = int(np.argmax(np.abs(jacobian)))
+    damper, drives = ModalDamper(float(jacobian[axis]), period_s, tuning, limits), DriveHistory()
+    on_the_way: deque[tuple[float, Estimate | None]] = deque()
+    next_command = 0.0
+    while plant.t < seconds:
+        for topic, data in plant.step():
+            if topic == topics.JOINT_STATES:
+                joints = decode_joint_state(data)
+                estimator.add_joint_state(joints.stamp_ns, joints.names, joints.positions)
+                drives.add(
+                    (joints.stamp_ns - START_NS) * 1e-9, joints.positions[0] - robot.rest.alpha.value[0]
+                )
+            elif topic == topics.TRACKER_TIP:
+                pose = decode_pose_stamped(data)
+                estimator.add_tracker_pose(pose.stamp_ns, pose.position, pose.quaternion_xyzw, pose.frame_id)
+            else:
+                load = decode_wrench_stamped(data)
+                estimator.add_tip_load(load.stamp_ns, load.force, load.torque, load.frame_id)
+        for out in estimator.advance(START_NS + round(plant.t * 1e9)):
+            t = (out.stamp_ns - START_NS) * 1e-9
+            drive = drives.at(t)
+            estimate = None
+            if out.valid and drive is not None and len(out.modes.frequency_hz) > mode:
+                estimate = Estimate(
+                    t, float(out.modes.amplitude[mode]), float(out.modes.rate[mode]),
+                    2 * np.pi * float(out.modes.frequency_hz[mode]), float(out.modes.damping[mode]),
+                    float(np.sqrt(out.tip_velocity_covariance[axis, axis])), *drive,
+                )  # fmt: skip
+            on_the_way.append((plant.t + ESTIMATOR_LATENCY_S, estimate))
+        while on_the_way and on_the_way[0][0] <= plant.t:
+            _, estimate = on_the_way.popleft()
+            damper.take(estimate) if estimate is not None else damper.invalid()
+        if plant.t >= next_command:
+            next_command += period_s
+            delta = damper.command(plant.t)
+            if control:
+                plant.send(plant.t, delta)
+    return plant
+
+
+def main() -> None:
+    robot = load_robot("till2020_tissue")
+    for label, control in (("without control", False), ("with control", True)):
+        plant = run(robot, 6.0, control=control)
+        settled = settling_time(plant.truth, plant.hardware.release_s, 0.003)
+        print(
+            f"{label:<16} tip within 3 mm after {settled:.2f} s, largest turn {max(map(abs, plant.truth.delta)):.3f} rad"
+        )
+
+
+if __name__ == "__main__":
+    main()
