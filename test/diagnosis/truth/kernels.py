@@ -684,6 +684,47 @@ class Scheme(NamedTuple):
 
 
 @njit(cache=True)
+def _full_newton(plant, scheme, c, v, A, inputs, h, tolerance, counts):
+    """Solve one step for the stage accelerations A (3, n) with the Jacobians of every stage; False when that fails."""
+    n = c.shape[0]
+    C, V = np.empty(n), np.empty(n)
+    r = np.empty((3, n))
+    flat = np.empty(3 * n)
+    tip = np.empty(TIP)
+    K, D, M = np.empty((n, n)), np.empty((n, n)), np.empty((n, n))
+    whole = np.empty((3 * n, 3 * n))
+    for _ in range(25):
+        counts[0] += 1
+        counts[1] += 3
+        for j in range(3):
+            for k in range(n):
+                C[k] = c[k] + h * scheme.nodes[j] * v[k]
+                V[k] = v[k]
+                for i in range(3):
+                    C[k] += h * h * scheme.A2[j, i] * A[i, k]
+                    V[k] += h * scheme.A[j, i] * A[i, k]
+            residual(plant, C, V, A[j], inputs[j], r[j], tip)
+            jacobians(plant, C, V, A[j], inputs[j], K, D, M)
+            for i in range(3):
+                block = h * scheme.A[j, i] * D + h * h * scheme.A2[j, i] * K
+                if i == j:
+                    block += M
+                whole[j * n : (j + 1) * n, i * n : (i + 1) * n] = block
+            flat[j * n : (j + 1) * n] = -r[j]
+        change = np.linalg.solve(whole, flat)
+        size = h * h * np.abs(change).max()
+        if not size < 1e6:
+            return False
+        share = min(1.0, 20.0 / size)
+        for j in range(3):
+            for k in range(n):
+                A[j, k] += share * change[j * n + k]
+        if size < tolerance:
+            return True
+    return False
+
+
+@njit(cache=True)
 def integrate(plant, scheme, c, v, inputs, h, tolerance, tips, counts):
     """Integrate len(inputs) steps of h s in place of (c, v); tips[0] is the begin.
 
@@ -770,6 +811,14 @@ def integrate(plant, scheme, c, v, inputs, h, tolerance, tips, counts):
             if done:
                 age += 1 if age < 1000 else 0
                 break
+        if not done:
+            A[:] = 0.0
+            done = _full_newton(plant, scheme, c, v, A, inputs[step], h, tolerance, counts)
+            if not done:
+                for j in range(3):
+                    A[j] = start
+                done = _full_newton(plant, scheme, c, v, A, inputs[step], h, tolerance, counts)
+            age = 1000
         if not done:
             return step
         for k in range(n):
