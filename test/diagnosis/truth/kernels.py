@@ -375,9 +375,7 @@ def residual(plant, c, v, a, inputs, r, tip):
             dz += H * (acc[0, 2] + acc[1, 2])
             for i in range(1, present):
                 for k in range(3):
-                    th[i, k] += H * (
-                        uz_at[p0, i, k] + uz_at[p1, i, k] - uz_at[p0, 0, k] - uz_at[p1, 0, k]
-                    )
+                    th[i, k] += H * (uz_at[p0, i, k] + uz_at[p1, i, k] - uz_at[p0, 0, k] - uz_at[p1, 0, k])
 
     tip[0], tip[1], tip[2] = px, py, pz
     tip[3:12] = R
@@ -553,7 +551,7 @@ def residual(plant, c, v, a, inputs, r, tip):
             if q < 0:
                 for i in range(n):
                     cs, sn = math.cos(edge_th[0, i, 0]), math.sin(edge_th[0, i, 0])
-                    a0, a1 = plant.axis[i], plant.ustar_plate[i]
+                    a1 = plant.ustar_plate[i]
                     if a1[0] != 0.0 or a1[1] != 0.0:
                         near[i, 0], near[i, 1] = _bending(
                             plant,
@@ -756,7 +754,7 @@ def integrate(plant, scheme, c, v, inputs, h, tolerance, tips, counts):
                     A[j] = (2 - attempt) * start
                 age = 1000
             last, rising, since = np.inf, 0, 0
-            for iteration in range(60):
+            for _ in range(60):
                 counts[0] += 1
                 for j in range(2, -1, -1):
                     for k in range(n):

@@ -67,18 +67,14 @@ class Machine:
         if any(s.curvature is None for tube in robot.tubes for s in tube.precurvature):
             raise NotImplementedError("the truth generator knows piecewise constant precurvature only")
         tubes, zero = robot.tubes, [0.0, 0.0, 0.0]
-        second = np.array(
-            [math.pi / 4 * (t.outer_radius.value**4 - t.inner_radius.value**4) for t in tubes]
-        )
+        second = np.array([math.pi / 4 * (t.outer_radius.value**4 - t.inner_radius.value**4) for t in tubes])
         area = np.array([math.pi * (t.outer_radius.value**2 - t.inner_radius.value**2) for t in tubes])
         rho = np.array([t.density.value for t in tubes])
         stiff = second * [t.youngs_modulus.value for t in tubes]
         friction = robot.friction
         return cls(
             beta=np.array(robot.rest.beta.value, dtype=float),
-            segments=[
-                [(s.length.value, np.array(s.curvature.value)) for s in t.precurvature] for t in tubes
-            ],
+            segments=[[(s.length.value, np.array(s.curvature.value)) for s in t.precurvature] for t in tubes],
             EI=np.stack([stiff, stiff], axis=1),
             axis=np.zeros(len(tubes)),
             GJ=2.0 * second * [t.shear.value for t in tubes],
@@ -149,10 +145,7 @@ def plant_of(machine: Machine, refine: int = 1) -> tuple[Plant, int]:
         first.append(len(h))
     tiny = 1e-9
     ustar_ends = [
-        [
-            [machine.curvature_at(i, s) for i in range(n)]
-            for s in (stations[k] + tiny, stations[k + 1] - tiny)
-        ]
+        [[machine.curvature_at(i, s) for i in range(n)] for s in (stations[k] + tiny, stations[k + 1] - tiny)]
         for k in range(sections)
     ]
     straight = -machine.beta
@@ -197,9 +190,7 @@ def plant_of(machine: Machine, refine: int = 1) -> tuple[Plant, int]:
             ]
         ),
         drag=np.array(machine.drag),
-        clearance=np.array(
-            [machine.clearance_rad if kink >= 0 else 0.0, machine.clearance_Nm, float(kink)]
-        ),
+        clearance=np.array([machine.clearance_rad if kink >= 0 else 0.0, machine.clearance_Nm, float(kink)]),
         spring=np.array(machine.spring),
         contact=np.array(machine.contact),
         bob=np.array(machine.bob),

@@ -119,9 +119,8 @@ class Run:
         )
         first = Rotation.from_matrix(self.rotation[k])
         whole = (Rotation.from_matrix(self.rotation[k + 1]) * first.inv()).as_rotvec()
-        turned = (
-            f**2 * (3 - 2 * f) * whole
-            + h * (f * (1 - f) ** 2 * self.omega[k] - f**2 * (1 - f) * self.omega[k + 1])
+        turned = f**2 * (3 - 2 * f) * whole + h * (
+            f * (1 - f) ** 2 * self.omega[k] - f**2 * (1 - f) * self.omega[k + 1]
         )
         return p, (Rotation.from_rotvec(turned) * first).as_matrix()
 
