@@ -8,10 +8,11 @@ quadrature (rotations by a fourth-order Magnus step), d'Alembert's principle wit
 
 which Radau IIA with three stages (order 5, L-stable) integrates. Nothing is shot and nothing is a finite difference in s.
 
-Order of the coordinates: tube angles psi at the actuators (N); two twist coefficients for the straight length of every tube (2N); for each section u_x,
-u_y (`nb` each) and u_z of the tubes present (`nt` each); tilt of the clearance (2); position of a hanging bob (3).
-Inputs: actuator angles (N), tip force and moment in base axes (3, 3), position, velocity and acceleration of the base plate (3, 3, 3), factor of
-all Young's and shear moduli (1).
+Order of the coordinates: tube angles psi at the actuators (N); two twist coefficients for the straight length of every tube
+(2N); for each section u_x, u_y (`nb` each) and u_z of the tubes present (`nt` each); z of the clearance's tilt, which is
+play z / sqrt(1 + z^2) at the moment m0 z (2); position of a hanging bob (3).
+Inputs: actuator angles (N), tip force and moment in base axes (3, 3), position, velocity and acceleration of the base plate
+(3, 3, 3), factor of all Young's and shear moduli (1).
 """
 
 import math
