@@ -245,6 +245,14 @@ def tip_at(plant: Plant, c: np.ndarray, inputs: np.ndarray) -> np.ndarray:
     return tip
 
 
+def _parabola(nodes: np.ndarray, at: np.ndarray) -> np.ndarray:
+    """(n, 3) weights that take values at three nodes to those of the parabola through them at `at` (n,)."""
+    return np.stack(
+        [np.prod([(at - nodes[m]) / (nodes[k] - nodes[m]) for m in range(3) if m != k], 0) for k in range(3)],
+        axis=1,
+    )
+
+
 def radau() -> Scheme:
     """Coefficients of Radau IIA with three stages (Hairer and Wanner 1996, table IV.5.6)."""
     q = math.sqrt(6.0)
@@ -259,16 +267,7 @@ def radau() -> Scheme:
     values, T = np.linalg.eig(A)
     order = np.argsort(np.abs(values.imag), kind="stable")
     values, T = values[order].astype(complex), T[:, order].astype(complex)
-    extrapolate = np.array(
-        [
-            [
-                np.prod([(1 + x - nodes[m]) / (nodes[k] - nodes[m]) for m in range(3) if m != k])
-                for k in range(3)
-            ]
-            for x in nodes
-        ]
-    )
-    return Scheme(nodes, A, A @ A, values, T, np.linalg.inv(T), extrapolate)
+    return Scheme(nodes, A, A @ A, values, T, np.linalg.inv(T), _parabola(nodes, 1 + nodes))
 
 
 RADAU = radau()
@@ -291,7 +290,36 @@ def run(
     tips = np.empty((len(inputs) + 1, TIP))
     tips[0] = tip_at(plant, c, inputs[0, 0])
     counts = np.zeros(2, dtype=np.int64) if statistics is None else statistics
-    done = integrate(plant, RADAU, c.copy(), np.zeros(len(c)), inputs, step_s, TOLERANCE, tips, counts)
-    if done < len(inputs):
-        raise NoMotionError(f"the step at {done * step_s:.4f} s did not converge")
+    c, v = c.copy(), np.zeros(len(c))
+    done = 0
+    while done < len(inputs):
+        done += integrate(plant, RADAU, c, v, inputs[done:], step_s, TOLERANCE, tips[done:], counts)
+        if done < len(inputs):
+            if not _in_parts(plant, c, v, inputs[done], step_s, tips[done + 1], counts, 3):
+                raise NoMotionError(f"the step at {done * step_s:.4f} s did not converge")
+            done += 1
     return tips
+
+
+def _in_parts(
+    plant: Plant,
+    c: np.ndarray,
+    v: np.ndarray,
+    inputs: np.ndarray,
+    h: float,
+    tip: np.ndarray,
+    counts: np.ndarray,
+    depth: int,
+) -> bool:
+    """Take one step in four parts, and parts that fail in four again, `depth` times at most; False when that fails too."""
+    tips = np.empty((2, TIP))
+    for part in range(4):
+        times = (part + RADAU.nodes) / 4
+        # inputs between the stages by the parabola through them
+        now = _parabola(RADAU.nodes, times) @ inputs
+        if not integrate(plant, RADAU, c, v, now[None], h / 4, TOLERANCE, tips, counts) and (
+            depth == 0 or not _in_parts(plant, c, v, now, h / 4, tips[1], counts, depth - 1)
+        ):
+            return False
+    tip[:] = tips[1]
+    return True
