@@ -626,6 +626,10 @@ def residual(plant, c, v, a, inputs, r, tip):
                 end -= Th[q]
         r[i] = end + plant.drive[i, 0] * (c[i] - inputs[i]) + plant.drive[i, 1] * a[i]
         r[k] = length * end
+        if length < 1e-9:  # held at the plate: its twist coefficients mean nothing and stay zero
+            r[k] = a[k] + c[k]
+            r[k + 1] = a[k + 1] + c[k + 1]
+            continue
         H = 0.5 * length
         inertia = 2.0 * plant.rho_i[i]
         for g in range(2):

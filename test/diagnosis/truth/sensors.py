@@ -88,7 +88,8 @@ def write(path: Path, run: Run, sensing: Sensing, robot: Robot, rng: np.random.G
 
     if motion.hung_kg:
         slow, fast = np.arange(0.0, motion.duration_s - 1e-9, 0.1), CUT_S + 0.01 * np.arange(-1, 4)
-        for x in np.unique(np.round(np.concatenate([slow, fast]), 6)):
+        times = np.unique(np.round(np.concatenate([slow, fast]), 6))
+        for x in times[times < motion.duration_s - 1e-9]:
             wrench = float(motion.load_share(x)) * run.wrench
             data = encode_wrench_stamped(stamp_of(x), FRAME, wrench[:3].tolist(), wrench[3:].tolist())
             messages.append((stamp_of(x), TIP_LOAD, data))
