@@ -21,6 +21,7 @@ from ctr_dynamics.model.workspace import (
     Z0,
     field_rows,
     lane_count,
+    lane_trips,
     offsets,
     parameter_rows,
     sincos,

@@ -35,6 +35,7 @@ class Inputs:
     torque: np.ndarray = field(default_factory=lambda: np.zeros(3))
 
 
+RENEW = 2  # sweeps a stage beyond which the next step starts with a new Jacobian, which costs two
 InputsAt = Callable[[float], Inputs]
 
 
@@ -155,21 +156,19 @@ class Simulator:
         inputs_at: InputsAt,
         *,
         record: bool = False,
-        lead: np.ndarray | None = None,
+        start: np.ndarray | None = None,
     ) -> StepResult:
         """Advance ``state`` from t to t + dt (s) in place; ``inputs_at`` gives actuators and load at any time in between.
 
         A step that fails is tried again with a fresh Jacobian and, for one-step schemes, in up to 32 substeps. With ``record`` the result
-        carries what the tangent of the step needs. ``lead`` (stages, 5 + N): by how much another run of the same inputs has just missed
-        its own extrapolated start; this one would miss by nearly the same.
+        carries what the tangent of the step needs. ``start`` (stages, 5 + N): where to look for the unknowns, in place of their straight
+        extrapolation.
         """
-        result = self._attempt(state, self.scheme, t, inputs_at, not state.usable, record, lead)
+        result = self._attempt(state, self.scheme, t, inputs_at, not state.usable, record, start)
         if result.ok:
             return result
         totals = [result.iterations, result.sweeps, result.jacobians]
-        quadratic = (
-            state.unknowns - 2.0 * state.earlier[0] + state.earlier[1]
-        )  # what a quadratic start adds to the linear one
+        quadratic = 3.0 * (state.unknowns - state.earlier[0]) + state.earlier[1]
         retries = [(1, quadratic), (1, None)] + [
             (2**halving, None) for halving in range(1, 6) if self.scheme.one_step
         ]
@@ -203,7 +202,7 @@ class Simulator:
         inputs_at: InputsAt,
         fresh: bool,
         record: bool,
-        lead: np.ndarray | None = None,
+        start: np.ndarray | None = None,
     ) -> StepResult:
         n, stages = self.model.n, scheme.stages
         at_stages = [inputs_at(t + c * scheme.dt) for c in scheme.times]
@@ -230,9 +229,9 @@ class Simulator:
             fresh = True
         mesh = now_mesh
         small, big = self._work(key, mesh)
-        guess = 2.0 * state.unknowns - state.earlier[0]  # linear in time, stage by stage
-        if lead is not None:
-            guess += lead
+        guess = (
+            2.0 * state.unknowns - state.earlier[0] if start is None else start
+        )  # linear in time, stage by stage
         before = bank[:RATES].copy() if record else bank
         found = np.empty_like(guess)
         outcome, iterations, sweeps, jacobians = step(
@@ -240,7 +239,7 @@ class Simulator:
             inputs, bank, guess, found, state.inverse, fresh, small, big, self.model.scale, self.model.step,
             self.tolerance, self.limit,
         )  # fmt: skip
-        state.usable = outcome == CONVERGED
+        state.usable = outcome == CONVERGED and sweeps <= RENEW * stages
         if outcome != CONVERGED:
             return StepResult(False, OUTCOMES[outcome], iterations, sweeps, jacobians)
         state.key, state.mesh, state.bank = key, mesh, bank
