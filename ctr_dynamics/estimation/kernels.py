@@ -172,3 +172,39 @@ def backbone_rows(s, nodes, fields, points, n, insertion_rate, turn, shift, devi
         for k in range(3):
             rows[i, 11 + k] = fields[base + 6 + k]
         rows[i, 14] = deviation[i]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def sparse_product(indptr, indices, data, vector):
+    """Product (rows,) of a matrix in compressed rows with ``vector`` (columns,)."""
+    result = np.empty(len(indptr) - 1)
+    for row in range(len(result)):
+        total = 0.0
+        for k in range(indptr[row], indptr[row + 1]):
+            total += data[k] * vector[indices[k]]
+        result[row] = total
+    return result
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def position_deviations(dnodes, size, pi):
+    """(nodes,) deviation of the position per axis in m: root of a third of the trace of its covariance under ``pi`` (r, r).
+
+    ``dnodes`` (nodes * size, r): columns of the node states, position first.
+    """
+    nodes, r = len(dnodes) // size, len(pi)
+    result = np.empty(nodes)
+    product = np.empty(r)
+    for node in range(nodes):
+        total = 0.0
+        for axis in range(3):
+            row = dnodes[node * size + axis]
+            product[:] = 0.0
+            for i in range(r):
+                x = row[i]
+                for k in range(r):
+                    product[k] += x * pi[i, k]
+            for k in range(r):
+                total += product[k] * row[k]
+        result[node] = math.sqrt(max(total, 0.0) / 3.0)
+    return result

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Literal
 
 import numpy as np
 from scipy.interpolate import CubicSpline
@@ -37,6 +39,7 @@ class Inputs:
 
 RENEW = 2  # sweeps a stage beyond which the next step starts with a new Jacobian, which costs two
 InputsAt = Callable[[float], Inputs]
+"""Inputs at a time in s. One that also has ``stages(times)``, which returns what :func:`stage_inputs` does, is asked for all stages at once."""
 
 
 @dataclass(frozen=True)
@@ -54,7 +57,12 @@ class StepResult:
 
 @dataclass(frozen=True)
 class Record:
-    """What :func:`ctr_dynamics.model.tangent.step_tangent` needs of one solved step."""
+    """What the tangent of a solved step needs.
+
+    ``after`` (fields,): fields at its end; ``inputs`` (stages, 3N + 6) and ``found`` (stages, 5 + N) at its stages. :func:`step_tangent
+    <ctr_dynamics.model.tangent.step_tangent>` also reads ``before`` (3, fields), the stored fields before the step, and all of
+    ``rates`` (stages, fields); without them ``before`` is empty and ``rates`` holds the last stage's alone.
+    """
 
     scheme: Scheme
     key: tuple
@@ -155,14 +163,14 @@ class Simulator:
         t: float,
         inputs_at: InputsAt,
         *,
-        record: bool = False,
+        record: bool | Literal["end"] = False,
         start: np.ndarray | None = None,
     ) -> StepResult:
         """Advance ``state`` from t to t + dt (s) in place; ``inputs_at`` gives actuators and load at any time in between.
 
         A step that fails is tried again with a fresh Jacobian and, for one-step schemes, in up to 32 substeps. With ``record`` the result
-        carries what the tangent of the step needs. ``start`` (stages, 5 + N): where to look for the unknowns, in place of their straight
-        extrapolation.
+        carries what the tangent of the step needs; with "end", of its last stage alone, and the record holds until the state is written
+        to. ``start`` (stages, 5 + N): where to look for the unknowns, in place of their straight extrapolation.
         """
         result = self._attempt(state, self.scheme, t, inputs_at, not state.usable, record, start)
         if result.ok:
@@ -201,10 +209,11 @@ class Simulator:
         t: float,
         inputs_at: InputsAt,
         fresh: bool,
-        record: bool,
+        record: bool | Literal["end"],
         start: np.ndarray | None = None,
     ) -> StepResult:
         n, stages = self.model.n, scheme.stages
+<<<<<<< HEAD
         at_stages = [inputs_at(t + c * scheme.dt) for c in scheme.times]
         last = at_stages[-1]
         inputs = np.empty((stages, self.model.input_count))
@@ -217,6 +226,10 @@ class Simulator:
             inputs[i, 3 * n : 3 * n + 3], inputs[i, 3 * n + 3 : 3 * n + 6] = now.force, now.torque
             inputs[i, 3 * n + 6 :] = now.beta_rate[: self.model.input_count - 3 * n - 6]
         if not np.isfinite(inputs).all():
+=======
+        inputs, last = stage_inputs(n, inputs_at, t + scheme.times * scheme.dt)
+        if not math.isfinite(float(inputs.sum())):
+>>>>>>> 6094912 (Columns on 12 nodes, moved in place; inputs of all stages at once)
             return StepResult(False, "actuators or load hold a number that is not finite", 0, 0, 0)
         bank, mesh = state.bank, state.mesh
         try:
@@ -232,7 +245,11 @@ class Simulator:
         guess = (
             2.0 * state.unknowns - state.earlier[0] if start is None else start
         )  # linear in time, stage by stage
+<<<<<<< HEAD
         before = bank[:RATES].copy() if record else bank
+=======
+        before = bank[:RATES].copy() if record is True else bank[:0]
+>>>>>>> 6094912 (Columns on 12 nodes, moved in place; inputs of all stages at once)
         found = np.empty_like(guess)
         outcome, iterations, sweeps, jacobians = step(
             self.model.tubes, self.model.lane, self.model.jacobian_lanes, mesh, scheme.c0, scheme.weights, self.parameters,
@@ -243,12 +260,14 @@ class Simulator:
         if outcome != CONVERGED:
             return StepResult(False, OUTCOMES[outcome], iterations, sweeps, jacobians)
         state.key, state.mesh, state.bank = key, mesh, bank
-        state.earlier = np.stack([state.unknowns, state.earlier[0]])
-        state.unknowns = found
+        earlier = np.empty_like(state.earlier)
+        earlier[0], earlier[1] = state.unknowns, state.earlier[0]
+        state.earlier, state.unknowns = earlier, found
         state.nodes = small[6].reshape(-1, 16 + 3 * n).copy()
         state.inputs = last
         records: tuple[Record, ...] = ()
         if record:
+<<<<<<< HEAD
             rates = bank[RATES : RATES + stages].copy()
             records = (
                 Record(
@@ -263,6 +282,13 @@ class Simulator:
                     t + scheme.times * scheme.dt,
                 ),
             )
+=======
+            # substeps share one bank, so each record needs its own copy
+            own = np.copy if record is True or scheme is not self.scheme else np.asarray
+            rates = own(bank[RATES + (0 if record is True else stages - 1) : RATES + stages])
+            times = t + scheme.times * scheme.dt
+            records = (Record(scheme, key, mesh, before, own(bank[Y_NOW]), rates, inputs, found, times),)
+>>>>>>> 6094912 (Columns on 12 nodes, moved in place; inputs of all stages at once)
         return StepResult(True, "ok", iterations, sweeps, jacobians, records=records)
 
     def _work(self, key: tuple, mesh: Mesh) -> tuple:
@@ -274,6 +300,19 @@ class Simulator:
                 self.model.buffers(mesh, lanes),
             )
         return self._buffers[key]
+
+
+def stage_inputs(n: int, inputs_at: InputsAt, times: np.ndarray) -> tuple[np.ndarray, Inputs]:
+    """Rows (stages, 3N + 6) of alpha, its rate, beta, tip force and torque at ``times`` (stages,) s, and the inputs at the last of them."""
+    at_once = getattr(inputs_at, "stages", None)
+    if at_once is not None:
+        return at_once(times)
+    rows = np.empty((len(times), 3 * n + 6))
+    for row, time in zip(rows, times, strict=True):
+        now = inputs_at(time)
+        row[:n], row[n : 2 * n], row[2 * n : 3 * n] = now.alpha, now.alpha_rate, now.beta
+        row[3 * n : 3 * n + 3], row[3 * n + 3 :] = now.force, now.torque
+    return rows, now
 
 
 def remap_fields(
