@@ -409,14 +409,14 @@ class Estimator:
         """Actuators and load at a time (s from t0), with the estimated offsets and force for the fused run."""
         assert self.t0_ns is not None
         n = self.model.n
-        shift = np.zeros(3 * n + 6)
+        shift = np.zeros(self.model.input_count)
         shift[:n] = self._nominal_offset
         if corrected:
             for i, row in self._offset_rows:
                 shift[i] += self.fusion.theta[row]
             shift[3 * n : 3 * n + 3] = self.fusion.force
         extrapolate = self._timeout_ns if self._predicting else 0
-        return _Actuation(n, self.t0_ns, self._joints, self._load, extrapolate, shift, self._known)
+        return _Actuation(self.model, self.t0_ns, self._joints, self._load, extrapolate, shift, self._known)
 
     def _start(self, k: int) -> str:
         """Both runs at rest at step ``k``; returns the reason when there is no equilibrium."""
@@ -478,11 +478,7 @@ class Estimator:
             - 3.0 * (a.earlier[0] - f.earlier[0])
             + (a.earlier[1] - f.earlier[1])
         )
-<<<<<<< HEAD
-        result = self.simulator.step(f, before, self._inputs(True), record=True)
-=======
         result = self.simulator.step(f, before, self._inputs(True), record="end")
->>>>>>> 6094912 (Columns on 12 nodes, moved in place; inputs of all stages at once)
         # the actuators' noise moves both runs alike: what lies between their unknowns is smooth, so a parabola meets it
         start = f.unknowns + apart if result.ok else None
         alone = self.reference.step(a, before, self._inputs(False), start=start)
@@ -810,14 +806,14 @@ _NO_LOAD = np.zeros(6)
 
 
 class _Actuation:
-    """Input signals with the corrections ``shift`` (3N + 6,) of one run, for the simulator.
+    """Input signals with the corrections ``shift`` (inputs,) of one run, for the simulator.
 
     ``known`` keeps the bare signals of one step, which both runs share.
     """
 
     def __init__(
         self,
-        n: int,
+        model: Model,
         t0_ns: int,
         joints: Signal,
         load: Signal,
@@ -825,7 +821,13 @@ class _Actuation:
         shift: Floats,
         known: dict,
     ) -> None:
-        self.n, self.t0_ns, self.joints, self.load = n, t0_ns, joints, load
+        self.n, self.count, self.t0_ns, self.joints, self.load = (
+            model.n,
+            model.input_count,
+            t0_ns,
+            joints,
+            load,
+        )
         self.extrapolate_ns, self.shift, self.known = extrapolate_ns, shift, known
 
     def __call__(self, t: float) -> Inputs:
@@ -836,12 +838,13 @@ class _Actuation:
         n = self.n
         key = (float(times[0]), float(times[-1]))
         if key not in self.known:
-            bare = np.empty((len(times), 3 * n + 6))
+            bare = np.empty((len(times), self.count))
             for row, t in zip(bare, times.tolist(), strict=True):
                 time_ns = self.t0_ns + round(t * 1e9)
                 value, rate = self.joints.at(time_ns, self.extrapolate_ns)
                 row[:n], row[n : 2 * n], row[2 * n : 3 * n] = value[:n], rate[:n], value[n:]
-                row[3 * n :] = self.load.at(time_ns)[0] if self.load.stamps else _NO_LOAD
+                row[3 * n : 3 * n + 6] = self.load.at(time_ns)[0] if self.load.stamps else _NO_LOAD
+                row[3 * n + 6 :] = rate[n : n + self.count - 3 * n - 6]
             self.known[key] = bare, rate[n:]
         bare, beta_rate = self.known[key]
         rows = bare + self.shift
@@ -852,7 +855,7 @@ class _Actuation:
             last[2 * n : 3 * n],
             beta_rate,
             last[3 * n : 3 * n + 3],
-            last[3 * n + 3 :],
+            last[3 * n + 3 : 3 * n + 6],
         )
 
 

@@ -213,23 +213,8 @@ class Simulator:
         start: np.ndarray | None = None,
     ) -> StepResult:
         n, stages = self.model.n, scheme.stages
-<<<<<<< HEAD
-        at_stages = [inputs_at(t + c * scheme.dt) for c in scheme.times]
-        last = at_stages[-1]
-        inputs = np.empty((stages, self.model.input_count))
-        for i, now in enumerate(at_stages):
-            inputs[i, :n], inputs[i, n : 2 * n], inputs[i, 2 * n : 3 * n] = (
-                now.alpha,
-                now.alpha_rate,
-                now.beta,
-            )
-            inputs[i, 3 * n : 3 * n + 3], inputs[i, 3 * n + 3 : 3 * n + 6] = now.force, now.torque
-            inputs[i, 3 * n + 6 :] = now.beta_rate[: self.model.input_count - 3 * n - 6]
-        if not np.isfinite(inputs).all():
-=======
-        inputs, last = stage_inputs(n, inputs_at, t + scheme.times * scheme.dt)
+        inputs, last = stage_inputs(self.model, inputs_at, t + scheme.times * scheme.dt)
         if not math.isfinite(float(inputs.sum())):
->>>>>>> 6094912 (Columns on 12 nodes, moved in place; inputs of all stages at once)
             return StepResult(False, "actuators or load hold a number that is not finite", 0, 0, 0)
         bank, mesh = state.bank, state.mesh
         try:
@@ -245,11 +230,7 @@ class Simulator:
         guess = (
             2.0 * state.unknowns - state.earlier[0] if start is None else start
         )  # linear in time, stage by stage
-<<<<<<< HEAD
-        before = bank[:RATES].copy() if record else bank
-=======
         before = bank[:RATES].copy() if record is True else bank[:0]
->>>>>>> 6094912 (Columns on 12 nodes, moved in place; inputs of all stages at once)
         found = np.empty_like(guess)
         outcome, iterations, sweeps, jacobians = step(
             self.model.tubes, self.model.lane, self.model.jacobian_lanes, mesh, scheme.c0, scheme.weights, self.parameters,
@@ -267,28 +248,11 @@ class Simulator:
         state.inputs = last
         records: tuple[Record, ...] = ()
         if record:
-<<<<<<< HEAD
-            rates = bank[RATES : RATES + stages].copy()
-            records = (
-                Record(
-                    scheme,
-                    key,
-                    mesh,
-                    before,
-                    state.fields.copy(),
-                    rates,
-                    inputs,
-                    found.copy(),
-                    t + scheme.times * scheme.dt,
-                ),
-            )
-=======
             # substeps share one bank, so each record needs its own copy
             own = np.copy if record is True or scheme is not self.scheme else np.asarray
             rates = own(bank[RATES + (0 if record is True else stages - 1) : RATES + stages])
             times = t + scheme.times * scheme.dt
             records = (Record(scheme, key, mesh, before, own(bank[Y_NOW]), rates, inputs, found, times),)
->>>>>>> 6094912 (Columns on 12 nodes, moved in place; inputs of all stages at once)
         return StepResult(True, "ok", iterations, sweeps, jacobians, records=records)
 
     def _work(self, key: tuple, mesh: Mesh) -> tuple:
@@ -302,16 +266,19 @@ class Simulator:
         return self._buffers[key]
 
 
-def stage_inputs(n: int, inputs_at: InputsAt, times: np.ndarray) -> tuple[np.ndarray, Inputs]:
-    """Rows (stages, 3N + 6) of alpha, its rate, beta, tip force and torque at ``times`` (stages,) s, and the inputs at the last of them."""
+def stage_inputs(model: Model, inputs_at: InputsAt, times: np.ndarray) -> tuple[np.ndarray, Inputs]:
+    """Rows (stages, inputs) of alpha, its rate, beta, tip force, torque, and beta's rate where the model reads it, at ``times`` (stages,) s;
+    and the inputs at the last of them."""
     at_once = getattr(inputs_at, "stages", None)
     if at_once is not None:
         return at_once(times)
-    rows = np.empty((len(times), 3 * n + 6))
+    n = model.n
+    rows = np.empty((len(times), model.input_count))
     for row, time in zip(rows, times, strict=True):
         now = inputs_at(time)
         row[:n], row[n : 2 * n], row[2 * n : 3 * n] = now.alpha, now.alpha_rate, now.beta
-        row[3 * n : 3 * n + 3], row[3 * n + 3 :] = now.force, now.torque
+        row[3 * n : 3 * n + 3], row[3 * n + 3 : 3 * n + 6] = now.force, now.torque
+        row[3 * n + 6 :] = now.beta_rate[: model.input_count - 3 * n - 6]
     return rows, now
 
 
