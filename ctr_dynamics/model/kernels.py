@@ -2,6 +2,9 @@
 
 Numbers live in the workspace of :mod:`ctr_dynamics.model.workspace`. A robot whose file names extensions that change the physics runs the
 same sweep with the functions of :mod:`ctr_dynamics.model.extended` in their places (:func:`dispatch`).
+
+What runs at every point is inlined by Numba: a compiled function that calls another counts references to its arrays, and those counts, atomic
+as they are, cost as much as the arithmetic.
 """
 
 import math
@@ -29,7 +32,7 @@ from ctr_dynamics.model.workspace import (
 )
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, inline="always", error_model="numpy")
 def _plain_curvature(tubes, lanes, W, present, ust, u0, c0):
     """Strains from moments: (16), (17) with the damping history of every tube taken exactly (docs/model.md).
 
@@ -100,7 +103,7 @@ def _plain_curvature(tubes, lanes, W, present, ust, u0, c0):
         W[TMP + 4 * L + j] = c0 * uy + W[HI + 7 * L + j]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, inline="always", error_model="numpy")
 def _body_forces(tubes, lanes, W):
     """Gravity in the frame of tube 1, R_1^T g, into ``TMP`` rows 10-12 (non-unit quaternion, normalised when read)."""
     n = len(tubes)
@@ -128,7 +131,7 @@ def _body_forces(tubes, lanes, W):
         )
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, inline="always", error_model="numpy")
 def _plain_derivative(tubes, lanes, W, present, ust, u0, c0):
     """Arc-length derivative of the state, (13), and the fields at this point (``OU``)."""
     n = len(tubes)
@@ -547,6 +550,26 @@ def _base_plate(tubes, lanes, W, ust0):
         )
 
 
+@njit(cache=True, inline="always")
+def _load_history(tubes, lanes, W, hist, point, shared):
+    """History parts of ``point`` into ``HI``, from rows of as many lanes or, if ``shared``, of one."""
+    n = len(tubes)
+    L = lane_count(lanes)
+    F = field_rows(n)
+    HI = offsets(tubes, lanes)[4]
+    if shared:
+        trip = lane_trips(n, lanes, W)
+        at = np.uint64(point * F)
+        for row in range(F):
+            value = hist[at + np.uint64(row)]
+            for j in range(trip):
+                W[HI + row * L + j] = value
+    else:
+        at = np.uint64(point * F * L)
+        for r in range(F * L):
+            W[HI + r] = hist[at + np.uint64(r)]
+
+
 @njit(cache=True, nogil=True, error_model="numpy")
 def sweep(
     tubes,
@@ -570,6 +593,7 @@ def sweep(
     tubes, n and m_xy at s = 0+; ``hist``, ``out`` (points, F, L): history parts and fields at every Runge-Kutta stage of every cell
     and at section ends; ``histb``, ``outb`` (N, base points, 2, L); ``nodes`` (cells + sections, S, L): the state at the nodes;
     ``res`` (5 + N, L): imbalance of force (3), moment m_xy (2) and m_z of every tube's end. c0 = 0 with zero history is the static model.
+    With several lanes ``hist`` may be (points, F), which all share, and ``out`` with ``nodes`` may be empty: then neither is written.
     """
     n = len(tubes)
     L = lane_count(lanes)
@@ -578,6 +602,8 @@ def sweep(
     F = field_rows(n)
     NP = parameter_rows(n)
     Y, YS, K, ACC, HI, OU, TMP, PAR, MA, MB = offsets(tubes, lanes)
+    kept = L == 1 or len(out) > 0
+    shared = L > 1 and len(hist) == len(mesh.ust) // (3 * n) * F
     for r in range(NP * L):
         W[PAR + r] = par[r]
     sec_cells, sec_tubes, ust = mesh.sec_cells, mesh.sec_tubes, mesh.ust
@@ -592,9 +618,7 @@ def sweep(
         present = sec_tubes[k]
         # transition into this section: friction from the jump of the inner tubes' moments
         _start_section(tubes, lanes, W, mesh.bp_tube, seclen, k)
-        at = np.uint64(point * F * L)
-        for r in range(F * L):
-            W[HI + r] = hist[at + np.uint64(r)]
+        _load_history(tubes, lanes, W, hist, point, shared)
         for r in range(S * L):
             W[YS + r] = W[Y + r]
         _curvature(tubes, lanes, W, present, ust, point * 3 * n, c0)
@@ -610,22 +634,24 @@ def sweep(
         for j in range(trip):
             W[MA + j] = seclen[k * L + j] / cells  # MA is free until the section's end
         for cell in range(cells):
-            here = np.uint64(node * S * L)
+            if kept:
+                here = np.uint64(node * S * L)
+                for r in range(S * L):
+                    nodes[here + np.uint64(r)] = W[Y + r]
             for r in range(S * L):
-                nodes[here + np.uint64(r)] = W[Y + r]
                 W[YS + r] = W[Y + r]
                 W[ACC + r] = 0.0
             node += 1
             for stage in range(4):
-                at = np.uint64(point * F * L)
-                for r in range(F * L):
-                    W[HI + r] = hist[at + np.uint64(r)]
+                _load_history(tubes, lanes, W, hist, point, shared)
                 _move_grid(
                     tubes, lanes, W, (cell + (0.0 if stage == 0 else 1.0 if stage == 3 else 0.5)) / cells
                 )
                 _derivative(tubes, lanes, W, present, ust, point * 3 * n, c0)
-                for r in range(F * L):
-                    out[at + np.uint64(r)] = W[OU + r]
+                if kept:
+                    at = np.uint64(point * F * L)
+                    for r in range(F * L):
+                        out[at + np.uint64(r)] = W[OU + r]
                 point += 1
                 weight = 1.0 if stage == 0 or stage == 3 else 2.0
                 ahead = 0.5 if stage < 2 else 1.0
@@ -639,18 +665,20 @@ def sweep(
                     r = row * L + j
                     W[Y + r] += W[MA + j] / 6.0 * W[ACC + r]
         # end of the section: fields, moments on the near side, body of the tube that ends
-        at = np.uint64(point * F * L)
-        for r in range(F * L):
-            W[HI + r] = hist[at + np.uint64(r)]
-        here = np.uint64(node * S * L)
+        _load_history(tubes, lanes, W, hist, point, shared)
+        if kept:
+            here = np.uint64(node * S * L)
+            for r in range(S * L):
+                nodes[here + np.uint64(r)] = W[Y + r]
         for r in range(S * L):
-            nodes[here + np.uint64(r)] = W[Y + r]
             W[YS + r] = W[Y + r]
         node += 1
         _move_grid(tubes, lanes, W, 1.0)
         _derivative(tubes, lanes, W, present, ust, point * 3 * n, c0)
-        for r in range(F * L):
-            out[at + np.uint64(r)] = W[OU + r]
+        if kept:
+            at = np.uint64(point * F * L)
+            for r in range(F * L):
+                out[at + np.uint64(r)] = W[OU + r]
         point += 1
         _bending_moments(tubes, lanes, W, present, MA)
         before = present

@@ -41,16 +41,15 @@ def jacobian(tubes, lanes, mesh, c0, par, seclen, x, hist, histb, big, step, inv
     """
     L = lane_count(lanes)
     m = len(x)
-    W, parL, seclenL, xL, histL, histbL, outL, outbL, nodesL, resL = big
+    W, parL, seclenL, xL, _, histbL, outL, outbL, nodesL, resL = big
     broadcast(lanes, par, parL)
     broadcast(lanes, seclen, seclenL)
     broadcast(lanes, x, xL)
-    broadcast(lanes, hist, histL)
     broadcast(lanes, histb, histbL)
     for i in range(m):
         xL[i * L + i + 1] += step[i]
     sweep(tubes, lanes, W, c0, mesh,
-          parL, seclenL, xL, histL, histbL, outL, outbL, nodesL, resL)  # fmt: skip
+          parL, seclenL, xL, hist, histbL, outL[:0], outbL, nodesL[:0], resL)  # fmt: skip
     matrix = np.empty((m, m))
     for i in range(m):
         for k in range(m):
