@@ -30,7 +30,7 @@ Floats = NDArray[np.float64]
 SHIFT_STEP = 0.02  # s: the shift 50 / s lies among the slow bending modes
 BLOCK = 8
 ROUNDS = 4
-MODE_NODES = 24
+MODE_NODES = 16
 _END = object()
 MAX_DAMPING = 0.7  # more is no vibration
 

@@ -99,7 +99,8 @@ class TipWindow:
 
     def transform(self, T: Floats) -> None:
         """Replace all columns V by V T."""
-        self.columns = self.columns @ T
+        size, rows, r = self.columns.shape
+        self.columns = (self.columns.reshape(size * rows, r) @ T).reshape(size, rows, -1)
 
     def widen(self, count: int) -> None:
         """Append ``count`` columns of zeros: what enters now does not move the past."""
@@ -107,7 +108,7 @@ class TipWindow:
 
     def shift(self, a: Floats) -> None:
         """Move every kept tip by the columns times ``a`` (r,)."""
-        d = self.columns @ a
+        d = (self.columns.reshape(-1, len(a)) @ a).reshape(self.size, 12)
         self.means[:, 0:3] += d[:, 0:3]
         self.means[:, 7:13] += d[:, 6:12]
         turn = d[:, 3:6]
