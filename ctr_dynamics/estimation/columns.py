@@ -17,11 +17,18 @@ from ctr_dynamics.model.simulator import Record, remap_fields
 from ctr_dynamics.model.tangent import linearise, theta_tangent
 from ctr_dynamics.model.transfer import Transfer, coarse_key, transfer
 
+from .kernels import position_deviations, sparse_product
 from .uncertainty import ModelUncertainty
 
 Floats = NDArray[np.float64]
-COLUMN_NODES = 24
+COLUMN_NODES = 12
 EPSILON = 1e-6  # of one standard deviation: small against the curvature of the step, large against rounding
+
+
+def restrict(moved: Transfer, *fields: Floats) -> list[Floats]:
+    """Fields (fine fields,) on the coarse sections of a transfer."""
+    matrix = moved.restrict
+    return [sparse_product(matrix.indptr, matrix.indices, matrix.data, x) for x in fields]
 
 
 def field_weights(model: Model, mesh: Mesh, beta: Floats) -> Floats:
@@ -81,6 +88,7 @@ class Columns:
         self.key: Key = ((), ())
         self.mesh: Mesh | None = None
         self.beta = np.zeros(model.n)
+        self._lent = False  # whether a snapshot holds `stored`
 
     def start(self, key: tuple, mesh: Mesh, beta: Floats, alpha: Floats, par: Floats, x: Floats) -> Floats:
         """Columns of the static equilibrium's dependence on the uncertain parameters; returns Pi_aa (r, r)."""
@@ -156,7 +164,7 @@ class Columns:
             self.key, self.mesh, self.transfer, self.beta = key, mesh, moved, beta
             after, rate = record.after, record.rates[-1]
             if moved is not None:
-                after, rate = moved.restrict @ after, moved.restrict @ rate
+                after, rate = restrict(moved, after, rate)
             columns = self.theta.shape[1]
             work_key = (key, columns)
             if work_key not in self._work:
@@ -166,17 +174,20 @@ class Columns:
                 main, base = len(big[4]) // L, len(big[5]) // L
                 self._work[work_key] = (
                     lanes, big, (np.zeros(main), np.zeros(base), np.zeros((main + base, columns))), np.zeros((m, m)),
-                    np.zeros((m, columns)), np.zeros((len(big[8]) // L, columns)),
+                    (len(big[8]) // L, columns),
                 )  # fmt: skip
-            lanes, big, work, inverse, dx, dnodes = self._work[work_key]
-            stored = self.stored.copy()
+            lanes, big, work, inverse, shape = self._work[work_key]
+            if self._lent:
+                self.stored = self.stored.copy()
+                self._lent = False
+            dx, dnodes = np.empty((m, columns)), np.empty(shape)
             ok = theta_tangent(
                 model.tubes, lanes, mesh, record.scheme.dt, par.copy(), record.inputs[-1], record.found[-1], after,
-                rate, dpar, EPSILON, model.tangent_step, big, work, stored[0], stored[1], inverse, dx, dnodes,
+                rate, dpar, EPSILON, model.tangent_step, big, work, self.stored[0], self.stored[1], inverse, dx, dnodes,
             )  # fmt: skip
             if not ok:
                 return False
-            self.stored, self.dx, self.dnodes = stored, dx.copy(), dnodes.copy()
+            self.dx, self.dnodes = dx, dnodes
         return True
 
     def fields_change(self, a: Floats) -> Floats:
@@ -191,11 +202,7 @@ class Columns:
 
     def position_deviation(self, pi: Floats) -> Floats:
         """(nodes,) deviation of the position per axis in m at the model's nodes, coefficients' covariance ``pi`` (r, r)."""
-        rows = self.dnodes.reshape(-1, 16 + 3 * self.model.n, self.dnodes.shape[1])[:, :3].reshape(
-            -1, len(pi)
-        )
-        variance = np.einsum("ij,ij->i", rows @ pi, rows).reshape(-1, 3).sum(axis=1)
-        deviation = np.sqrt(np.maximum(variance, 0.0) / 3.0)
+        deviation = position_deviations(self.dnodes, 16 + 3 * self.model.n, pi)
         return deviation if self.transfer is None else self.transfer.nodes @ deviation
 
     def widen(self, count: int) -> None:
@@ -215,7 +222,8 @@ class Columns:
         )
 
     def snapshot(self) -> tuple:
-        """What :meth:`restore` needs; arrays are replaced by later steps, never written, so references do."""
+        """What :meth:`restore` needs; references do, for the next step leaves the arrays alone and goes on with a copy."""
+        self._lent = True
         return (
             self.key,
             self.mesh,
@@ -230,6 +238,7 @@ class Columns:
     def restore(self, snapshot: tuple) -> None:
         """Go back to an earlier snapshot."""
         self.key, self.mesh, self.transfer, self.beta, theta, self.stored, self.dnodes, self.dx = snapshot
+        self._lent = True
         self.theta = theta.copy()
 
     def weights(self) -> Floats:

@@ -21,7 +21,7 @@ from ctr_dynamics.errors import InputError
 from ctr_dynamics.model.mesh import node_points, node_positions
 from ctr_dynamics.model.model import Model
 from ctr_dynamics.model.scheme import make_scheme
-from ctr_dynamics.model.simulator import Inputs, InputsAt, Simulator, State, StepResult
+from ctr_dynamics.model.simulator import Inputs, Simulator, State, StepResult
 from ctr_dynamics.parameters import Settings, axes_mask
 from ctr_dynamics.robot import Robot
 
@@ -40,7 +40,7 @@ DT_NS = 3_000_000
 LOAD_GRACE_NS = 100_000_000  # a first load that comes this soon after the joints is there from the start
 AHEAD_NS = 10_000_000_000  # a pose that far after the newest joint state is on another clock
 WAITING_SAMPLES = 200  # poses kept until the first joint state
-MODES_EVERY = 66  # steps between refreshes of the vibration modes
+MODES_EVERY = 132  # steps between refreshes of the vibration modes
 RETRY_EVERY = 33  # steps between starts while there is no equilibrium: looking for one in vain takes long
 MAX_FAILURES = 10  # steps in a row that may fail before the model starts anew at rest
 MAX_BEHIND = 1000  # steps to catch up at once; beyond, the model starts anew
@@ -137,10 +137,9 @@ class Estimator:
         self._sampled_ns: int | None = None
         self._squares = [0.0, 0.0]
         self._residuals = 0
-        self._known: dict[
-            float, tuple[Floats, Floats, Floats]
-        ] = {}  # the signals of one step, shared by both runs
+        self._known: dict[tuple[float, float], tuple[Floats, Floats]] = {}  # the signals of one step
         self._rows: dict[tuple, tuple[Floats, NDArray[np.int64]]] = {}
+        self._turn: tuple[Floats, tuple[Floats, Floats]] | None = None
 
     # -- inputs --
 
@@ -406,32 +405,18 @@ class Estimator:
 
     # -- steps --
 
-    def _inputs(self, corrected: bool) -> InputsAt:
+    def _inputs(self, corrected: bool) -> _Actuation:
         """Actuators and load at a time (s from t0), with the estimated offsets and force for the fused run."""
-        n, t0 = self.model.n, self.t0_ns
-        assert t0 is not None
-        extrapolate = self._timeout_ns if self._predicting else 0
-        joints, load = self._joints, self._load
-        known = self._known
-        offset = np.full(n, self._nominal_offset)
-        force = np.zeros(3)
+        assert self.t0_ns is not None
+        n = self.model.n
+        shift = np.zeros(self.model.input_count)
+        shift[:n] = self._nominal_offset
         if corrected:
             for i, row in self._offset_rows:
-                offset[i] += self.fusion.theta[row]
-            force = self.fusion.force
-
-        def at(t: float) -> Inputs:
-            signals = known.get(t)
-            if signals is None:
-                time_ns = t0 + round(t * 1e9)
-                signals = known[t] = (
-                    *joints.at(time_ns, extrapolate),
-                    load.at(time_ns)[0] if load.stamps else _NO_LOAD,
-                )
-            value, rate, wrench = signals
-            return Inputs(value[:n] + offset, rate[:n], value[n:], rate[n:], wrench[:3] + force, wrench[3:])
-
-        return at
+                shift[i] += self.fusion.theta[row]
+            shift[3 * n : 3 * n + 3] = self.fusion.force
+        extrapolate = self._timeout_ns if self._predicting else 0
+        return _Actuation(self.model, self.t0_ns, self._joints, self._load, extrapolate, shift, self._known)
 
     def _start(self, k: int) -> str:
         """Both runs at rest at step ``k``; returns the reason when there is no equilibrium."""
@@ -487,10 +472,16 @@ class Estimator:
         assert self._fused is not None and self._alone is not None
         before, t = (k - 1) * DT_NS * 1e-9, k * DT_NS * 1e-9
         self._known.clear()
-        expected = 2.0 * self._fused.unknowns - self._fused.earlier[0]
-        result = self.simulator.step(self._fused, before, self._inputs(True), record=True)
-        lead = self._fused.unknowns - expected if result.ok else None
-        alone = self.reference.step(self._alone, before, self._inputs(False), lead=lead)
+        f, a = self._fused, self._alone
+        apart = (
+            3.0 * (a.unknowns - f.unknowns)
+            - 3.0 * (a.earlier[0] - f.earlier[0])
+            + (a.earlier[1] - f.earlier[1])
+        )
+        result = self.simulator.step(f, before, self._inputs(True), record="end")
+        # the actuators' noise moves both runs alike: what lies between their unknowns is smooth, so a parabola meets it
+        start = f.unknowns + apart if result.ok else None
+        alone = self.reference.step(a, before, self._inputs(False), start=start)
         if not alone.ok:
             return alone
         self._keep_alone_tip(t)
@@ -732,10 +723,8 @@ class Estimator:
     def _backbone(self) -> NDArray[np.float32]:
         state = self._fused
         assert state is not None
-        bias = self.fusion.bias
-        back = matrix(conjugate(self.tracker.rotation))
-        turn = matrix(from_vector(back @ bias[ROTATION]))
-        key = (state.key, tuple(state.inputs.beta))
+        turn, shift = self._registration()
+        key = (state.key, state.inputs.beta.tobytes())
         if key not in self._rows:
             if len(self._rows) > 8:
                 self._rows.clear()
@@ -748,10 +737,19 @@ class Estimator:
         c = self.fusion.columns
         r = c.theta.shape[1]
         backbone_rows(
-            s, state.nodes, state.fields, points, self.model.n, float(state.inputs.beta_rate[0]), turn, back @ bias[TRANSLATION],
-            c.position_deviation(np.ascontiguousarray(self.fusion.pi[:r, :r])), rows,
+            s, state.nodes, state.fields, points, self.model.n, float(state.inputs.beta_rate[0]), turn, shift,
+            c.position_deviation(self.fusion.pi[:r, :r]), rows,
         )  # fmt: skip
         return rows
+
+    def _registration(self) -> tuple[Floats, Floats]:
+        """Estimated error of the registration in base axes: rotation (3, 3) and translation (3,) m."""
+        bias = self.fusion.bias[:6]
+        if self._turn is None or not np.array_equal(self._turn[0], bias):
+            back = matrix(conjugate(self.tracker.rotation))
+            turn = matrix(from_vector(back @ bias[ROTATION]))
+            self._turn = bias.copy(), (turn, back @ bias[TRANSLATION])
+        return self._turn[1]
 
     def snapshot(self) -> dict[str, Any]:
         """Where the estimator stands, for a file."""
@@ -805,6 +803,60 @@ class Estimator:
 
 
 _NO_LOAD = np.zeros(6)
+
+
+class _Actuation:
+    """Input signals with the corrections ``shift`` (inputs,) of one run, for the simulator.
+
+    ``known`` keeps the bare signals of one step, which both runs share.
+    """
+
+    def __init__(
+        self,
+        model: Model,
+        t0_ns: int,
+        joints: Signal,
+        load: Signal,
+        extrapolate_ns: int,
+        shift: Floats,
+        known: dict,
+    ) -> None:
+        self.n, self.count, self.t0_ns, self.joints, self.load = (
+            model.n,
+            model.input_count,
+            t0_ns,
+            joints,
+            load,
+        )
+        self.extrapolate_ns, self.shift, self.known = extrapolate_ns, shift, known
+
+    def __call__(self, t: float) -> Inputs:
+        return self.stages(np.array([t]))[1]
+
+    def stages(self, times: Floats) -> tuple[Floats, Inputs]:
+        """Inputs at all stages of a step; see :func:`ctr_dynamics.model.simulator.stage_inputs`."""
+        n = self.n
+        key = (float(times[0]), float(times[-1]))
+        if key not in self.known:
+            bare = np.empty((len(times), self.count))
+            for row, t in zip(bare, times.tolist(), strict=True):
+                time_ns = self.t0_ns + round(t * 1e9)
+                value, rate = self.joints.at(time_ns, self.extrapolate_ns)
+                row[:n], row[n : 2 * n], row[2 * n : 3 * n] = value[:n], rate[:n], value[n:]
+                row[3 * n : 3 * n + 6] = self.load.at(time_ns)[0] if self.load.stamps else _NO_LOAD
+                row[3 * n + 6 :] = rate[n : n + self.count - 3 * n - 6]
+            self.known[key] = bare, rate[n:]
+        bare, beta_rate = self.known[key]
+        rows = bare + self.shift
+        last = rows[-1]
+        return rows, Inputs(
+            last[:n],
+            last[n : 2 * n],
+            last[2 * n : 3 * n],
+            beta_rate,
+            last[3 * n : 3 * n + 3],
+            last[3 * n + 3 : 3 * n + 6],
+        )
 
 
 def _standing(inputs: Inputs) -> Inputs:

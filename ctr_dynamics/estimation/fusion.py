@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from filterpy.kalman import ExtendedKalmanFilter
 from numpy.typing import NDArray
+from scipy.linalg import solve_triangular
 from scipy.stats import chi2
 
 from ctr_dynamics.model.model import Model
@@ -68,6 +69,20 @@ class TipEstimate:
     finite: bool
 
 
+def _roots(covariance: Floats) -> tuple[Floats, Floats]:
+    """L with L L^T = ``covariance`` (r, r), and its inverse; by eigenvectors, with a pseudo-inverse, where some direction has no spread."""
+    try:
+        root = np.linalg.cholesky(covariance)
+        if root.diagonal().min() > 1e-7 * root.diagonal().max():
+            return root, solve_triangular(root, np.eye(len(root)), lower=True, check_finite=False)
+    except np.linalg.LinAlgError:
+        pass
+    lam, E = np.linalg.eigh(0.5 * (covariance + covariance.T))
+    lam = np.maximum(lam, 0.0)
+    inverse = np.where(lam > 1e-14 * lam.max(), 1.0 / np.sqrt(np.maximum(lam, 1e-300)), 0.0)
+    return E * np.sqrt(lam), inverse[:, None] * E.T
+
+
 class Fusion:
     """Filter of one simulated robot.
 
@@ -89,6 +104,7 @@ class Fusion:
         self.steps = 0
         self.force_sigma = options.force_sigma
         self._refused = False
+        self._filters: dict[tuple[int, int], ExtendedKalmanFilter] = {}
         self._gate = {dof: float(chi2.ppf(options.gate_probability, dof)) for dof in range(1, 7)}
 
     # -- start and prediction --
@@ -178,16 +194,12 @@ class Fusion:
         unit = max(float(np.trace(gram)) / r, 1e-12)
         scaled = c.theta / sigma[:, None]
         gram = gram + unit * 0.01 * (scaled.T @ scaled)
-        pi_aa = 0.5 * (self.pi[:r, :r] + self.pi[:r, :r].T)
-        lam, E = np.linalg.eigh(pi_aa)
-        lam = np.maximum(lam, 0.0)
-        root = E * np.sqrt(lam)  # Pi_aa = root root^T
-        values, U = np.linalg.eigh(root.T @ gram @ root)
-        order = np.argsort(values)[::-1][: self.options.rank]
+        root, inverse_root = _roots(self.pi[:r, :r])
+        _, U = np.linalg.eigh(root.T @ gram @ root)  # ascending
+        order = np.arange(r)[::-1][: self.options.rank]
         U = U[:, order]
         T = root @ U  # old coefficients = T new coefficients
-        inverse_root = np.where(lam > 1e-14 * lam.max(), 1.0 / np.sqrt(np.maximum(lam, 1e-300)), 0.0)
-        S = U.T @ (inverse_root[:, None] * E.T)  # new = S old
+        S = U.T @ inverse_root  # new = S old
         k = len(order)
         pi = np.zeros((k + STATES, k + STATES))
         pi[:k, :k] = np.eye(k)
@@ -227,9 +239,10 @@ class Fusion:
             )
         self._refused = False
         size = len(self.pi)
-        ekf = ExtendedKalmanFilter(dim_x=size, dim_z=dof)
-        ekf.P = self.pi
-        ekf.R = R
+        if (size, dof) not in self._filters:
+            self._filters[size, dof] = ExtendedKalmanFilter(dim_x=size, dim_z=dof)
+        ekf = self._filters[size, dof]
+        ekf.x, ekf.P, ekf.R = np.zeros((size, 1)), self.pi, R
         ekf.update(nu[:, None], HJacobian=lambda x: H, Hx=lambda x: np.zeros((dof, 1)))
         self.pi = 0.5 * (ekf.P + ekf.P.T)
         self._correct(state, ekf.x[:, 0])
@@ -271,7 +284,7 @@ class Fusion:
         """(3,) variance of the estimated tip force, N^2."""
         part = self.columns.theta[self.uncertainty.force]
         r = part.shape[1]
-        return np.maximum(np.einsum("ij,jk,ik->i", part, self.pi[:r, :r], part), 0.0)
+        return np.maximum(np.sum((part @ self.pi[:r, :r]) * part, axis=1), 0.0)
 
     def _inflate(self, nu: Floats, H: Floats, R: Floats, limit: float) -> None:
         """Two readings in a row outside the gate are no outliers: the model has lost the robot. Widen the fields' part of the covariance until

@@ -172,3 +172,101 @@ def backbone_rows(s, nodes, fields, points, n, insertion_rate, turn, shift, devi
         for k in range(3):
             rows[i, 11 + k] = fields[base + 6 + k]
         rows[i, 14] = deviation[i]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def sparse_product(indptr, indices, data, vector):
+    """Product (rows,) of a matrix in compressed rows with ``vector`` (columns,)."""
+    result = np.empty(len(indptr) - 1)
+    for row in range(len(result)):
+        total = 0.0
+        for k in range(indptr[row], indptr[row + 1]):
+            total += data[k] * vector[indices[k]]
+        result[row] = total
+    return result
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def position_deviations(dnodes, size, pi):
+    """(nodes,) deviation of the position per axis in m: root of a third of the trace of its covariance under ``pi`` (r, r).
+
+    ``dnodes`` (nodes * size, r): columns of the node states, position first.
+    """
+    nodes, r = len(dnodes) // size, len(pi)
+    result = np.empty(nodes)
+    product = np.empty(r)
+    for node in range(nodes):
+        total = 0.0
+        for axis in range(3):
+            row = dnodes[node * size + axis]
+            product[:] = 0.0
+            for i in range(r):
+                x = row[i]
+                for k in range(r):
+                    product[k] += x * pi[i, k]
+            for k in range(r):
+                total += product[k] * row[k]
+        result[node] = math.sqrt(max(total, 0.0) / 3.0)
+    return result
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def blend_columns(a, b, w, d, x, columns):
+    """Columns (12, r) between two tips with columns ``a``, ``b``: Hermite weights ``w`` (4,) of the position and ``d`` (4,) of its rate, and the
+    fraction ``x`` of the step for rotation and angular velocity."""
+    for c in range(a.shape[1]):
+        for i in range(3):
+            columns[i, c] = w[0] * a[i, c] + w[1] * a[6 + i, c] + w[2] * b[i, c] + w[3] * b[6 + i, c]
+            columns[6 + i, c] = d[0] * a[i, c] + d[1] * a[6 + i, c] + d[2] * b[i, c] + d[3] * b[6 + i, c]
+            columns[3 + i, c] = (1 - x) * a[3 + i, c] + x * b[3 + i, c]
+            columns[9 + i, c] = (1 - x) * a[9 + i, c] + x * b[9 + i, c]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def sensitivity_rows(R, Q, lever, position, velocity, rate, columns, H):
+    """Derivative H (6, r + 13) of the expected reading; see :func:`ctr_dynamics.estimation.tracker.sensitivity`.
+
+    ``R``, ``Q`` (3, 3): rotations of the tip and of the registration, errors included; ``lever`` (3,) m with its error, tip frame.
+    """
+    r = columns.shape[1]
+    arm = np.empty(3)
+    for i in range(3):
+        arm[i] = R[i, 0] * lever[0] + R[i, 1] * lever[1] + R[i, 2] * lever[2]
+    d = np.empty(3)
+    for c in range(r):
+        tx, ty, tz = columns[3, c], columns[4, c], columns[5, c]
+        d[0] = columns[0, c] + ty * arm[2] - tz * arm[1]
+        d[1] = columns[1, c] + tz * arm[0] - tx * arm[2]
+        d[2] = columns[2, c] + tx * arm[1] - ty * arm[0]
+        for i in range(3):
+            H[i, c] = Q[i, 0] * d[0] + Q[i, 1] * d[1] + Q[i, 2] * d[2]
+            H[3 + i, c] = R[0, i] * tx + R[1, i] * ty + R[2, i] * tz
+    H[:, r:] = 0.0
+    for i in range(3):
+        px = (
+            Q[0, 0] * (position[0] + arm[0])
+            + Q[0, 1] * (position[1] + arm[1])
+            + Q[0, 2] * (position[2] + arm[2])
+        )
+        py = (
+            Q[1, 0] * (position[0] + arm[0])
+            + Q[1, 1] * (position[1] + arm[1])
+            + Q[1, 2] * (position[2] + arm[2])
+        )
+        pz = (
+            Q[2, 0] * (position[0] + arm[0])
+            + Q[2, 1] * (position[1] + arm[1])
+            + Q[2, 2] * (position[2] + arm[2])
+        )
+        for k in range(3):
+            H[3 + i, r + k] = R[0, i] * Q[k, 0] + R[1, i] * Q[k, 1] + R[2, i] * Q[k, 2]
+            H[i, r + 6 + k] = Q[i, 0] * R[0, k] + Q[i, 1] * R[1, k] + Q[i, 2] * R[2, k]
+        H[i, r + 3 + i] = 1.0
+        H[i, r + 10 + i] = 1.0
+        d[i] = velocity[i] + rate[(i + 1) % 3] * arm[(i + 2) % 3] - rate[(i + 2) % 3] * arm[(i + 1) % 3]
+    H[0, r + 1], H[0, r + 2] = pz, -py
+    H[1, r], H[1, r + 2] = -pz, px
+    H[2, r], H[2, r + 1] = py, -px
+    for i in range(3):
+        H[i, r + 9] = -(Q[i, 0] * d[0] + Q[i, 1] * d[1] + Q[i, 2] * d[2])
+        H[3 + i, r + 9] = -(R[0, i] * rate[0] + R[1, i] * rate[1] + R[2, i] * rate[2])

@@ -22,7 +22,7 @@ from ctr_dynamics.model.statics import Equilibrium, Statics
 from ctr_dynamics.model.tangent import linearise
 from ctr_dynamics.model.transfer import Transfer, transfer
 
-from .columns import COLUMN_NODES, field_weights
+from .columns import field_weights
 from .outputs import Modes
 from .rotations import matrix
 
@@ -30,6 +30,7 @@ Floats = NDArray[np.float64]
 SHIFT_STEP = 0.02  # s: the shift 50 / s lies among the slow bending modes
 BLOCK = 8
 ROUNDS = 4
+MODE_NODES = 16
 _END = object()
 MAX_DAMPING = 0.7  # more is no vibration
 
@@ -222,14 +223,12 @@ def modal_parts(
 class ModeTracker:
     """The modes of a moving robot: refreshed now and then, one part of the work a step, and read in every step.
 
-    They are found on at most ``COLUMN_NODES`` nodes, like the covariance; the equilibrium that amplitudes count from is the model's own.
+    They are found on at most ``MODE_NODES`` nodes; the equilibrium that amplitudes count from is the model's own.
     """
 
     def __init__(self, model: Model, every: int) -> None:
         self.model, self.every = model, every
-        self.coarse = (
-            model if model.nodes <= COLUMN_NODES else Model(model.robot, COLUMN_NODES, model.base_cells)
-        )
+        self.coarse = model if model.nodes <= MODE_NODES else Model(model.robot, MODE_NODES, model.base_cells)
         self._transfers: dict[tuple[Key, Key], Transfer] = {}
         self.clear()
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from .kernels import tip_rows
+from .kernels import blend_columns, tip_rows
 from .rotations import conjugate, from_vector, multiply, to_vector
 
 Floats = NDArray[np.float64]
@@ -38,14 +38,7 @@ def between(a: Tip, b: Tip, stamp: float) -> Tip:
     d = 6 * x * (x - 1) / dt, (1 - x) * (1 - 3 * x), 6 * x * (1 - x) / dt, x * (3 * x - 2)
     turn = to_vector(multiply(b.quaternion, conjugate(a.quaternion)))
     columns = np.empty_like(b.columns)
-    columns[0:3] = (
-        w[0] * a.columns[0:3] + w[1] * a.columns[6:9] + w[2] * b.columns[0:3] + w[3] * b.columns[6:9]
-    )
-    columns[6:9] = (
-        d[0] * a.columns[0:3] + d[1] * a.columns[6:9] + d[2] * b.columns[0:3] + d[3] * b.columns[6:9]
-    )
-    columns[3:6] = (1 - x) * a.columns[3:6] + x * b.columns[3:6]
-    columns[9:12] = (1 - x) * a.columns[9:12] + x * b.columns[9:12]
+    blend_columns(a.columns, b.columns, w, d, x, columns)
     return Tip(
         stamp,
         w[0] * a.position + w[1] * a.velocity + w[2] * b.position + w[3] * b.velocity,
@@ -106,7 +99,8 @@ class TipWindow:
 
     def transform(self, T: Floats) -> None:
         """Replace all columns V by V T."""
-        self.columns = self.columns @ T
+        size, rows, r = self.columns.shape
+        self.columns = (self.columns.reshape(size * rows, r) @ T).reshape(size, rows, -1)
 
     def widen(self, count: int) -> None:
         """Append ``count`` columns of zeros: what enters now does not move the past."""
@@ -114,7 +108,7 @@ class TipWindow:
 
     def shift(self, a: Floats) -> None:
         """Move every kept tip by the columns times ``a`` (r,)."""
-        d = self.columns @ a
+        d = (self.columns.reshape(-1, len(a)) @ a).reshape(self.size, 12)
         self.means[:, 0:3] += d[:, 0:3]
         self.means[:, 7:13] += d[:, 6:12]
         turn = d[:, 3:6]

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from ctr_dynamics.robot import Robot
 
-from .kernels import registered_rows
-from .rotations import conjugate, from_vector, matrix, multiply, skew, to_vector
+from .kernels import registered_rows, sensitivity_rows
+from .rotations import conjugate, from_vector, matrix, multiply, to_vector
 from .tip import Tip
 
 Floats = NDArray[np.float64]
@@ -113,21 +113,10 @@ def residual(
 
 def sensitivity(model: TrackerModel, bias: Floats, tip: Tip) -> Floats:
     """H (6, r + 13): derivative of the expected reading by the columns' coefficients and the tracker states."""
-    r = tip.columns.shape[1]
-    R = matrix(tip.quaternion)
+    H = np.empty((6, tip.columns.shape[1] + STATES))
     Q = matrix(multiply(from_vector(bias[ROTATION]), model.rotation))
-    arm = R @ (model.lever + bias[LEVER])
-    H = np.zeros((6, r + STATES))
-    H[0:3, :r] = Q @ (tip.columns[0:3] - skew(arm) @ tip.columns[3:6])
-    H[3:6, :r] = R.T @ tip.columns[3:6]
-    b = H[:, r:]
-    b[0:3, ROTATION] = -skew(Q @ (tip.position + arm))
-    b[3:6, ROTATION] = R.T @ Q.T
-    b[0:3, TRANSLATION] = np.eye(3)
-    b[0:3, LEVER] = Q @ R
-    b[0:3, DELAY] = -Q @ (tip.velocity + np.cross(tip.rate, arm))
-    b[3:6, DELAY] = -R.T @ tip.rate
-    b[0:3, DRIFT] = np.eye(3)
+    lever = model.lever + bias[LEVER]
+    sensitivity_rows(matrix(tip.quaternion), Q, lever, tip.position, tip.velocity, tip.rate, tip.columns, H)
     return H
 
 

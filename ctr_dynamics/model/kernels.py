@@ -2,6 +2,9 @@
 
 Numbers live in the workspace of :mod:`ctr_dynamics.model.workspace`. A robot whose file names extensions that change the physics runs the
 same sweep with the functions of :mod:`ctr_dynamics.model.extended` in their places (:func:`dispatch`).
+
+What runs at every point is inlined by Numba: a compiled function that calls another counts references to its arrays, and those counts, atomic
+as they are, cost as much as the arithmetic.
 """
 
 import math
@@ -21,6 +24,7 @@ from ctr_dynamics.model.workspace import (
     Z0,
     field_rows,
     lane_count,
+    lane_trips,
     offsets,
     parameter_rows,
     sincos,
@@ -28,7 +32,7 @@ from ctr_dynamics.model.workspace import (
 )
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, inline="always", error_model="numpy")
 def _plain_curvature(tubes, lanes, W, present, ust, u0, c0):
     """Strains from moments: (16), (17) with the damping history of every tube taken exactly (docs/model.md).
 
@@ -37,12 +41,13 @@ def _plain_curvature(tubes, lanes, W, present, ust, u0, c0):
     """
     n = len(tubes)
     L = lane_count(lanes)
+    trip = lane_trips(n, lanes, W)
     Y, YS, K, ACC, HI, OU, TMP, PAR, MA, MB = offsets(tubes, lanes)
     mz, th, ga = Z0, Z0 + n, Z0 + 2 * n - 1
     EI, GJ, BB, BT, KS = PAR, PAR + n * L, PAR + 4 * n * L, PAR + 5 * n * L, PAR + 6 * n * L
     T = TMP + 13 * L
     ux_, uy_, uz_ = ust[u0], ust[u0 + 1], ust[u0 + 2]
-    for j in range(L):
+    for j in range(trip):
         wx = W[KS + j] * ux_
         wy = W[KS + j] * uy_
         W[T + j] = wx
@@ -59,31 +64,32 @@ def _plain_curvature(tubes, lanes, W, present, ust, u0, c0):
         W[TMP + 7 * L + j] = 0.0
         W[TMP + 8 * L + j] = ei * wx - bb * W[HI + 6 * L + j]
         W[TMP + 9 * L + j] = ei * wy - bb * W[HI + 7 * L + j]
-    for i in range(1, present):
-        Ti = T + 7 * i * L
-        vx_, vy_, vz_ = ust[u0 + 3 * i], ust[u0 + 3 * i + 1], ust[u0 + 3 * i + 2]
-        EIi, GJi, BBi, BTi, KSi = EI + i * L, GJ + i * L, BB + i * L, BT + i * L, KS + i * L
-        MZi, THi, GAi = YS + (mz + i) * L, YS + (th + i - 1) * L, YS + (ga + i - 1) * L
-        HUi = HI + (8 + i) * L
-        for j in range(L):
-            s, c = sincos(W[THi + j])
-            ks = W[KSi + j]
-            wx = ks * (c * vx_ - s * vy_)
-            wy = ks * (s * vx_ + c * vy_)
-            W[Ti + j] = wx
-            W[Ti + L + j] = wy
-            gj = W[GJi + j]
-            hu = W[HUi + j]
-            uz = (W[MZi + j] + gj * ks * vz_ - W[BTi + j] * hu) / (gj + c0 * W[BTi + j])
-            W[Ti + 2 * L + j] = uz
-            W[Ti + 3 * L + j] = c0 * uz + hu
-            ei = W[EIi + j]
-            bb = W[BBi + j]
-            W[TMP + 6 * L + j] += ei + c0 * bb
-            W[TMP + 7 * L + j] += bb * W[GAi + j]
-            W[TMP + 8 * L + j] += ei * wx - bb * W[HI + 6 * L + j]
-            W[TMP + 9 * L + j] += ei * wy - bb * W[HI + 7 * L + j]
-    for j in range(L):
+    for i in range(1, n):
+        if i < present:
+            Ti = T + 7 * i * L
+            vx_, vy_, vz_ = ust[u0 + 3 * i], ust[u0 + 3 * i + 1], ust[u0 + 3 * i + 2]
+            EIi, GJi, BBi, BTi, KSi = EI + i * L, GJ + i * L, BB + i * L, BT + i * L, KS + i * L
+            MZi, THi, GAi = YS + (mz + i) * L, YS + (th + i - 1) * L, YS + (ga + i - 1) * L
+            HUi = HI + (8 + i) * L
+            for j in range(trip):
+                s, c = sincos(W[THi + j])
+                ks = W[KSi + j]
+                wx = ks * (c * vx_ - s * vy_)
+                wy = ks * (s * vx_ + c * vy_)
+                W[Ti + j] = wx
+                W[Ti + L + j] = wy
+                gj = W[GJi + j]
+                hu = W[HUi + j]
+                uz = (W[MZi + j] + gj * ks * vz_ - W[BTi + j] * hu) / (gj + c0 * W[BTi + j])
+                W[Ti + 2 * L + j] = uz
+                W[Ti + 3 * L + j] = c0 * uz + hu
+                ei = W[EIi + j]
+                bb = W[BBi + j]
+                W[TMP + 6 * L + j] += ei + c0 * bb
+                W[TMP + 7 * L + j] += bb * W[GAi + j]
+                W[TMP + 8 * L + j] += ei * wx - bb * W[HI + 6 * L + j]
+                W[TMP + 9 * L + j] += ei * wy - bb * W[HI + 7 * L + j]
+    for j in range(trip):
         a = W[TMP + 6 * L + j]
         b = W[TMP + 7 * L + j]
         rx = W[YS + M0 * L + j] + W[TMP + 8 * L + j]
@@ -97,14 +103,15 @@ def _plain_curvature(tubes, lanes, W, present, ust, u0, c0):
         W[TMP + 4 * L + j] = c0 * uy + W[HI + 7 * L + j]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, inline="always", error_model="numpy")
 def _body_forces(tubes, lanes, W):
     """Gravity in the frame of tube 1, R_1^T g, into ``TMP`` rows 10-12 (non-unit quaternion, normalised when read)."""
     n = len(tubes)
     L = lane_count(lanes)
+    trip = lane_trips(n, lanes, W)
     Y, YS, K, ACC, HI, OU, TMP, PAR, MA, MB = offsets(tubes, lanes)
     G = PAR + 14 * n * L
-    for j in range(L):
+    for j in range(trip):
         a, b, c, d = (
             W[YS + H0 * L + j],
             W[YS + (H0 + 1) * L + j],
@@ -124,18 +131,19 @@ def _body_forces(tubes, lanes, W):
         )
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, inline="always", error_model="numpy")
 def _plain_derivative(tubes, lanes, W, present, ust, u0, c0):
     """Arc-length derivative of the state, (13), and the fields at this point (``OU``)."""
     n = len(tubes)
     L = lane_count(lanes)
+    trip = lane_trips(n, lanes, W)
     Y, YS, K, ACC, HI, OU, TMP, PAR, MA, MB = offsets(tubes, lanes)
     mz, th, ga = Z0, Z0 + n, Z0 + 2 * n - 1
     EI, RA, RI, BB = PAR, PAR + 2 * n * L, PAR + 3 * n * L, PAR + 4 * n * L
     T = TMP + 13 * L
     _plain_curvature(tubes, lanes, W, present, ust, u0, c0)
     # torsion of tube 1 and the sums over the tubes: rho A, rho I, rho I omega_z + 2 rho I gamma, m_z
-    for j in range(L):
+    for j in range(trip):
         ux, uy = W[TMP + j], W[TMP + L + j]
         utx, uty = W[TMP + 3 * L + j], W[TMP + 4 * L + j]
         wz_t = c0 * W[YS + (O0 + 2) * L + j] + W[HI + 5 * L + j]
@@ -148,40 +156,42 @@ def _plain_derivative(tubes, lanes, W, present, ust, u0, c0):
         W[TMP + 7 * L + j] = W[RI + j]
         W[TMP + 8 * L + j] = W[RI + j] * W[YS + (O0 + 2) * L + j]
         W[TMP + 9 * L + j] = W[YS + mz * L + j]
-    for i in range(1, present):
-        Ti = T + 7 * i * L
-        EIi, RAi, RIi, BBi = EI + i * L, RA + i * L, RI + i * L, BB + i * L
-        MZi, GAi = YS + (mz + i) * L, YS + (ga + i - 1) * L
-        KM, KT, KG = K + (mz + i) * L, K + (th + i - 1) * L, K + (ga + i - 1) * L
-        OUu, OUg, HG = OU + (8 + i) * L, OU + (7 + n + i) * L, HI + (7 + n + i) * L
-        for j in range(L):
-            ux, uy = W[TMP + j], W[TMP + L + j]
-            utx, uty = W[TMP + 3 * L + j], W[TMP + 4 * L + j]
-            g = W[GAi + j]
-            ri = W[RIi + j]
-            wz_t = c0 * (W[YS + (O0 + 2) * L + j] + g) + W[HI + 5 * L + j] + W[HG + j]
-            W[KM + j] = (
-                W[EIi + j] * (ux * W[Ti + L + j] - uy * W[Ti + j])
-                - W[BBi + j] * (ux * (uty - g * ux) - uy * (utx + g * uy))
-                + 2.0 * ri * wz_t
-            )
-            W[KT + j] = W[Ti + 2 * L + j] - W[TMP + 2 * L + j]
-            W[KG + j] = W[Ti + 3 * L + j] - W[TMP + 5 * L + j]
-            W[OUu + j] = W[Ti + 2 * L + j]
-            W[OUg + j] = g
-            W[TMP + 6 * L + j] += W[RAi + j]
-            W[TMP + 7 * L + j] += ri
-            W[TMP + 8 * L + j] += ri * (W[YS + (O0 + 2) * L + j] + 2.0 * g)
-            W[TMP + 9 * L + j] += W[MZi + j]
-    for i in range(present, n):
-        for j in range(L):
-            W[K + (mz + i) * L + j] = 0.0
-            W[K + (th + i - 1) * L + j] = 0.0
-            W[K + (ga + i - 1) * L + j] = 0.0
-            W[OU + (8 + i) * L + j] = 0.0
-            W[OU + (7 + n + i) * L + j] = 0.0
+    for i in range(1, n):
+        if i < present:
+            Ti = T + 7 * i * L
+            EIi, RAi, RIi, BBi = EI + i * L, RA + i * L, RI + i * L, BB + i * L
+            MZi, GAi = YS + (mz + i) * L, YS + (ga + i - 1) * L
+            KM, KT, KG = K + (mz + i) * L, K + (th + i - 1) * L, K + (ga + i - 1) * L
+            OUu, OUg, HG = OU + (8 + i) * L, OU + (7 + n + i) * L, HI + (7 + n + i) * L
+            for j in range(trip):
+                ux, uy = W[TMP + j], W[TMP + L + j]
+                utx, uty = W[TMP + 3 * L + j], W[TMP + 4 * L + j]
+                g = W[GAi + j]
+                ri = W[RIi + j]
+                wz_t = c0 * (W[YS + (O0 + 2) * L + j] + g) + W[HI + 5 * L + j] + W[HG + j]
+                W[KM + j] = (
+                    W[EIi + j] * (ux * W[Ti + L + j] - uy * W[Ti + j])
+                    - W[BBi + j] * (ux * (uty - g * ux) - uy * (utx + g * uy))
+                    + 2.0 * ri * wz_t
+                )
+                W[KT + j] = W[Ti + 2 * L + j] - W[TMP + 2 * L + j]
+                W[KG + j] = W[Ti + 3 * L + j] - W[TMP + 5 * L + j]
+                W[OUu + j] = W[Ti + 2 * L + j]
+                W[OUg + j] = g
+                W[TMP + 6 * L + j] += W[RAi + j]
+                W[TMP + 7 * L + j] += ri
+                W[TMP + 8 * L + j] += ri * (W[YS + (O0 + 2) * L + j] + 2.0 * g)
+                W[TMP + 9 * L + j] += W[MZi + j]
+    for i in range(1, n):
+        if i >= present:
+            for j in range(trip):
+                W[K + (mz + i) * L + j] = 0.0
+                W[K + (th + i - 1) * L + j] = 0.0
+                W[K + (ga + i - 1) * L + j] = 0.0
+                W[OU + (8 + i) * L + j] = 0.0
+                W[OU + (7 + n + i) * L + j] = 0.0
     # kinematics
-    for j in range(L):
+    for j in range(trip):
         ux, uy, uz = W[TMP + j], W[TMP + L + j], W[TMP + 2 * L + j]
         a, b, c, d = (
             W[YS + H0 * L + j],
@@ -198,7 +208,7 @@ def _plain_derivative(tubes, lanes, W, present, ust, u0, c0):
         W[K + (H0 + 2) * L + j] = 0.5 * (uy * a - uz * b + ux * d)
         W[K + (H0 + 3) * L + j] = 0.5 * (uz * a + uy * b - ux * c)
     # velocities and balance of forces and moments
-    for j in range(L):
+    for j in range(trip):
         ux, uy, uz = W[TMP + j], W[TMP + L + j], W[TMP + 2 * L + j]
         qx, qy, qz = W[YS + Q0 * L + j], W[YS + (Q0 + 1) * L + j], W[YS + (Q0 + 2) * L + j]
         wx, wy, wz = W[YS + O0 * L + j], W[YS + (O0 + 1) * L + j], W[YS + (O0 + 2) * L + j]
@@ -239,21 +249,22 @@ def _plain_bending_moments(tubes, lanes, W, present, dst):
     """Internal bending moment of each tube, (14), in the frame of tube 1, into rows ``dst``; zero for tubes that have ended."""
     n = len(tubes)
     L = lane_count(lanes)
+    trip = lane_trips(n, lanes, W)
     Y, YS, K, ACC, HI, OU, TMP, PAR, MA, MB = offsets(tubes, lanes)
     T = TMP + 13 * L
     for i in range(n):
         D, Ti, EI, BB = dst + 2 * i * L, T + 7 * i * L, PAR + i * L, PAR + (4 * n + i) * L
         GA = YS + (Z0 + 2 * n - 2 + i) * L
         if i >= present:
-            for j in range(L):
+            for j in range(trip):
                 W[D + j] = 0.0
                 W[D + L + j] = 0.0
         elif i == 0:
-            for j in range(L):
+            for j in range(trip):
                 W[D + j] = W[EI + j] * (W[TMP + j] - W[Ti + j]) + W[BB + j] * W[TMP + 3 * L + j]
                 W[D + L + j] = W[EI + j] * (W[TMP + L + j] - W[Ti + L + j]) + W[BB + j] * W[TMP + 4 * L + j]
         else:
-            for j in range(L):
+            for j in range(trip):
                 g = W[GA + j]
                 W[D + j] = W[EI + j] * (W[TMP + j] - W[Ti + j]) + W[BB + j] * (
                     W[TMP + 3 * L + j] + g * W[TMP + L + j]
@@ -341,28 +352,30 @@ def _tube_friction(tubes, lanes, W, present):
     """Friction between neighbouring tubes at a transition, (22), (23): proportional to the jump of the inner tube's moment."""
     n = len(tubes)
     L = lane_count(lanes)
+    trip = lane_trips(n, lanes, W)
     Y, YS, K, ACC, HI, OU, TMP, PAR, MA, MB = offsets(tubes, lanes)
     FR = PAR + (14 * n + 9) * L
     ga = Z0 + 2 * n - 2
-    for i in range(present - 1):
-        A, B = MA + 2 * i * L, MB + 2 * i * L
-        MZ = Y + (Z0 + i) * L
-        G1, G2 = Y + (ga + i) * L, Y + (ga + i + 1) * L
-        first = i == 0
-        for j in range(L):
-            dx, dy = W[B + j] - W[A + j], W[B + L + j] - W[A + L + j]
-            rate = W[G2 + j] if first else W[G2 + j] - W[G1 + j]
-            eps = W[FR + 2 * L + j]
-            tau = (
-                _coulomb(tubes, lanes, W, j, rate)
-                * W[FR + j]
-                * math.sqrt(dx * dx + dy * dy)
-                * rate
-                / math.sqrt(rate * rate + eps * eps)
-                + W[FR + L + j] * rate
-            )
-            W[MZ + j] -= tau
-            W[MZ + L + j] += tau
+    for i in range(n - 1):
+        if i < present - 1:
+            A, B = MA + 2 * i * L, MB + 2 * i * L
+            MZ = Y + (Z0 + i) * L
+            G1, G2 = Y + (ga + i) * L, Y + (ga + i + 1) * L
+            first = i == 0
+            for j in range(trip):
+                dx, dy = W[B + j] - W[A + j], W[B + L + j] - W[A + L + j]
+                rate = W[G2 + j] if first else W[G2 + j] - W[G1 + j]
+                eps = W[FR + 2 * L + j]
+                tau = (
+                    _coulomb(tubes, lanes, W, j, rate)
+                    * W[FR + j]
+                    * math.sqrt(dx * dx + dy * dy)
+                    * rate
+                    / math.sqrt(rate * rate + eps * eps)
+                    + W[FR + L + j] * rate
+                )
+                W[MZ + j] -= tau
+                W[MZ + L + j] += tau
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -374,6 +387,7 @@ def _body(tubes, lanes, W, i, c0):
     """
     n = len(tubes)
     L = lane_count(lanes)
+    trip = lane_trips(n, lanes, W)
     Y, YS, K, ACC, HI, OU, TMP, PAR, MA, MB = offsets(tubes, lanes)
     MB, HX, HY, HZ = (
         PAR + (7 * n + i) * L,
@@ -382,7 +396,7 @@ def _body(tubes, lanes, W, i, c0):
         PAR + (10 * n + i) * L,
     )
     TH, GA, HG = Y + (Z0 + n + i - 1) * L, Y + (Z0 + 2 * n - 2 + i) * L, HI + (7 + n + i) * L
-    for j in range(L):
+    for j in range(trip):
         qx, qy, qz = W[Y + Q0 * L + j], W[Y + (Q0 + 1) * L + j], W[Y + (Q0 + 2) * L + j]
         wx, wy, wz = W[Y + O0 * L + j], W[Y + (O0 + 1) * L + j], W[Y + (O0 + 2) * L + j]
         atx, aty, atz = c0 * wx + W[HI + 3 * L + j], c0 * wy + W[HI + 4 * L + j], c0 * wz + W[HI + 5 * L + j]
@@ -414,6 +428,7 @@ def _below_base(tubes, lanes, W, c0, cells, ust_base, x, histb, outb):
     """Torsion of the straight lengths behind the base plate, (18), and the coupling (19) into the state at s = 0-."""
     n = len(tubes)
     L = lane_count(lanes)
+    trip = lane_trips(n, lanes, W)
     Y, YS, K, ACC, HI, OU, TMP, PAR, MA, MB = offsets(tubes, lanes)
     points = 4 * cells + 1
     # state, stage, accumulated increment (psi, psi_t, m_z each), step, compliance: all in the workspace, so that lanes vectorise
@@ -427,9 +442,9 @@ def _below_base(tubes, lanes, W, c0, cells, ust_base, x, histb, outb):
             PAR + (6 * n + i) * L,
         )
         AL, AV, BE = PAR + (11 * n + i) * L, PAR + (12 * n + i) * L, PAR + (13 * n + i) * L
-        for j in range(L):
+        for j in range(trip):
             W[S + 2 * L + j] = x[i * L + j]
-        for j in range(L):
+        for j in range(trip):
             psi, psi_t = _drive(tubes, lanes, W, c0, i, j, x[i * L + j], W[AL + j], W[AV + j], histb, outb)
             W[S + j] = psi
             W[S + L + j] = psi_t
@@ -448,7 +463,7 @@ def _below_base(tubes, lanes, W, c0, cells, ust_base, x, histb, outb):
                 ahead = 0.5 if stage < 2 else 1.0
                 for r in range(2 * L):
                     W[HI + r] = histb[at + np.uint64(r)]
-                for j in range(L):
+                for j in range(trip):
                     psi_t = W[A + L + j]
                     u = (W[A + 2 * L + j] + W[US + j] * uz_ref - W[BT + j] * W[HI + L + j]) * W[CO + j]
                     kv = c0 * u + W[HI + L + j] + _base_stretch(tubes, lanes, W, i, j, W[BE + j], u)
@@ -464,13 +479,13 @@ def _below_base(tubes, lanes, W, c0, cells, ust_base, x, histb, outb):
                     W[A + 2 * L + j] = W[S + 2 * L + j] + h * km
                 for r in range(2 * L):
                     outb[at + np.uint64(r)] = W[OU + r]
-            for j in range(L):
+            for j in range(trip):
                 h = W[DS + j] / 6.0
                 W[S + j] += h * W[B + j]
                 W[S + L + j] += h * W[B + L + j]
                 W[S + 2 * L + j] += h * W[B + 2 * L + j]
         end = (i * points + 4 * cells) * 2 * L
-        for j in range(L):
+        for j in range(trip):
             gj, bt = W[GJ + j], W[BT + j]
             outb[end + j] = W[S + L + j]
             outb[end + L + j] = (
@@ -478,7 +493,7 @@ def _below_base(tubes, lanes, W, c0, cells, ust_base, x, histb, outb):
             ) / (gj + c0 * bt)
             W[Y + (Z0 + i) * L + j] = W[S + 2 * L + j]
         if i == 0:
-            for j in range(L):
+            for j in range(trip):
                 half = 0.5 * W[S + j]
                 s, c = sincos(half)
                 W[Y + H0 * L + j] = c
@@ -488,10 +503,10 @@ def _below_base(tubes, lanes, W, c0, cells, ust_base, x, histb, outb):
                 W[Y + (O0 + 2) * L + j] = W[S + L + j]
                 W[Y + M0 * L + j] = W[S + j]  # psi_1, held here until the other tubes have used it
         else:
-            for j in range(L):
+            for j in range(trip):
                 W[Y + (Z0 + n + i - 1) * L + j] = W[S + j] - W[Y + M0 * L + j]
                 W[Y + (Z0 + 2 * n + i - 2) * L + j] = W[S + L + j] - W[Y + (O0 + 2) * L + j]
-    for j in range(L):
+    for j in range(trip):
         for r in range(3):
             W[Y + (P0 + r) * L + j] = 0.0
             W[Y + (Q0 + r) * L + j] = 0.0
@@ -507,18 +522,19 @@ def _base_plate(tubes, lanes, W, ust0):
     """Near side of s = 0: moments of precurved lengths held straight into ``MA``, and the friction of the plate on the outermost tube, (24)."""
     n = len(tubes)
     L = lane_count(lanes)
+    trip = lane_trips(n, lanes, W)
     Y, YS, K, ACC, HI, OU, TMP, PAR, MA, MB = offsets(tubes, lanes)
     FR = PAR + (14 * n + 9) * L
     for i in range(n):
         EI, KS, A = PAR + i * L, PAR + (6 * n + i) * L, MA + 2 * i * L
         vx, vy = ust0[3 * i], ust0[3 * i + 1]
-        for j in range(L):
+        for j in range(trip):
             s, c = 0.0, 1.0
             if i > 0:
                 s, c = sincos(W[Y + (Z0 + n + i - 1) * L + j])
             W[A + j] = -W[EI + j] * W[KS + j] * (c * vx - s * vy)
             W[A + L + j] = -W[EI + j] * W[KS + j] * (s * vx + c * vy)
-    for j in range(L):
+    for j in range(trip):
         rate = W[Y + (O0 + 2) * L + j]
         if n > 1:
             rate += W[Y + (Z0 + 3 * n - 3) * L + j]
@@ -532,6 +548,26 @@ def _base_plate(tubes, lanes, W, ust0):
             / math.sqrt(rate * rate + eps * eps)
             + W[FR + 4 * L + j] * rate
         )
+
+
+@njit(cache=True, inline="always")
+def _load_history(tubes, lanes, W, hist, point, shared):
+    """History parts of ``point`` into ``HI``, from rows of as many lanes or, if ``shared``, of one."""
+    n = len(tubes)
+    L = lane_count(lanes)
+    F = field_rows(n)
+    HI = offsets(tubes, lanes)[4]
+    if shared:
+        trip = lane_trips(n, lanes, W)
+        at = np.uint64(point * F)
+        for row in range(F):
+            value = hist[at + np.uint64(row)]
+            for j in range(trip):
+                W[HI + row * L + j] = value
+    else:
+        at = np.uint64(point * F * L)
+        for r in range(F * L):
+            W[HI + r] = hist[at + np.uint64(r)]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -557,13 +593,17 @@ def sweep(
     tubes, n and m_xy at s = 0+; ``hist``, ``out`` (points, F, L): history parts and fields at every Runge-Kutta stage of every cell
     and at section ends; ``histb``, ``outb`` (N, base points, 2, L); ``nodes`` (cells + sections, S, L): the state at the nodes;
     ``res`` (5 + N, L): imbalance of force (3), moment m_xy (2) and m_z of every tube's end. c0 = 0 with zero history is the static model.
+    With several lanes ``hist`` may be (points, F), which all share, and ``out`` with ``nodes`` may be empty: then neither is written.
     """
     n = len(tubes)
     L = lane_count(lanes)
+    trip = lane_trips(n, lanes, W)
     S = state_rows(n)
     F = field_rows(n)
     NP = parameter_rows(n)
     Y, YS, K, ACC, HI, OU, TMP, PAR, MA, MB = offsets(tubes, lanes)
+    kept = L == 1 or len(out) > 0
+    shared = L > 1 and len(hist) == len(mesh.ust) // (3 * n) * F
     for r in range(NP * L):
         W[PAR + r] = par[r]
     sec_cells, sec_tubes, ust = mesh.sec_cells, mesh.sec_tubes, mesh.ust
@@ -578,9 +618,7 @@ def sweep(
         present = sec_tubes[k]
         # transition into this section: friction from the jump of the inner tubes' moments
         _start_section(tubes, lanes, W, mesh.bp_tube, seclen, k)
-        at = np.uint64(point * F * L)
-        for r in range(F * L):
-            W[HI + r] = hist[at + np.uint64(r)]
+        _load_history(tubes, lanes, W, hist, point, shared)
         for r in range(S * L):
             W[YS + r] = W[Y + r]
         _curvature(tubes, lanes, W, present, ust, point * 3 * n, c0)
@@ -589,54 +627,58 @@ def sweep(
         if (
             before > present
         ):  # tube `present` ended here: its own balance about its axis; its m_z holds the body's part already
-            for j in range(L):
+            for j in range(trip):
                 res[(5 + present) * L + j] = -W[Y + (Z0 + present) * L + j]
                 W[Y + (Z0 + present) * L + j] = 0.0
         cells = sec_cells[k]
-        for j in range(L):
+        for j in range(trip):
             W[MA + j] = seclen[k * L + j] / cells  # MA is free until the section's end
         for cell in range(cells):
-            here = np.uint64(node * S * L)
+            if kept:
+                here = np.uint64(node * S * L)
+                for r in range(S * L):
+                    nodes[here + np.uint64(r)] = W[Y + r]
             for r in range(S * L):
-                nodes[here + np.uint64(r)] = W[Y + r]
                 W[YS + r] = W[Y + r]
                 W[ACC + r] = 0.0
             node += 1
             for stage in range(4):
-                at = np.uint64(point * F * L)
-                for r in range(F * L):
-                    W[HI + r] = hist[at + np.uint64(r)]
+                _load_history(tubes, lanes, W, hist, point, shared)
                 _move_grid(
                     tubes, lanes, W, (cell + (0.0 if stage == 0 else 1.0 if stage == 3 else 0.5)) / cells
                 )
                 _derivative(tubes, lanes, W, present, ust, point * 3 * n, c0)
-                for r in range(F * L):
-                    out[at + np.uint64(r)] = W[OU + r]
+                if kept:
+                    at = np.uint64(point * F * L)
+                    for r in range(F * L):
+                        out[at + np.uint64(r)] = W[OU + r]
                 point += 1
                 weight = 1.0 if stage == 0 or stage == 3 else 2.0
                 ahead = 0.5 if stage < 2 else 1.0
                 for row in range(S):
-                    for j in range(L):
+                    for j in range(trip):
                         r = row * L + j
                         W[ACC + r] += weight * W[K + r]
                         W[YS + r] = W[Y + r] + ahead * W[MA + j] * W[K + r]
             for row in range(S):
-                for j in range(L):
+                for j in range(trip):
                     r = row * L + j
                     W[Y + r] += W[MA + j] / 6.0 * W[ACC + r]
         # end of the section: fields, moments on the near side, body of the tube that ends
-        at = np.uint64(point * F * L)
-        for r in range(F * L):
-            W[HI + r] = hist[at + np.uint64(r)]
-        here = np.uint64(node * S * L)
+        _load_history(tubes, lanes, W, hist, point, shared)
+        if kept:
+            here = np.uint64(node * S * L)
+            for r in range(S * L):
+                nodes[here + np.uint64(r)] = W[Y + r]
         for r in range(S * L):
-            nodes[here + np.uint64(r)] = W[Y + r]
             W[YS + r] = W[Y + r]
         node += 1
         _move_grid(tubes, lanes, W, 1.0)
         _derivative(tubes, lanes, W, present, ust, point * 3 * n, c0)
-        for r in range(F * L):
-            out[at + np.uint64(r)] = W[OU + r]
+        if kept:
+            at = np.uint64(point * F * L)
+            for r in range(F * L):
+                out[at + np.uint64(r)] = W[OU + r]
         point += 1
         _bending_moments(tubes, lanes, W, present, MA)
         before = present
@@ -645,7 +687,7 @@ def sweep(
             i = present - 1
             _body(tubes, lanes, W, i, c0)
             if i > 0:
-                for j in range(L):
+                for j in range(trip):
                     W[Y + N0 * L + j] += W[TMP + j]
                     W[Y + (N0 + 1) * L + j] += W[TMP + L + j]
                     W[Y + (N0 + 2) * L + j] += W[TMP + 2 * L + j]
@@ -659,7 +701,7 @@ def sweep(
     for r in range(3 * L):
         W[FE + r] = W[FT + r]
     _tip_forces(tubes, lanes, W, FE)
-    for j in range(L):
+    for j in range(trip):
         a, b_, c, d = (
             W[Y + H0 * L + j],
             W[Y + (H0 + 1) * L + j],

@@ -35,19 +35,21 @@ def broadcast(lanes, source, target):
 
 @njit(cache=True, nogil=True)
 def jacobian(tubes, lanes, mesh, c0, par, seclen, x, hist, histb, big, step, inverse):
-    """Inverse of d(imbalance)/dx at ``x`` by one sweep of perturbed lanes into ``inverse`` (m, m); False if it is singular or not finite."""
+    """Inverse of d(imbalance)/dx at ``x`` by one sweep of perturbed lanes into ``inverse`` (m, m); False if it is singular or not finite.
+
+    The imbalance at ``x`` itself stays in the first lane of the last buffer of ``big``.
+    """
     L = lane_count(lanes)
     m = len(x)
-    W, parL, seclenL, xL, histL, histbL, outL, outbL, nodesL, resL = big
+    W, parL, seclenL, xL, _, histbL, outL, outbL, nodesL, resL = big
     broadcast(lanes, par, parL)
     broadcast(lanes, seclen, seclenL)
     broadcast(lanes, x, xL)
-    broadcast(lanes, hist, histL)
     broadcast(lanes, histb, histbL)
     for i in range(m):
         xL[i * L + i + 1] += step[i]
     sweep(tubes, lanes, W, c0, mesh,
-          parL, seclenL, xL, histL, histbL, outL, outbL, nodesL, resL)  # fmt: skip
+          parL, seclenL, xL, hist, histbL, outL[:0], outbL, nodesL[:0], resL)  # fmt: skip
     matrix = np.empty((m, m))
     for i in range(m):
         for k in range(m):
@@ -133,15 +135,22 @@ def solve(
     previous = np.empty(m)
     sweeps, jacobians = 0, 0
     newest = False
+    L = lane_count(lanes)
     if fresh:
         if not jacobian(tubes, lanes, mesh, c0, par, seclen, x, hist, histb, big, step, inverse):
             return NOT_FINITE, 0, 0, 1
         jacobians += 1
         newest = True
-    sweep(tubes, lane, W, c0, mesh,
-          par, seclen, x, hist, histb, out, outb, nodes, res)  # fmt: skip
-    sweeps += 1
-    norm = scaled_norm(res, scale)
+        for i in range(m):
+            res[i] = big[9][i * L]
+        norm = scaled_norm(res, scale)
+    else:
+        norm = math.inf
+    if norm <= tolerance or not fresh:  # the fields belong to the last plain sweep
+        sweep(tubes, lane, W, c0, mesh,
+              par, seclen, x, hist, histb, out, outb, nodes, res)  # fmt: skip
+        sweeps += 1
+        norm = scaled_norm(res, scale)
     for iteration in range(limit):
         if norm <= tolerance:
             return CONVERGED, iteration, sweeps, jacobians

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Literal
 
 import numpy as np
 from scipy.interpolate import CubicSpline
@@ -35,7 +37,9 @@ class Inputs:
     torque: np.ndarray = field(default_factory=lambda: np.zeros(3))
 
 
+RENEW = 2  # sweeps a stage beyond which the next step starts with a new Jacobian, which costs two
 InputsAt = Callable[[float], Inputs]
+"""Inputs at a time in s. One that also has ``stages(times)``, which returns what :func:`stage_inputs` does, is asked for all stages at once."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +57,12 @@ class StepResult:
 
 @dataclass(frozen=True)
 class Record:
-    """What :func:`ctr_dynamics.model.tangent.step_tangent` needs of one solved step."""
+    """What the tangent of a solved step needs.
+
+    ``after`` (fields,): fields at its end; ``inputs`` (stages, 3N + 6) and ``found`` (stages, 5 + N) at its stages. :func:`step_tangent
+    <ctr_dynamics.model.tangent.step_tangent>` also reads ``before`` (3, fields), the stored fields before the step, and all of
+    ``rates`` (stages, fields); without them ``before`` is empty and ``rates`` holds the last stage's alone.
+    """
 
     scheme: Scheme
     key: tuple
@@ -154,22 +163,20 @@ class Simulator:
         t: float,
         inputs_at: InputsAt,
         *,
-        record: bool = False,
-        lead: np.ndarray | None = None,
+        record: bool | Literal["end"] = False,
+        start: np.ndarray | None = None,
     ) -> StepResult:
         """Advance ``state`` from t to t + dt (s) in place; ``inputs_at`` gives actuators and load at any time in between.
 
         A step that fails is tried again with a fresh Jacobian and, for one-step schemes, in up to 32 substeps. With ``record`` the result
-        carries what the tangent of the step needs. ``lead`` (stages, 5 + N): by how much another run of the same inputs has just missed
-        its own extrapolated start; this one would miss by nearly the same.
+        carries what the tangent of the step needs; with "end", of its last stage alone, and the record holds until the state is written
+        to. ``start`` (stages, 5 + N): where to look for the unknowns, in place of their straight extrapolation.
         """
-        result = self._attempt(state, self.scheme, t, inputs_at, not state.usable, record, lead)
+        result = self._attempt(state, self.scheme, t, inputs_at, not state.usable, record, start)
         if result.ok:
             return result
         totals = [result.iterations, result.sweeps, result.jacobians]
-        quadratic = (
-            state.unknowns - 2.0 * state.earlier[0] + state.earlier[1]
-        )  # what a quadratic start adds to the linear one
+        quadratic = 3.0 * (state.unknowns - state.earlier[0]) + state.earlier[1]
         retries = [(1, quadratic), (1, None)] + [
             (2**halving, None) for halving in range(1, 6) if self.scheme.one_step
         ]
@@ -202,22 +209,12 @@ class Simulator:
         t: float,
         inputs_at: InputsAt,
         fresh: bool,
-        record: bool,
-        lead: np.ndarray | None = None,
+        record: bool | Literal["end"],
+        start: np.ndarray | None = None,
     ) -> StepResult:
         n, stages = self.model.n, scheme.stages
-        at_stages = [inputs_at(t + c * scheme.dt) for c in scheme.times]
-        last = at_stages[-1]
-        inputs = np.empty((stages, self.model.input_count))
-        for i, now in enumerate(at_stages):
-            inputs[i, :n], inputs[i, n : 2 * n], inputs[i, 2 * n : 3 * n] = (
-                now.alpha,
-                now.alpha_rate,
-                now.beta,
-            )
-            inputs[i, 3 * n : 3 * n + 3], inputs[i, 3 * n + 3 : 3 * n + 6] = now.force, now.torque
-            inputs[i, 3 * n + 6 :] = now.beta_rate[: self.model.input_count - 3 * n - 6]
-        if not np.isfinite(inputs).all():
+        inputs, last = stage_inputs(self.model, inputs_at, t + scheme.times * scheme.dt)
+        if not math.isfinite(float(inputs.sum())):
             return StepResult(False, "actuators or load hold a number that is not finite", 0, 0, 0)
         bank, mesh = state.bank, state.mesh
         try:
@@ -230,40 +227,32 @@ class Simulator:
             fresh = True
         mesh = now_mesh
         small, big = self._work(key, mesh)
-        guess = 2.0 * state.unknowns - state.earlier[0]  # linear in time, stage by stage
-        if lead is not None:
-            guess += lead
-        before = bank[:RATES].copy() if record else bank
+        guess = (
+            2.0 * state.unknowns - state.earlier[0] if start is None else start
+        )  # linear in time, stage by stage
+        before = bank[:RATES].copy() if record is True else bank[:0]
         found = np.empty_like(guess)
         outcome, iterations, sweeps, jacobians = step(
             self.model.tubes, self.model.lane, self.model.jacobian_lanes, mesh, scheme.c0, scheme.weights, self.parameters,
             inputs, bank, guess, found, state.inverse, fresh, small, big, self.model.scale, self.model.step,
             self.tolerance, self.limit,
         )  # fmt: skip
-        state.usable = outcome == CONVERGED
+        state.usable = outcome == CONVERGED and sweeps <= RENEW * stages
         if outcome != CONVERGED:
             return StepResult(False, OUTCOMES[outcome], iterations, sweeps, jacobians)
         state.key, state.mesh, state.bank = key, mesh, bank
-        state.earlier = np.stack([state.unknowns, state.earlier[0]])
-        state.unknowns = found
+        earlier = np.empty_like(state.earlier)
+        earlier[0], earlier[1] = state.unknowns, state.earlier[0]
+        state.earlier, state.unknowns = earlier, found
         state.nodes = small[6].reshape(-1, 16 + 3 * n).copy()
         state.inputs = last
         records: tuple[Record, ...] = ()
         if record:
-            rates = bank[RATES : RATES + stages].copy()
-            records = (
-                Record(
-                    scheme,
-                    key,
-                    mesh,
-                    before,
-                    state.fields.copy(),
-                    rates,
-                    inputs,
-                    found.copy(),
-                    t + scheme.times * scheme.dt,
-                ),
-            )
+            # substeps share one bank, so each record needs its own copy
+            own = np.copy if record is True or scheme is not self.scheme else np.asarray
+            rates = own(bank[RATES + (0 if record is True else stages - 1) : RATES + stages])
+            times = t + scheme.times * scheme.dt
+            records = (Record(scheme, key, mesh, before, own(bank[Y_NOW]), rates, inputs, found, times),)
         return StepResult(True, "ok", iterations, sweeps, jacobians, records=records)
 
     def _work(self, key: tuple, mesh: Mesh) -> tuple:
@@ -275,6 +264,22 @@ class Simulator:
                 self.model.buffers(mesh, lanes),
             )
         return self._buffers[key]
+
+
+def stage_inputs(model: Model, inputs_at: InputsAt, times: np.ndarray) -> tuple[np.ndarray, Inputs]:
+    """Rows (stages, inputs) of alpha, its rate, beta, tip force, torque, and beta's rate where the model reads it, at ``times`` (stages,) s;
+    and the inputs at the last of them."""
+    at_once = getattr(inputs_at, "stages", None)
+    if at_once is not None:
+        return at_once(times)
+    n = model.n
+    rows = np.empty((len(times), model.input_count))
+    for row, time in zip(rows, times, strict=True):
+        now = inputs_at(time)
+        row[:n], row[n : 2 * n], row[2 * n : 3 * n] = now.alpha, now.alpha_rate, now.beta
+        row[3 * n : 3 * n + 3], row[3 * n + 3 : 3 * n + 6] = now.force, now.torque
+        row[3 * n + 6 :] = now.beta_rate[: model.input_count - 3 * n - 6]
+    return rows, now
 
 
 def remap_fields(

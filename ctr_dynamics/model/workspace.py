@@ -3,7 +3,8 @@
 A *lane* is one complete copy of the problem (its own history, parameters, loads and unknowns). The plain sweep has one lane; the
 Jacobian, the tangents of a step and batches of simulations are the same code with 8 to 64 lanes. Lanes are innermost, and
 every number that the equations touch lies in one flat workspace ``W`` at offsets that are constant once the tube and lane counts are known,
-which is what lets LLVM vectorise over the lanes without run-time alias checks.
+which is what lets LLVM vectorise over the lanes without run-time alias checks. For the same reason loops over the tubes count to the tubes
+of the robot and ask which are present: the offsets of each tube are then constants too.
 
 ``tubes`` and ``lanes`` are tuples whose *lengths* carry the counts into the compiler (one entry a tube; one entry for eight lanes, none for
 a single lane); their contents are not read.
@@ -95,6 +96,15 @@ def extra(tubes, lanes):
 def lane_count(lanes):
     """Lanes that a lane tuple stands for: none for one, else eight for each entry."""
     return max(1, 8 * len(lanes))
+
+
+@njit(cache=True, inline="always")
+def lane_trips(n, lanes, W):
+    """Turns of a loop over the lanes: the lane count, told to the compiler for one lane only.
+
+    Short loops of known length are unrolled before they can be vectorised, and then run on scalars.
+    """
+    return 1 if len(lanes) == 0 else len(W) // workspace_rows(n)
 
 
 @njit(cache=True, inline="always")

@@ -7,11 +7,12 @@ from scipy.optimize import curve_fit
 from ctr_dynamics.estimation.columns import Columns
 from ctr_dynamics.estimation.modes import input_vector, modal_basis
 from ctr_dynamics.estimation.uncertainty import bias_sigma, model_uncertainty
-from ctr_dynamics.model.mesh import STAGES, build_mesh
+from ctr_dynamics.model.mesh import build_mesh
 from ctr_dynamics.model.model import Model
 from ctr_dynamics.model.simulator import Inputs, Simulator
 from ctr_dynamics.model.statics import Statics
 from ctr_dynamics.model.transfer import coarse_key, transfer
+from ctr_dynamics.model.workspace import base_rows
 from ctr_dynamics.robot import load_robot
 
 BETA, ALPHA, ZERO = np.array([-0.2521, -0.1977]), np.array([1.5708, 1.5708]), np.zeros(2)
@@ -50,7 +51,7 @@ def test_transfer_is_exact_for_cubics_inside_each_section(robot):
     coarse = build_mesh(fine.segments, BETA, short, mesh.base_cells)
     assert max(coarse.sec_cells) >= 3
     F, S = 7 + 2 * fine.n, 16 + 3 * fine.n
-    base = fine.n * (STAGES * mesh.base_cells + 1) * 2
+    base = base_rows(fine.n, mesh.base_cells)
     rng = np.random.default_rng(2)
     coefficients = rng.normal(size=(len(mesh.sec_cells), 4, S))
     for k, cells in enumerate(coarse.sec_cells):
