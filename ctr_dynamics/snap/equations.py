@@ -166,10 +166,16 @@ def body(y, m, i, n, par, hist, c0, wrench):
         (1.0 - k * (c * c + d * d)) * ax + k * (b * c - a * d) * ay + k * (b * d + a * c) * az - par[14 * n]
     )
     wrench[1] = mass * (
-        k * (b * c + a * d) * ax + (1.0 - k * (b * b + d * d)) * ay + k * (c * d - a * b) * az - par[14 * n + 1]
+        k * (b * c + a * d) * ax
+        + (1.0 - k * (b * b + d * d)) * ay
+        + k * (c * d - a * b) * az
+        - par[14 * n + 1]
     )
     wrench[2] = mass * (
-        k * (b * d - a * c) * ax + k * (c * d + a * b) * ay + (1.0 - k * (b * b + c * c)) * az - par[14 * n + 2]
+        k * (b * d - a * c) * ax
+        + k * (c * d + a * b) * ay
+        + (1.0 - k * (b * b + c * c)) * az
+        - par[14 * n + 2]
     )
     hx, hy, hz = par[8 * n + i], par[9 * n + i], par[10 * n + i]
     if i == 0:
@@ -271,6 +277,8 @@ def tip(y, n, par, ust, hist, c0, out, w, wrench):
     for r in range(3):
         y[N + r] = par[14 * n + 3 + r] - wrench[r]
     y[M] = (1.0 - k * (c * c + d * d)) * tx + k * (b * c + a * d) * ty + k * (b * d - a * c) * tz - wrench[3]
-    y[M + 1] = k * (b * c - a * d) * tx + (1.0 - k * (b * b + d * d)) * ty + k * (c * d + a * b) * tz - wrench[4]
+    y[M + 1] = (
+        k * (b * c - a * d) * tx + (1.0 - k * (b * b + d * d)) * ty + k * (c * d + a * b) * tz - wrench[4]
+    )
     y[Z] = k * (b * d + a * c) * tx + k * (c * d - a * b) * ty + (1.0 - k * (b * b + c * c)) * tz - wrench[5]
     strain(y, 1, n, par, ust, hist, c0, out, w)

@@ -13,7 +13,9 @@ from ctr_dynamics.model.mesh import Tubes, breakpoints
 SPACING = 0.001  # m, of cells on robots without a grid of their own
 LEAST = 3  # cells of a section
 BASE = 14  # cells of each tube behind the plate
-SHORTEST = 1e-6  # m; a section between coinciding breakpoints gets this length, so that (25) has a step to divide by
+SHORTEST = (
+    1e-6  # m; a section between coinciding breakpoints gets this length, so that (25) has a step to divide by
+)
 
 # The grid of the authors' published program (15, 30, 10, 15, 10, 4 points), base to tip.
 PUBLISHED = {"till2020_snap_example": (14, 29, 9, 14, 9, 3)}
@@ -132,7 +134,9 @@ def build_grid(tubes: Tubes, beta: np.ndarray, cells: tuple[int, ...]) -> Grid:
     uz_base = np.zeros((base, n))
     for i, segments in enumerate(tubes):
         if beta[i] < 0.0:
-            for at, store in [(-beta[i], None)] + [(-beta[i] * (c + 0.5) / max(base, 1), c) for c in range(base)]:
+            for at, store in [(-beta[i], None)] + [
+                (-beta[i] * (c + 0.5) / max(base, 1), c) for c in range(base)
+            ]:
                 here = next(g for g in segments if at <= g.end + 1e-15).curvature(at)
                 if store is None:
                     behind[i] = here
@@ -140,7 +144,9 @@ def build_grid(tubes: Tubes, beta: np.ndarray, cells: tuple[int, ...]) -> Grid:
                     uz_base[store, i] = here[2]
     total = base + sum(cells[1:])
     sections = len(present)
-    cell_section = np.concatenate([np.full(base, -1), np.repeat(np.arange(sections), cells[1:])]).astype(np.int64)
+    cell_section = np.concatenate([np.full(base, -1), np.repeat(np.arange(sections), cells[1:])]).astype(
+        np.int64
+    )
     first_cell = base + np.concatenate([[0], np.cumsum(cells[1:])]).astype(np.int64)
     lengths = np.diff(edges)
     ds = np.array([lengths[k] / cells[k + 1] if k >= 0 else 0.0 for k in cell_section])

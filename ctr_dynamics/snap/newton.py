@@ -88,7 +88,22 @@ def _node(g, k, x, par, hist, c0, out_near, out_far, scratch, right, left):
         for i in range(3 * g.turning):
             right[i] = x[i]
         hist_start = hist[cells]
-        enter(x, g.turning, n, par, g.ust_behind, g.ust_start[0], hist_start, c0, out_far, w, near, far, torque, left)
+        enter(
+            x,
+            g.turning,
+            n,
+            par,
+            g.ust_behind,
+            g.ust_start[0],
+            hist_start,
+            c0,
+            out_far,
+            w,
+            near,
+            far,
+            torque,
+            left,
+        )
     elif k == 0:
         for i in range(g.turning):
             left[3 * i] = par[11 * n + i]
@@ -155,7 +170,15 @@ def residual(g, x, par, c0, work):
                 for r in range(3):
                     mean[r] = 0.5 * (before[3 * i + r] + here[3 * i + r])
                 base_slope(
-                    mean, i, n, par, g.uz_base[cell, i], work.hist_base[cell, i], c0, work.out_base[cell, i], f
+                    mean,
+                    i,
+                    n,
+                    par,
+                    g.uz_base[cell, i],
+                    work.hist_base[cell, i],
+                    c0,
+                    work.out_base[cell, i],
+                    f,
                 )
                 for r in range(3):
                     e = (here[3 * i + r] - before[3 * i + r]) / g.base_ds[i] - f[r]

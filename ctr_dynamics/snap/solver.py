@@ -46,7 +46,11 @@ class SnapSolver:
     """
 
     def __init__(
-        self, robot: Robot, beta: np.ndarray, cells: tuple[int, ...] | None = None, tolerance: float = TOLERANCE
+        self,
+        robot: Robot,
+        beta: np.ndarray,
+        cells: tuple[int, ...] | None = None,
+        tolerance: float = TOLERANCE,
     ) -> None:
         problem = robot.actuator_problem(np.asarray(beta, float))
         if problem:
@@ -68,6 +72,8 @@ class SnapSolver:
         self.bank = np.zeros((3, self.work.out.size + self.work.out_base.size))  # y now, y before, rate now
         self.t = 0.0
         self.dt = self.dt_before = 0.0
+        self.angle_surprise = 0.0  # rad, theta_f of the last step less its quadratic extrapolation
+        self._angles = np.zeros(3)
         self._c0 = -1.0
         self._fresh = True
         self._straight()
@@ -128,6 +134,37 @@ class SnapSolver:
         self.bank[Y_NOW], self.bank[Y_BEFORE], self.bank[RATE_NOW] = fields, fields, 0.0
         self.x_before, self.x_earlier = self.x.copy(), self.x.copy()
         self.t = self.dt = self.dt_before = 0.0
+        self._angles[:] = self.theta_f if self.n > 1 else 0.0
+
+    def copy_state(self) -> tuple:
+        """Everything that a step changes, for :meth:`restore_state`."""
+        arrays = (
+            self.x,
+            self.x_before,
+            self.x_earlier,
+            self.bank,
+            self.parameters,
+            self._angles,
+            self.work.left,
+            self.work.right,
+            self.work.out,
+        )
+        return tuple(a.copy() for a in arrays), (self.t, self.dt, self.dt_before)
+
+    def restore_state(self, kept: tuple) -> None:
+        """Go back to a state of :meth:`copy_state`."""
+        arrays, (self.t, self.dt, self.dt_before) = kept
+        x, before, earlier, bank, parameters, angles, left, right, out = (a.copy() for a in arrays)
+        self.x, self.x_before, self.x_earlier, self.bank, self.parameters, self._angles = (
+            x,
+            before,
+            earlier,
+            bank,
+            parameters,
+            angles,
+        )
+        self.work.left[:], self.work.right[:], self.work.out[:] = left, right, out
+        self._fresh = True
 
     def approach(self, alpha: np.ndarray, largest: float = 0.1) -> Solved:
         """Slow static approach: equilibria on the way from the present alpha to ``alpha`` (N,) rad, at most ``largest`` rad apart.
@@ -158,7 +195,14 @@ class SnapSolver:
                 solved = Solved(True, "", 0, 0, 0.0)
         return solved
 
-    def step(self, dt: float, alpha: np.ndarray, alpha_rate: np.ndarray, scheme: str = "bdf2", bdf_alpha: float = -0.45) -> Solved:
+    def step(
+        self,
+        dt: float,
+        alpha: np.ndarray,
+        alpha_rate: np.ndarray,
+        scheme: str = "bdf2",
+        bdf_alpha: float = -0.45,
+    ) -> Solved:
         """Advance by ``dt`` s to the actuator angles ``alpha`` (N,) rad with rates (N,) rad/s.
 
         ``scheme`` is ``bdf2``, with coefficients for unequal steps, or another one-stage scheme of
@@ -172,28 +216,36 @@ class SnapSolver:
         else:
             made = make_scheme(scheme, dt, bdf_alpha)
             if made.stages > 1:
-                raise InputError(f"time scheme '{scheme}' has {made.stages} stages", do="use bdf2 or bdf_alpha")
+                raise InputError(
+                    f"time scheme '{scheme}' has {made.stages} stages", do="use bdf2 or bdf_alpha"
+                )
             if not made.one_step and abs(ratio - 1.0) > 1e-9:
-                raise InputError(f"time scheme '{scheme}' needs equal steps", do="use bdf2 with steps that change")
+                raise InputError(
+                    f"time scheme '{scheme}' needs equal steps", do="use bdf2 with steps that change"
+                )
             c0, weights = float(made.c0[0]), made.weights[0, :3]
         kept = self.parameters.copy()
         self.parameters[layout["alpha"]] = alpha
         self.parameters[layout["alpha_rate"]] = alpha_rate
         history = weights @ self.bank
-        guess = self.x
-        if self.dt_before:  # quadratic in time, through three solutions
-            a, b = dt, self.dt
-            c = b + self.dt_before
-            guess = (
-                self.x * ((a + b) * (a + c) / (b * c))
-                - self.x_before * (a * (a + c) / (b * (c - b)))
-                + self.x_earlier * (a * (a + b) / (c * (c - b)))
-            )
+        # quadratic in time, through three solutions; those before the start are the resting one
+        a, b = dt, self.dt or dt
+        c = b + (self.dt_before or b)
+        ahead = np.array(
+            [(a + b) * (a + c) / (b * c), -a * (a + c) / (b * (c - b)), a * (a + b) / (c * (c - b))]
+        )
+        guess = ahead[0] * self.x + ahead[1] * self.x_before + ahead[2] * self.x_earlier
         solved = self._solve(c0, history, guess, 30)
-        if not solved.ok and self.dt_before:
+        if not solved.ok:
             self._fresh = True
             again = self._solve(c0, history, self.x, 40)
-            solved = Solved(again.ok, again.reason, solved.iterations + again.iterations, solved.jacobians + again.jacobians, again.residual)
+            solved = Solved(
+                again.ok,
+                again.reason,
+                solved.iterations + again.iterations,
+                solved.jacobians + again.jacobians,
+                again.residual,
+            )
         if not solved.ok:
             self.parameters = kept
             return solved
@@ -202,7 +254,11 @@ class SnapSolver:
         self.bank[Y_BEFORE] = self.bank[Y_NOW]
         self.bank[Y_NOW] = fields
         self.t += dt
-        self.dt_before, self.dt = self.dt, dt
+        self.dt_before, self.dt = b, dt
+        if self.n > 1:
+            angle = self.theta_f
+            self.angle_surprise = float(angle - ahead @ self._angles)
+            self._angles[1:], self._angles[0] = self._angles[:-1].copy(), angle
         return solved
 
     # What is read from the present solution.
@@ -222,10 +278,23 @@ class SnapSolver:
         return angles
 
     @property
-    def theta_f(self) -> float:
-        """End angle of tube 2 against that of tube 1, rad."""
+    def marker_angle(self) -> float:
+        """psi_L2 - psi_L1: angle between the end frames of tubes 2 and 1, rad."""
         angles = self.end_angles()
         return float(angles[1] - angles[0])
+
+    @property
+    def theta_f(self) -> float:
+        """Tip angle as the authors' published example counts it, rad: theta_2 at tube 2's end plus the twist of tube 1 from there to its tip.
+
+        At rest this is psi_L2 - psi_L1. In motion the marker on tube 1 twists the length beyond tube 2, and the published program counts
+        this twist with the other sign than :attr:`marker_angle` (docs/snap.md).
+        """
+        g, work = self.grid.arrays, self.work
+        node = g.first_cell[int(np.max(np.flatnonzero(g.tubes > 1))) + 1]
+        twist = work.out[node - g.base : len(g.ds) - g.base, 8] @ g.ds[node:]
+        m = int(g.tubes[g.cell_section[node - 1]])
+        return float(work.right[node, 18 + m] + twist)
 
     def tube_end(self, i: int) -> np.ndarray:
         """(3,) m in ``ctr_base``, end of tube ``i`` (0 is the innermost)."""
