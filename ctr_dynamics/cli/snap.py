@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -76,7 +75,7 @@ def _progress() -> Callable[[float], None] | None:
 
 
 def _figures(
-    plan: Plan, run: Trajectory, curve: SCurve, found: list[Extremum], crossed: float | None, wall: float
+    plan: Plan, run: Trajectory, curve: SCurve, found: list[Extremum], crossed: float | None
 ) -> dict[str, Any]:
     """What summary.json says of the run itself."""
     from ctr_dynamics.snap.experiment import overshoot
@@ -102,8 +101,8 @@ def _figures(
         "cells": list(run.cells),
         "iterations_per_step": float(run.iterations.mean()) if len(run.t) else None,
         "jacobians_per_step": float(run.jacobians.mean()) if len(run.t) else None,
-        "wall_s": wall,
-        "ms_per_step": 1e3 * wall / len(run.t) if len(run.t) else None,
+        "wall_s": run.wall_s,
+        "ms_per_step": 1e3 * run.wall_s / len(run.t) if len(run.t) else None,
         "failure": run.failure,
     }
 
@@ -193,9 +192,7 @@ def snap(
     output.mkdir(parents=True, exist_ok=True)
     curve = s_curve(of, of.rest.beta.value, of.rest.alpha.value[-1], points)
     plan = Plan(_start(of, start, "beta1" in given, curve), adaptive=adaptive, **options)  # type: ignore[arg-type]
-    begin = time.perf_counter()
     trajectory = run(of, plan, _progress())
-    wall = time.perf_counter() - begin
     crossed = crossing(trajectory.t, trajectory.theta_f)
     found = after_snap(extrema(trajectory.t, trajectory.theta_f), crossed)
     metadata = {
@@ -204,7 +201,7 @@ def snap(
         "robot_sha256": of.sha256,
         "parameters": str({**options, "start": plan.start, "adaptive": adaptive, "set": given}),
     }
-    summary = _figures(plan, trajectory, curve, found, crossed, wall)
+    summary = _figures(plan, trajectory, curve, found, crossed)
     files.write_trajectory(output / "trajectory.csv", trajectory)
     files.write_scurve(output / "scurve.csv", curve)
     files.write_peaks(output / "peaks.csv", found)

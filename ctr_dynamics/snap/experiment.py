@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -130,7 +131,7 @@ class Trajectory:
         inner_tip, outer_tip: (k, 3) m in ``ctr_base``.
         iterations, jacobians: (k,) of each step.
         frame_t: (f,) s, positions: (f, nodes, 3) m and quaternions: (f, nodes, 4) wxyz of the kept backbones.
-        theta_f_rest: rad, at t = 0; failure: why the run ended before its time, else empty.
+        theta_f_rest: rad, at t = 0; wall_s: s, taken by the steps; failure: why the run ended before its time, else empty.
     """
 
     t: np.ndarray
@@ -147,6 +148,7 @@ class Trajectory:
     theta_f_rest: float
     unknowns: int
     cells: tuple[int, ...]
+    wall_s: float
     failure: str = ""
 
 
@@ -190,6 +192,7 @@ def run(robot: Robot, plan: Plan, progress: Callable[[float], None] | None = Non
     log.frames.append((0.0, *solver.backbone()))
     failure = ""
     dt, end = plan.dt, plan.duration * (1 - 1e-9)
+    begin = time.perf_counter()  # the approach has compiled everything
     count = 0
     while solver.t < end:
         if plan.adaptive is None:
@@ -240,6 +243,7 @@ def run(robot: Robot, plan: Plan, progress: Callable[[float], None] | None = Non
         theta_f_rest=rest,
         unknowns=solver.grid.unknowns,
         cells=solver.grid.cells,
+        wall_s=time.perf_counter() - begin,
         failure=failure,
     )
 

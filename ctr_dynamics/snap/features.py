@@ -58,20 +58,23 @@ def after_snap(found: list[Extremum], snap_time: float | None) -> list[Extremum]
 def frequencies(t: np.ndarray, theta: np.ndarray, since: float, count: int = 3) -> list[tuple[float, float]]:
     """(Hz, relative height) of the highest spectral peaks of ``theta`` (rad) from ``since`` (s) on, highest first.
 
-    A straight line is taken off and a Hann window laid over samples that are equally spaced first; heights are relative to the highest.
+    Samples are made equally spaced, and the line through the last half is taken off, about which the motion settles. Only the last
+    quarter is tapered: the vibration decays, and a window over all of it would weigh its end most. Lines closer to 0 than two periods of
+    the record are not resolved and left out.
     """
     kept = t >= since
-    if kept.sum() < 16:
+    if kept.sum() < 32:
         return []
     x, y = t[kept], theta[kept]
-    samples = max(len(x), 16)
+    samples = len(x)
     grid = np.linspace(x[0], x[-1], samples)
     signal = np.interp(grid, x, y)
-    signal -= np.polyval(np.polyfit(grid, signal, 1), grid)
+    half, quarter = samples // 2, samples // 4
+    signal -= np.polyval(np.polyfit(grid[half:] - grid[0], signal[half:], 1), grid - grid[0])
+    signal[-quarter:] *= 0.5 + 0.5 * np.cos(np.linspace(0.0, np.pi, quarter))
     size = 2 ** math.ceil(math.log2(16 * samples))
-    spectrum = np.abs(np.fft.rfft(signal * np.hanning(samples), size))
+    spectrum = np.abs(np.fft.rfft(signal, size))
     hz = np.fft.rfftfreq(size, (grid[-1] - grid[0]) / (samples - 1))
-    # the main lobe of the window covers 2/T to each side of a line
     spectrum[hz < 2.0 / (grid[-1] - grid[0])] = 0.0
     peaks = find_peaks(spectrum)[0]
     best = sorted(peaks, key=lambda i: -spectrum[i])[:count]

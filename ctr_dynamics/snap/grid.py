@@ -142,7 +142,6 @@ def build_grid(tubes: Tubes, beta: np.ndarray, cells: tuple[int, ...]) -> Grid:
                     behind[i] = here
                 else:
                     uz_base[store, i] = here[2]
-    total = base + sum(cells[1:])
     sections = len(present)
     cell_section = np.concatenate([np.full(base, -1), np.repeat(np.arange(sections), cells[1:])]).astype(
         np.int64
