@@ -7,6 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
+import numpy as np
 import typer
 
 from ctr_dynamics import __version__
@@ -175,11 +176,7 @@ def snap(
         raise InputError(f"--points {points} is outside 50 to 100000", do="1000 resolve the fold to 1e-7 rad")
     if not 1.0 <= slower <= 1e6:
         raise InputError(f"--slower {slower:g} is outside 1 to 1e6")
-    chosen = _cells(cells)
-    if chosen is None:
-        chosen = refined_cells(of, refine)
-    elif refine != 1:
-        chosen = tuple(refine * c for c in chosen)
+    chosen = refined_cells(of, refine, _cells(cells))
     options = {
         "dt": dt,
         "duration": duration,
@@ -190,7 +187,7 @@ def snap(
     }
     Plan(start or 0.0, adaptive=adaptive, **options).check()  # type: ignore[arg-type]
     output.mkdir(parents=True, exist_ok=True)
-    curve = s_curve(of, of.rest.beta.value, of.rest.alpha.value[-1], points)
+    curve = s_curve(of, np.array(of.rest.beta.value), of.rest.alpha.value[1], points)
     plan = Plan(_start(of, start, "beta1" in given, curve), adaptive=adaptive, **options)  # type: ignore[arg-type]
     trajectory = run(of, plan, _progress())
     crossed = crossing(trajectory.t, trajectory.theta_f)

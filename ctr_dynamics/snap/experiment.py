@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from ctr_dynamics.errors import InputError
+from ctr_dynamics.model.model import Model
 from ctr_dynamics.robot import Robot, quantities, robot_with
 from ctr_dynamics.snap.features import Extremum
 from ctr_dynamics.snap.grid import default_cells
@@ -270,17 +271,16 @@ def _adaptive_step(
     return solved, min(following, max(plan.duration - solver.t, plan.dt))
 
 
-def refined_cells(robot: Robot, factor: int) -> tuple[int, ...]:
-    """The robot's own cells, each count multiplied by ``factor``.
+def refined_cells(robot: Robot, factor: int, cells: tuple[int, ...] | None = None) -> tuple[int, ...]:
+    """``cells``, or the robot's own, with each count multiplied by ``factor``.
 
     Raises:
         InputError: factor outside 1 to 50.
     """
     if not 1 <= factor <= 50:
         raise InputError(f"--refine {factor} is outside 1 to 50", do="2 doubles the cells of every section")
-    from ctr_dynamics.model.model import Model
-
-    cells = default_cells(robot.name, Model(robot).segments, np.array(robot.rest.beta.value))
+    if cells is None:
+        cells = default_cells(robot.name, Model(robot).segments, np.array(robot.rest.beta.value))
     return tuple(factor * c for c in cells)
 
 

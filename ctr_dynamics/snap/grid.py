@@ -111,7 +111,8 @@ def build_grid(tubes: Tubes, beta: np.ndarray, cells: tuple[int, ...]) -> Grid:
     base = cells[0] if turning else 0
     active = [next(j for j, g in enumerate(t) if beta[i] + g.end > 0.0) for i, t in enumerate(tubes)]
     present: list[int] = []
-    middles, starts, ends = [], [], []
+    middles: list[np.ndarray] = []
+    starts, ends = [], []
     remaining = n
 
     def reference(s: float) -> np.ndarray:
