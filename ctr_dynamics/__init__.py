@@ -17,7 +17,7 @@ def _kernel_cache() -> str:
     here = Path(__file__).parent
     stamps = sorted(
         (p.name, p.stat().st_mtime_ns)
-        for folder in ("model", "estimation")
+        for folder in ("model", "estimation", "snap")
         for p in (here / folder).glob("*.py")
     )
     digest = hashlib.sha256(repr(stamps).encode()).hexdigest()[:16]
