@@ -18,16 +18,36 @@ EXIT = 0
 
 
 def diagnose(
-    bags: Annotated[list[Path], typer.Argument(metavar="BAG [BAG ...]", help="Bags to fit: .mcap files or folders.")],
-    robot: Annotated[str, typer.Option("--robot", metavar="NAME_OR_FILE", help="A shipped robot or a robot file.")],
-    output: Annotated[Path, typer.Option("--output", metavar="DIR", help="Folder for findings.json, report.html and robot files.")],
+    bags: Annotated[
+        list[Path], typer.Argument(metavar="BAG [BAG ...]", help="Bags to fit: .mcap files or folders.")
+    ],
+    robot: Annotated[
+        str, typer.Option("--robot", metavar="NAME_OR_FILE", help="A shipped robot or a robot file.")
+    ],
+    output: Annotated[
+        Path,
+        typer.Option(
+            "--output", metavar="DIR", help="Folder for findings.json, report.html and robot files."
+        ),
+    ],
     validate: Annotated[
         list[Path] | None,
-        typer.Option("--validate", metavar="BAG [BAG ...]", help="Bags that are predicted only: what the extension is worth."),
+        typer.Option(
+            "--validate",
+            metavar="BAG [BAG ...]",
+            help="Bags that are predicted only: what the extension is worth.",
+        ),
     ] = None,
     workers: Annotated[int, typer.Option("--workers", min=1, max=64, help="Fits at once.")] = 2,
-    cluster: Annotated[str, typer.Option("--cluster", metavar="ADDRESS", help="Dask scheduler that takes the work, one bag set a task.")] = "",
-    as_json: Annotated[bool, typer.Option("--json", help="One line of JSON on stdout instead of the summary.")] = False,
+    cluster: Annotated[
+        str,
+        typer.Option(
+            "--cluster", metavar="ADDRESS", help="Dask scheduler that takes the work, one bag set a task."
+        ),
+    ] = "",
+    as_json: Annotated[
+        bool, typer.Option("--json", help="One line of JSON on stdout instead of the summary.")
+    ] = False,
     report: Annotated[bool, typer.Option("--report/--no-report", help="Write report.html.")] = True,
 ) -> int:
     """Find what the simulation gets wrong about the recorded robot, name the cause, extend the model and measure the gain."""
@@ -41,7 +61,15 @@ def diagnose(
     if validate:
         command += " --validate " + " ".join(shlex.quote(str(b)) for b in validate)
     command += f" --robot {shlex.quote(robot)} --output {shlex.quote(str(output))}"
-    request = Request(loaded, [str(b) for b in bags], [str(b) for b in validate or []], str(output), command, workers, report)
+    request = Request(
+        loaded,
+        [str(b) for b in bags],
+        [str(b) for b in validate or []],
+        str(output),
+        command,
+        workers,
+        report,
+    )
     begin = time.perf_counter()
 
     def note(text: str) -> None:
@@ -69,12 +97,16 @@ def _on_cluster(address: str, request: Any) -> dict[str, Any]:
     try:
         from dask.distributed import Client
     except ImportError:
-        raise InputError("--cluster needs dask.distributed", do="pip install 'ctr_dynamics[cluster]'") from None
+        raise InputError(
+            "--cluster needs dask.distributed", do="pip install 'ctr_dynamics[cluster]'"
+        ) from None
     from ctr_dynamics.diagnosis.command import run
 
     try:
         client = Client(address, timeout="10s")
     except (OSError, TimeoutError, ValueError) as error:
-        raise InputError(f"no Dask scheduler answers at '{address}' within 10 s ({error})", do="check the address") from None
+        raise InputError(
+            f"no Dask scheduler answers at '{address}' within 10 s ({error})", do="check the address"
+        ) from None
     with client:
         return client.submit(run, request, pure=False).result()

@@ -60,7 +60,9 @@ def whiteness(problem: Problem, whitened: Floats, free: int) -> Whiteness:
     return Whiteness(p, power / m, p_power, p_correlation)
 
 
-def block_bootstrap(a: Floats, b: Floats, stamps: Floats, seed: int = 0, length: float = 0.5, draws: int = 2000) -> tuple[float, float]:
+def block_bootstrap(
+    a: Floats, b: Floats, stamps: Floats, seed: int = 0, length: float = 0.5, draws: int = 2000
+) -> tuple[float, float]:
     """95 % interval of 1 - sum(b)/sum(a) over blocks of ``length`` s; a, b: squared errors (s,) before and after."""
     block = np.floor(stamps / length).astype(int)
     groups = np.unique(block, return_inverse=True)[1]

@@ -49,7 +49,9 @@ def run(request: Request, note: Callable[[str], None] = _quiet) -> dict[str, Any
     others = [read_recording(path, request.robot) for path in request.validation]
     diagnosis = diagnose(request.robot, recordings, others, note=note, workers=request.workers)
     if not others:
-        diagnosis.notes.append("without a validation bag the gain is not measured, and a wrong cause that fits is not found out")
+        diagnosis.notes.append(
+            "without a validation bag the gain is not measured, and a wrong cause that fits is not found out"
+        )
     note("next experiment")
     planned = plan(diagnosis)
     directory = Path(request.output)
@@ -78,7 +80,9 @@ def _yaml(scenario: Scenario) -> str:
     return yaml.safe_dump(scenario.model_dump(exclude_none=True, mode="json"), sort_keys=False)
 
 
-def _report(diagnosis: Diagnosis, content: dict[str, Any], directory: Path, note: Callable[[str], None]) -> None:
+def _report(
+    diagnosis: Diagnosis, content: dict[str, Any], directory: Path, note: Callable[[str], None]
+) -> None:
     try:
         from ctr_dynamics.diagnosis.report import write_report
     except ImportError:

@@ -24,7 +24,17 @@ from .fit import Fit, Problem, add_numerics, fit, make_problem
 from .mistakes import find_mistake
 from .noise import noise_floor
 from .recording import Recording
-from .search import SEPARATION, Candidate, Explanation, Linearisation, Search, candidates, linearise, search, separation
+from .search import (
+    SEPARATION,
+    Candidate,
+    Explanation,
+    Linearisation,
+    Search,
+    candidates,
+    linearise,
+    search,
+    separation,
+)
 
 Floats = NDArray[np.float64]
 Note = Callable[[str], None]
@@ -111,7 +121,23 @@ def diagnose(
     if mask is None:
         mask = measured_axes(recordings, notes)
     result = Diagnosis(
-        robot, list(recordings), "clean", [], [((), 1.0)], [], [], {}, None, None, None, None, None, None, math.nan, None, notes=notes
+        robot,
+        list(recordings),
+        "clean",
+        [],
+        [((), 1.0)],
+        [],
+        [],
+        {},
+        None,
+        None,
+        None,
+        None,
+        None,
+        None,
+        math.nan,
+        None,
+        notes=notes,
     )
     note("nominal model")
     result.mistake = find_mistake(recordings[0], robot, note)
@@ -127,11 +153,16 @@ def diagnose(
     result.problem = problem
     result.nominal_rms = _rms(problem, {})
     if not math.isfinite(result.nominal_rms):
-        raise InputError("the nominal model cannot be simulated on this bag", do="check the robot, the joints and the load with `ctr-dynamics info`")
+        raise InputError(
+            "the nominal model cannot be simulated on this bag",
+            do="check the robot, the joints and the load with `ctr-dynamics info`",
+        )
     note("re-calibration inside tolerance")
     clean = fit(problem, (), {})
     if clean is None:
-        raise InputError("the model cannot be simulated near the nominal robot", do="check the robot file and the bag")
+        raise InputError(
+            "the model cannot be simulated near the nominal robot", do="check the robot file and the bag"
+        )
     note("numerics")
     result.numerics = add_numerics(problem, clean.point)
     clean = fit(problem, (), clean.point) or clean
@@ -145,8 +176,12 @@ def diagnose(
         raise InputError("the recalibrated model cannot be linearised", do="check the robot file and the bag")
     result.search = found
     seen = observable(problem, found)
-    result.not_observable = sorted({c.effect for c in pool} - {c.effect for c, size in seen.items() if size >= OBSERVABLE})
-    excited = len({c.effect for c, s in seen.items() if s >= OBSERVABLE}) / max(len({c.effect for c in pool}), 1)
+    result.not_observable = sorted(
+        {c.effect for c in pool} - {c.effect for c, size in seen.items() if size >= OBSERVABLE}
+    )
+    excited = len({c.effect for c, s in seen.items() if s >= OBSERVABLE}) / max(
+        len({c.effect for c in pool}), 1
+    )
     _decide(result, problem, found, excited, validation, note)
     result.seconds = time.perf_counter() - begin
     return result
@@ -157,14 +192,18 @@ def measured_axes(recordings: Sequence[Recording], notes: list[str]) -> NDArray[
     mask = np.ones(6, bool)
     if all(np.ptp(r.quaternion, axis=0).max(initial=0.0) < 1e-9 for r in recordings):
         mask[3:] = False
-        notes.append("the tracker sends no rotation (three degrees of freedom); causes are judged by position alone")
+        notes.append(
+            "the tracker sends no rotation (three degrees of freedom); causes are judged by position alone"
+        )
     return mask
 
 
 def observable(problem: Problem, found: Search) -> dict[Candidate, float]:
     """Whitened size of every candidate's signature at its prior scale, nuisances projected out."""
     lin = found.linearised
-    J = np.hstack([lin.columns_of(problem.nuisances) * [q.tolerance for q in problem.nuisances], problem.numerics])
+    J = np.hstack(
+        [lin.columns_of(problem.nuisances) * [q.tolerance for q in problem.nuisances], problem.numerics]
+    )
     factor = np.linalg.cholesky(np.eye(J.shape[1]) + J.T @ J)
     sizes = {}
     for c, signature in lin.signatures.items():
@@ -180,10 +219,19 @@ def _rms(problem: Problem, point: dict) -> float:
     return rms(np.concatenate(parts))
 
 
-def _decide(result: Diagnosis, problem: Problem, found: Search, excited: float, validation: Sequence[Recording], note: Note) -> None:
+def _decide(
+    result: Diagnosis,
+    problem: Problem,
+    found: Search,
+    excited: float,
+    validation: Sequence[Recording],
+    note: Note,
+) -> None:
     """Verdict, causes and their probabilities."""
     assert result.clean is not None
-    clean_p = next((p for e, p in zip(found.explanations, found.probabilities, strict=True) if not e.members), 0.0)
+    clean_p = next(
+        (p for e, p in zip(found.explanations, found.probabilities, strict=True) if not e.members), 0.0
+    )
     best = found.best
     clean = next(e for e in found.explanations if not e.members)
     if best.members and best.score - clean.score < CLEAN_GAIN:

@@ -22,7 +22,9 @@ from ctr_dynamics.robot import Robot
 from .recording import Recording
 
 Floats = NDArray[np.float64]
-Point = Mapping[tuple[str, str], float]  # coordinates of quantities that are not at their off-values, by (effect, name)
+Point = Mapping[
+    tuple[str, str], float
+]  # coordinates of quantities that are not at their off-values, by (effect, name)
 FRACTION = 1e-3  # of a quantity's unit, for differences of what is cheap to evaluate
 AVERAGE_POINTS = np.array([0.04691008, 0.23076534, 0.5, 0.76923466, 0.95308992])
 AVERAGE_WEIGHTS = np.array([0.11846344, 0.23931434, 0.28444444, 0.23931434, 0.11846344])
@@ -67,8 +69,6 @@ class Experiment:
         self.scheme = make_scheme("sdirk3", dt)
         self._models = {False: Model(robot, nodes=nodes), True: Model(robot, nodes=nodes, extended=True)}
         self.nominal = make_setup(self._models[False])
-        self._guess: Floats | None = None
-        self._steady = _reference(recording)
 
     # -- the chain --
 
@@ -110,7 +110,9 @@ class Experiment:
             out[:, 3 * n : 3 * n + 3] += setup.tip_force
             if extended:
                 interval = np.clip(np.searchsorted(t, times, side="left") - 1, 0, len(steps) - 1)
-                out[:, 3 * n + 6 :] = np.where(((times > t[0]) & (times <= t[-1]))[:, None], slides[interval], 0.0)
+                out[:, 3 * n + 6 :] = np.where(
+                    ((times > t[0]) & (times <= t[-1]))[:, None], slides[interval], 0.0
+                )
             return out
 
         return rows
@@ -168,7 +170,7 @@ class Experiment:
         setup = self.setup(point)
         changed = [self.setup(moved(point, q, FRACTION)) for q in wanted]
         kinds: list[str] = []
-        for q, other in zip(wanted, changed, strict=True):
+        for other in changed:
             model = not np.array_equal(other.block, setup.block) or any(
                 not np.array_equal(getattr(other, name), getattr(setup, name)) for name in _INPUTS
             )
@@ -241,15 +243,12 @@ class Experiment:
         turn = turn.reshape(len(times), r, 3) / norm2[:, :, None]
         swing = np.cross(turn, setup.lever)
         unit = h / np.sqrt(norm2)
-        swing = rotate(unit[:, None, :].repeat(r, axis=1).reshape(-1, 4), swing.reshape(-1, 3)).reshape(len(times), r, 3)
+        swing = rotate(unit[:, None, :].repeat(r, axis=1).reshape(-1, 4), swing.reshape(-1, 3)).reshape(
+            len(times), r, 3
+        )
         shift = setup.tracker_scale * (rows[:, :3].transpose(0, 2, 1) + swing)
         shift = rotate(setup.rotation, shift.reshape(-1, 3)).reshape(len(times), r, 3)
         return np.concatenate([shift, turn], axis=2).transpose(0, 2, 1)
-
-
-def _reference(recording: Recording) -> Floats:
-    """(3,) mean of the tracker's positions, m."""
-    return recording.position.mean(axis=0)
 
 
 def moved(point: Point, quantity: Quantity, share: float) -> dict[tuple[str, str], float]:

@@ -61,7 +61,15 @@ def findings(diagnosis: Diagnosis, command: str, experiment: dict[str, Any] | No
     causes = []
     for m in d.members:
         if m.effect == "config_mistake" and d.mistake is not None:
-            values: dict[str, Any] = {"which": {"value": d.mistake[0], "ci90": None, "ci99": None, "unit": "name", "nominal": "none"}}
+            values: dict[str, Any] = {
+                "which": {
+                    "value": d.mistake[0],
+                    "ci90": None,
+                    "ci99": None,
+                    "unit": "name",
+                    "nominal": "none",
+                }
+            }
         elif m.candidate is None or best is None:
             values = {}
         else:
@@ -119,8 +127,12 @@ def findings(diagnosis: Diagnosis, command: str, experiment: dict[str, Any] | No
             "notes": d.notes,
             "version": __version__,
             "robot": {"name": d.robot.name, "source": d.robot.source, "sha256": d.robot.sha256},
-            "inputs": [{"name": name, "sha256": digest} for r in d.recordings for name, digest in r.sha256.items()],
-            "parameters": {"nodes": problem.experiments[0].nodes, "dt_s": problem.experiments[0].scheme.dt} if problem else {},
+            "inputs": [
+                {"name": name, "sha256": digest} for r in d.recordings for name, digest in r.sha256.items()
+            ],
+            "parameters": {"nodes": problem.experiments[0].nodes, "dt_s": problem.experiments[0].scheme.dt}
+            if problem
+            else {},
         }
     )
 
@@ -142,13 +154,17 @@ def write(directory: Path, diagnosis: Diagnosis, content: dict[str, Any]) -> Non
     directory.mkdir(parents=True, exist_ok=True)
     name = diagnosis.robot.name
     if diagnosis.clean is not None:
-        recalibrated = robot_of(diagnosis.robot, diagnosis.clean, f"{name}_recalibrated", "re-calibrated inside its tolerances")
+        recalibrated = robot_of(
+            diagnosis.robot, diagnosis.clean, f"{name}_recalibrated", "re-calibrated inside its tolerances"
+        )
         _text(directory / RECALIBRATED, robot_to_yaml(recalibrated))
     if diagnosis.best is not None:
         effects = ", ".join(m.effect for m in diagnosis.members if m.effect in EFFECTS) or "no cause"
         extended = robot_of(diagnosis.robot, diagnosis.best, f"{name}_extended", f"extended by {effects}")
         _text(directory / EXTENDED, robot_to_yaml(extended))
-    _text(directory / "findings.json", json.dumps(content, indent=1, allow_nan=False, ensure_ascii=False) + "\n")
+    _text(
+        directory / "findings.json", json.dumps(content, indent=1, allow_nan=False, ensure_ascii=False) + "\n"
+    )
 
 
 def _text(path: Path, text: str) -> None:

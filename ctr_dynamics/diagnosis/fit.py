@@ -91,7 +91,9 @@ class Problem:
             parts.append(whiten(experiment.residual(prediction)))
         return np.concatenate(parts) - self.offset if len(self.offset) else np.concatenate(parts)
 
-    def linearise(self, point: Mapping[Key, float], wanted: Sequence[Quantity]) -> tuple[Floats, Floats] | None:
+    def linearise(
+        self, point: Mapping[Key, float], wanted: Sequence[Quantity]
+    ) -> tuple[Floats, Floats] | None:
         """Whitened residual (m,) at ``point`` and derivatives (m, len(wanted)) of the prediction, each by its coordinate."""
         residuals, columns = [], []
         for experiment, whiten in zip(self.experiments, self.whiteners, strict=True):
@@ -105,7 +107,9 @@ class Problem:
         return (residual - self.offset if len(self.offset) else residual), np.concatenate(columns) / scale
 
 
-def make_problem(robot: Robot, recordings: Sequence[Recording], nuisances: Sequence[Quantity], mask: NDArray[np.bool_]) -> Problem:
+def make_problem(
+    robot: Robot, recordings: Sequence[Recording], nuisances: Sequence[Quantity], mask: NDArray[np.bool_]
+) -> Problem:
     """Problem of ``recordings``; axes that are not finite or not in ``mask`` (6,) are left out."""
     experiments = [Experiment(r, robot) for r in recordings]
     whiteners = []
@@ -115,7 +119,9 @@ def make_problem(robot: Robot, recordings: Sequence[Recording], nuisances: Seque
     return Problem(robot, experiments, whiteners, tuple(nuisances))
 
 
-def variances(nuisances: Sequence[Quantity], causes: Sequence[Quantity]) -> tuple[tuple[Quantity, ...], Floats]:
+def variances(
+    nuisances: Sequence[Quantity], causes: Sequence[Quantity]
+) -> tuple[tuple[Quantity, ...], Floats]:
     """Free quantities and their prior variances: tolerance^2 for nuisances, plus scale^2 for causes."""
     active = list(nuisances)
     names = {q.key for q in nuisances}
@@ -177,8 +183,6 @@ def fit(
     off = np.array([q.off for q in active])
     low = np.array([q.low for q in active])
     high = np.array([q.high for q in active])
-    if any(q.effect == "clearance" for q in causes):
-        pass
     values = np.array([start.get(q.key, q.off) for q in active])
     if known is not None and {q.key for q in active} <= {q.key for q in known[2]}:
         residual = known[0]
@@ -199,10 +203,11 @@ def fit(
         if bound.any():  # move the others with the bounded ones held
             free = ~bound
             moved = residual - columns[:, bound] @ step[bound]
-            wanted_free, _, _ = posterior(moved, columns[:, free], (values - off)[free], variance[free], numerics)
+            wanted_free, _, _ = posterior(
+                moved, columns[:, free], (values - off)[free], variance[free], numerics
+            )
             step[free] = np.clip((off[free] + wanted_free), low[free], high[free]) - values[free]
-        expected = columns @ step
-        size = float(np.sqrt(np.mean((columns @ step) ** 2) * len(residual)))
+        size = float(np.linalg.norm(columns @ step))
         if size < 0.05:
             break
         factor, accepted = 1.0, False
@@ -249,17 +254,23 @@ def fit(
             trial = np.clip(off + wanted, low, high)
             new = problem.residual({q.key: float(v) for q, v in zip(active, trial, strict=True)})
             if new is not None and cost(new, trial - off, variance, numerics) < here:
-                columns_step = trial - values
                 values, residual = trial, new
                 here = cost(residual, values - off, variance, numerics)
-                del columns_step
     _, covariance, _ = posterior(residual, columns, values - off, variance, numerics)
     evidence = _laplace(here, columns, variance, numerics)
     one_sided = {q.key for q in causes if (math.isfinite(q.low) and q.low == q.off)}
     evidence += math.log(2.0) * len(one_sided)
     extra = _numerics_part(residual, numerics)
     return Fit(
-        tuple(causes), active, values, covariance, float(np.sum((residual - extra) ** 2)), evidence, residual - extra, columns, extra
+        tuple(causes),
+        active,
+        values,
+        covariance,
+        float(np.sum((residual - extra) ** 2)),
+        evidence,
+        residual - extra,
+        columns,
+        extra,
     )
 
 
@@ -272,7 +283,9 @@ def _laplace(here: float, columns: Floats, variance: Floats, numerics: Floats) -
 def _numerics_part(residual: Floats, numerics: Floats) -> Floats:
     if not numerics.size:
         return np.zeros_like(residual)
-    return numerics @ np.linalg.solve(np.eye(numerics.shape[1]) + numerics.T @ numerics, numerics.T @ residual)
+    return numerics @ np.linalg.solve(
+        np.eye(numerics.shape[1]) + numerics.T @ numerics, numerics.T @ residual
+    )
 
 
 def add_numerics(problem: Problem, point: Mapping[Key, float]) -> dict[str, float]:
@@ -285,7 +298,9 @@ def add_numerics(problem: Problem, point: Mapping[Key, float]) -> dict[str, floa
     count = 0
     for experiment, whiten in zip(problem.experiments, problem.whiteners, strict=True):
         base = experiment.predict(point)
-        for i, (nodes, dt) in enumerate(((experiment.nodes, 0.5 * experiment.scheme.dt), (2 * experiment.nodes, experiment.scheme.dt))):
+        for i, (nodes, dt) in enumerate(
+            ((experiment.nodes, 0.5 * experiment.scheme.dt), (2 * experiment.nodes, experiment.scheme.dt))
+        ):
             finer = Experiment(experiment.recording, experiment.robot, nodes, dt).predict(point)
             if finer.failure or base.failure:
                 difference = np.zeros((len(base.position), 6))

@@ -120,7 +120,9 @@ def misfit(recording: Recording, robot: Robot) -> float:
     return math.sqrt(float(np.nanmean(squares)))
 
 
-def find_mistake(recording: Recording, robot: Robot, note: Callable[[str], None]) -> tuple[str, float, float] | None:
+def find_mistake(
+    recording: Recording, robot: Robot, note: Callable[[str], None]
+) -> tuple[str, float, float] | None:
     """(name, misfit before, misfit after) of the mistake whose undoing leaves least, where the misfit is gross and it explains nearly all."""
     before = misfit(recording, robot)
     if before < GROSS * noise_floor(robot) * math.sqrt(2.0):

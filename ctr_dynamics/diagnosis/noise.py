@@ -17,7 +17,9 @@ class Whitener:
     ``mask`` (6,) leaves out axes that are not measured; ``used`` (s,) leaves out samples. ``scale`` multiplies the stated noise.
     """
 
-    def __init__(self, robot: Robot, stamps: Floats, mask: NDArray[np.bool_], used: NDArray[np.bool_]) -> None:
+    def __init__(
+        self, robot: Robot, stamps: Floats, mask: NDArray[np.bool_], used: NDArray[np.bool_]
+    ) -> None:
         noise = robot.tracker.noise
         self.mask, self.used = mask, used
         t = stamps[used]
@@ -37,7 +39,9 @@ class Whitener:
         parts = []
         for axis in np.flatnonzero(self.mask):
             column = flat[:, axis]
-            parts.append(solve_triangular(self._factor, column, lower=True) if axis < 3 else column / self._rotation)
+            parts.append(
+                solve_triangular(self._factor, column, lower=True) if axis < 3 else column / self._rotation
+            )
         out = np.concatenate(parts)
         return out if values.ndim == 3 else out[:, 0]
 

@@ -46,9 +46,13 @@ def planned(scenario: Scenario, robot: Robot) -> Recording:
         corners = {c for item in scenario.loads for c, _ in item.corners()}
         grid = sorted({*t.tolist(), *corners})
         load = np.array([[x, *known(x).force, *known(x).torque] for x in grid])
-    stamps = np.arange(math.floor(scenario.duration_s * scenario.rates.tracker_hz) + 1) / scenario.rates.tracker_hz
+    stamps = (
+        np.arange(math.floor(scenario.duration_s * scenario.rates.tracker_hz) + 1) / scenario.rates.tracker_hz
+    )
     still = np.tile([1.0, 0.0, 0.0, 0.0], (len(stamps), 1))
-    return Recording(scenario.description, scenario.source, {}, joints, load, stamps, np.zeros((len(stamps), 3)), still, ())
+    return Recording(
+        scenario.description, scenario.source, {}, joints, load, stamps, np.zeros((len(stamps), 3)), still, ()
+    )
 
 
 def plan(diagnosis: Diagnosis) -> Plan | None:
@@ -56,7 +60,12 @@ def plan(diagnosis: Diagnosis) -> Plan | None:
     d = diagnosis
     if d.verdict == "not_excited":
         scenario = load_scenario(START)
-        return Plan(f"{scenario.description}: excites bending and torsion, which these bags do not", scenario, None, None)
+        return Plan(
+            f"{scenario.description}: excites bending and torsion, which these bags do not",
+            scenario,
+            None,
+            None,
+        )
     if d.problem is None or d.best is None or d.at_best is None:
         return None
     member = next((m for m in d.members if m.candidate is not None and m.rivals), None)
@@ -81,7 +90,9 @@ def plan(diagnosis: Diagnosis) -> Plan | None:
 
 def _separation(d: Diagnosis, scenario: Scenario, own: Candidate, rival: Candidate) -> float | None:
     """Separation of the two with these bags and one of ``scenario`` together."""
-    assert d.problem is not None and d.best is not None and d.at_best is not None
+    assert d.problem is not None
+    assert d.best is not None
+    assert d.at_best is not None
     fit = d.best
     recording = planned(scenario, d.robot)
     experiment = Experiment(recording, d.robot)
@@ -105,7 +116,9 @@ def _separation(d: Diagnosis, scenario: Scenario, own: Candidate, rival: Candida
         [(v - q.off) / q.scale if q.key in keys else 0.0 for q, v in zip(fit.active, fit.values, strict=True)]
     )
     signature = everything @ departure
-    widths = np.array([q.tolerance / q.scale if q.key in keys else max(q.tolerance / q.scale, 0.0) for q in fit.active])
+    widths = np.array(
+        [q.tolerance / q.scale if q.key in keys else max(q.tolerance / q.scale, 0.0) for q in fit.active]
+    )
     J = np.hstack([everything * widths, against])
     rhs = J.T @ signature
     left = float(signature @ signature - rhs @ np.linalg.solve(np.eye(J.shape[1]) + J.T @ J, rhs))

@@ -64,16 +64,22 @@ def read_recording(path: str | Path, robot: Robot) -> Recording:
             where=where,
         )
     if not poses:
-        raise InputError("no usable tracker pose", do="diagnosis needs the tracker on /ctr/tracker/tip", where=where)
+        raise InputError(
+            "no usable tracker pose", do="diagnosis needs the tracker on /ctr/tracker/tip", where=where
+        )
     t0 = joints[0][0]
     table = np.array([[(stamp - t0) * 1e-9, *value] for stamp, value in _once(joints)])
     reason = robot.actuator_problem(table[0, 1 + robot.n_tubes :], table[0, 1 : 1 + robot.n_tubes])
     if reason:
-        raise InputError(f"{reason}; is it a bag of this robot?", do="check the robot file and the units", where=where)
+        raise InputError(
+            f"{reason}; is it a bag of this robot?", do="check the robot file and the units", where=where
+        )
     tracker = np.array([[(stamp - t0) * 1e-9, *value] for stamp, value in _once(poses)])
     inside = (tracker[:, 0] >= 0.0) & (tracker[:, 0] <= table[-1, 0])
     if not inside.all():
-        notes.append(f"{int((~inside).sum())} tracker poses lie outside the time of the joints and were left out")
+        notes.append(
+            f"{int((~inside).sum())} tracker poses lie outside the time of the joints and were left out"
+        )
     tracker = tracker[inside]
     span = float(np.ptp(tracker[:, 0])) if len(tracker) else 0.0
     if span < SHORTEST:
@@ -108,7 +114,11 @@ def _collect(bag: Bag, robot: Robot) -> tuple[Samples, Samples, Samples, list[st
             if isinstance(order, str):
                 wrong = order
                 continue
-            value = [float(message.positions[i]) for i in order] if len(message.positions) >= len(message.names) else []
+            value = (
+                [float(message.positions[i]) for i in order]
+                if len(message.positions) >= len(message.names)
+                else []
+            )
             if value and finite(value):
                 joints.append((message.stamp_ns, value))
             else:

@@ -134,7 +134,9 @@ def log_prior(members: Sequence[Candidate], every: Sequence[Candidate]) -> float
     return math.log(mass / count) - variants
 
 
-def linearise(problem: Problem, point: Mapping[Key, float], pool: Sequence[Candidate], note: Callable[[str], None]) -> Linearisation | None:
+def linearise(
+    problem: Problem, point: Mapping[Key, float], pool: Sequence[Candidate], note: Callable[[str], None]
+) -> Linearisation | None:
     """Columns of nuisances and all candidates at ``point``; those without a derivative by finite probes."""
     smooth: dict[Key, Quantity] = {q.key: q for q in problem.nuisances}
     for c in pool:
@@ -148,7 +150,6 @@ def linearise(problem: Problem, point: Mapping[Key, float], pool: Sequence[Candi
     result = Linearisation(dict(point), residual, wanted, columns)
     # effects with shape parameters or a kink need the shape, or a finite size
     note("probing effects that are not smooth")
-    shaped: dict[tuple, tuple[Candidate, dict[Key, float]]] = {}
     groups: dict[tuple, list[Candidate]] = {}
     for c in pool:
         if c.shapes and EFFECTS[c.effect].smooth:
@@ -173,7 +174,6 @@ def linearise(problem: Problem, point: Mapping[Key, float], pool: Sequence[Candi
             width = len(c.quantities)
             result.signatures[c] = shaped_found[1][:, start_column : start_column + width]
             start_column += width
-    del shaped
     rough = [c for c in pool if not EFFECTS[c.effect].smooth]
 
     def probe(c: Candidate) -> Floats | None:
@@ -186,7 +186,9 @@ def linearise(problem: Problem, point: Mapping[Key, float], pool: Sequence[Candi
             parts.append((residual - new) / size)
         return np.stack(parts, axis=1)
 
-    for c, signature in zip(rough, Parallel(2, prefer="threads")(delayed(probe)(c) for c in rough), strict=True):
+    for c, signature in zip(
+        rough, Parallel(2, prefer="threads")(delayed(probe)(c) for c in rough), strict=True
+    ):
         if signature is not None:
             result.signatures[c] = signature
     for c in pool:
@@ -195,7 +197,9 @@ def linearise(problem: Problem, point: Mapping[Key, float], pool: Sequence[Candi
     return result
 
 
-def screen(problem: Problem, lin: Linearisation, base: Sequence[Candidate], pool: Sequence[Candidate]) -> list[tuple[float, Candidate]]:
+def screen(
+    problem: Problem, lin: Linearisation, base: Sequence[Candidate], pool: Sequence[Candidate]
+) -> list[tuple[float, Candidate]]:
     """Linear log evidence gained by each candidate beside ``base``, best first; one-sided causes of the wrong sign gain nothing."""
     fixed = tuple(q for c in base for q in c.quantities + c.shapes)
     active, variance = variances(problem.nuisances, fixed)
@@ -227,11 +231,15 @@ def screen(problem: Problem, lin: Linearisation, base: Sequence[Candidate], pool
     return sorted(scored, key=lambda item: -item[0])
 
 
-def _own(c: Candidate, nuisance: Mapping[Key, int], new: Sequence[int], departure: Floats, count: int) -> list[float]:
+def _own(
+    c: Candidate, nuisance: Mapping[Key, int], new: Sequence[int], departure: Floats, count: int
+) -> list[float]:
     """Departures of the candidate's own quantities."""
     out = []
     for i, q in enumerate(c.quantities):
-        out.append(float(departure[nuisance[q.key]] if q.key in nuisance else departure[count + list(new).index(i)]))
+        out.append(
+            float(departure[nuisance[q.key]] if q.key in nuisance else departure[count + list(new).index(i)])
+        )
     return out
 
 
@@ -246,7 +254,9 @@ def _column(lin: Linearisation, base: Sequence[Candidate], q: Quantity) -> Float
     return np.zeros((len(lin.residual), 1))
 
 
-def explain(problem: Problem, members: Sequence[Candidate], start: Mapping[Key, float], lin: Linearisation | None) -> Explanation | None:
+def explain(
+    problem: Problem, members: Sequence[Candidate], start: Mapping[Key, float], lin: Linearisation | None
+) -> Explanation | None:
     """Fit of a set of candidates from ``start``; the first step uses the columns of ``lin`` where it stands at that point."""
     causes = tuple(q for c in members for q in c.quantities + c.shapes)
     point = dict(start)
@@ -255,18 +265,28 @@ def explain(problem: Problem, members: Sequence[Candidate], start: Mapping[Key, 
         point.update(dict(c.start))
     nudged = False
     for c in fresh:
-        if c.shapes or not EFFECTS[c.effect].smooth:  # shapes have no derivative until there is something to shape
+        if (
+            c.shapes or not EFFECTS[c.effect].smooth
+        ):  # shapes have no derivative until there is something to shape
             signature = lin.signatures.get(c) if lin is not None else None
-            sizes = _first_size(problem, lin, c, signature) if signature is not None and lin is not None else [0.3 * q.scale for q in c.quantities]
+            sizes = (
+                _first_size(problem, lin, c, signature)
+                if signature is not None and lin is not None
+                else [0.3 * q.scale for q in c.quantities]
+            )
             for q, size in zip(c.quantities, sizes, strict=True):
-                point[q.key] = min(max(q.off + size, q.low + 0.02 * q.scale if math.isfinite(q.low) else -math.inf), q.high)
+                point[q.key] = min(
+                    max(q.off + size, q.low + 0.02 * q.scale if math.isfinite(q.low) else -math.inf), q.high
+                )
             nudged = True
     extra = problem.nuisances
     if any(c.effect == "clearance" for c in members):
         extra = problem.nuisances + tuple(problem_share(problem))
-    own = Problem(problem.robot, problem.experiments, problem.whiteners, extra, problem.numerics, problem.offset)
+    own = Problem(
+        problem.robot, problem.experiments, problem.whiteners, extra, problem.numerics, problem.offset
+    )
     known = None
-    if lin is not None and not nudged and lin.point == {k: v for k, v in point.items()}:
+    if lin is not None and not nudged and lin.point == point:
         known = (lin.residual, lin.columns, lin.quantities)
     result = fit(own, causes, point, known)
     return None if result is None else Explanation(tuple(members), result)
@@ -283,9 +303,14 @@ def _first_size(problem: Problem, lin: Linearisation, c: Candidate, signature: F
     """Linear estimate of a candidate's departures beside the nuisances."""
     variance = np.append([q.tolerance**2 for q in problem.nuisances], [q.scale**2 for q in c.quantities])
     J = np.hstack([lin.columns_of(problem.nuisances), signature])
-    values = np.append([lin.point.get(q.key, q.off) - q.off for q in problem.nuisances], np.zeros(len(c.quantities)))
+    values = np.append(
+        [lin.point.get(q.key, q.off) - q.off for q in problem.nuisances], np.zeros(len(c.quantities))
+    )
     departure, _, _ = posterior(lin.residual, J, values, variance, problem.numerics)
-    return [float(np.clip(d, -2.0 * q.scale, 2.0 * q.scale)) for d, q in zip(departure[-len(c.quantities) :], c.quantities, strict=True)]
+    return [
+        float(np.clip(d, -2.0 * q.scale, 2.0 * q.scale))
+        for d, q in zip(departure[-len(c.quantities) :], c.quantities, strict=True)
+    ]
 
 
 @dataclass
@@ -310,7 +335,9 @@ class Search:
         return self.explanations[0]
 
 
-def search(problem: Problem, pool: list[Candidate], clean: Fit, note: Callable[[str], None], workers: int = 2) -> Search | None:
+def search(
+    problem: Problem, pool: list[Candidate], clean: Fit, note: Callable[[str], None], workers: int = 2
+) -> Search | None:
     """Find the explanations that deserve probability, from the recalibrated fit ``clean`` on."""
     base = Explanation((), clean)
     note("signatures of all candidates")
@@ -331,7 +358,13 @@ def search(problem: Problem, pool: list[Candidate], clean: Fit, note: Callable[[
     return Search(found, _probabilities(found, problem), base, lin, screened, pool)
 
 
-def _seconds(problem: Problem, pool: list[Candidate], found: list[Explanation], note: Callable[[str], None], workers: int) -> list[Explanation]:
+def _seconds(
+    problem: Problem,
+    pool: list[Candidate],
+    found: list[Explanation],
+    note: Callable[[str], None],
+    workers: int,
+) -> list[Explanation]:
     """Two causes, and three where that pays: from each of the best, what it leaves is screened again."""
     out: list[Explanation] = []
     tried: set[frozenset[str]] = set()
@@ -347,7 +380,9 @@ def _seconds(problem: Problem, pool: list[Candidate], found: list[Explanation], 
             lin = linearise(problem, leader.fit.point, pool, note)
             if lin is None:
                 continue
-            gains = [(g, c) for g, c in screen(problem, lin, leader.members, pool) if g > SECOND_EVIDENCE - 2.0]
+            gains = [
+                (g, c) for g, c in screen(problem, lin, leader.members, pool) if g > SECOND_EVIDENCE - 2.0
+            ]
             jobs = []
             for _, c in gains[:SECOND]:
                 names = frozenset(x.label for x in (*leader.members, c))
@@ -375,7 +410,9 @@ def _leftover(problem: Problem, result: Fit) -> float:
 
 
 def _fits(problem: Problem, jobs: list, workers: int) -> list[Explanation]:
-    results = Parallel(workers, prefer="threads")(delayed(explain)(problem, members, start, lin) for members, start, lin in jobs)
+    results = Parallel(workers, prefer="threads")(
+        delayed(explain)(problem, members, start, lin) for members, start, lin in jobs
+    )
     return [e for e in results if e is not None]
 
 
@@ -403,20 +440,30 @@ def _score(found: list[Explanation], pool: Sequence[Candidate]) -> None:
 def _probabilities(found: Sequence[Explanation], problem: Problem) -> Floats:
     """Of each explanation: softmax of the tempered score, with the noise that the best one leaves."""
     inflation = max(1.0, found[0].fit.chi2 / problem.size)
-    scores = np.array([e.fit.log_evidence / (TEMPERATURE * inflation) + (e.score - e.fit.log_evidence) for e in found])
+    scores = np.array(
+        [e.fit.log_evidence / (TEMPERATURE * inflation) + (e.score - e.fit.log_evidence) for e in found]
+    )
     weights = np.exp(scores - scores.max())
     return weights / weights.sum()
 
 
-def separation(problem: Problem, explanation: Explanation, member: Candidate, rival: Candidate | None, lin: Linearisation) -> float:
+def separation(
+    problem: Problem, explanation: Explanation, member: Candidate, rival: Candidate | None, lin: Linearisation
+) -> float:
     """d_sep of one cause: the size of its signature, whitened, with nuisances, other causes and the rival projected out."""
     result = explanation.fit
     own = {q.key for q in member.quantities}
     off = {q.key: q.off for q in member.quantities}
-    values = np.array([v - off[q.key] if q.key in own else 0.0 for q, v in zip(result.active, result.values, strict=True)])
+    values = np.array(
+        [v - off[q.key] if q.key in own else 0.0 for q, v in zip(result.active, result.values, strict=True)]
+    )
     signature = result.columns @ values
     names = {q.key for q in problem.nuisances}
-    others = [i for i, q in enumerate(result.active) if q.key not in member.keys or (q.key in names and q.key not in own)]
+    others = [
+        i
+        for i, q in enumerate(result.active)
+        if q.key not in member.keys or (q.key in names and q.key not in own)
+    ]
     wide = {q.key for q in result.causes}
     prior = {q.key: q.tolerance**2 + (q.scale**2 if q.key in wide else 0.0) for q in result.active}
     parts = [result.columns[:, i] * math.sqrt(prior[result.active[i].key]) for i in others]

@@ -14,7 +14,13 @@ VERDICTS = {
     "not_excited": "These bags hardly move the robot: they cannot show what is wrong.",
 }
 # Units for people: factor and text.
-SHOWN = {"kg": (1e3, "g"), "m": (1e3, "mm"), "s": (1e3, "ms"), "rad": (57.29577951, "deg"), "m/s": (1e3, "mm/s")}
+SHOWN = {
+    "kg": (1e3, "g"),
+    "m": (1e3, "mm"),
+    "s": (1e3, "ms"),
+    "rad": (57.29577951, "deg"),
+    "m/s": (1e3, "mm/s"),
+}
 
 
 def shown(value: float | None, unit: str) -> str:
@@ -39,9 +45,13 @@ def cause(entry: dict[str, Any]) -> str:
         parts.append(
             f"{name} {shown(p['value'], p['unit'])} [{shown(low, p['unit'])}, {shown(high, p['unit'])}], robot file {shown(p['nominal'], p['unit'])}"
         )
-    sentence = f"Cause: {effect.replace('_', ' ')}, {'; '.join(parts)}; probability {entry['probability']:.2f}."
+    sentence = (
+        f"Cause: {effect.replace('_', ' ')}, {'; '.join(parts)}; probability {entry['probability']:.2f}."
+    )
     if entry["not_separable_from"]:
-        sentence += f" Not separable from: {', '.join(x.replace('_', ' ') for x in entry['not_separable_from'])}."
+        sentence += (
+            f" Not separable from: {', '.join(x.replace('_', ' ') for x in entry['not_separable_from'])}."
+        )
     if effect in EFFECTS:
         sentence += f" {EFFECTS[effect].text}"
     return sentence

@@ -196,7 +196,16 @@ def _share(setup: Setup, values: Values) -> None:
 register(
     Effect(
         "play_kinematics",
-        (Parameter("share", "1", 1.0, 0.7, lambda robot, i: 0.7, text="part of the tilt by which velocities turn; 1 for rigid tubes"),),
+        (
+            Parameter(
+                "share",
+                "1",
+                1.0,
+                0.7,
+                lambda robot, i: 0.7,
+                text="part of the tilt by which velocities turn; 1 for rigid tubes",
+            ),
+        ),
         _share,
         "Model-form uncertainty of the clearance: how velocities pass the tilt.",
         "docs/diagnosis.md",
@@ -213,7 +222,16 @@ def _shift(setup: Setup, values: Values) -> None:
 register(
     Effect(
         "load_time",
-        (Parameter("delay_s", "s", 0.0, 0.001, lambda robot, i: 0.001, text="known loads act this much later than stamped"),),
+        (
+            Parameter(
+                "delay_s",
+                "s",
+                0.0,
+                0.001,
+                lambda robot, i: 0.001,
+                text="known loads act this much later than stamped",
+            ),
+        ),
         _shift,
         "Event times, such as the cut of a string, are known to about a millisecond.",
         "docs/diagnosis.md",

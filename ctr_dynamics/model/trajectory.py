@@ -226,11 +226,23 @@ def run(
             chosen = slice(first, min(first + room, effect.shape[1]))
             part = None if input_effect is None else _some(input_effect, chosen)
             parts.append(
-                run(model, scheme, parameters, inputs, duration, effect=effect[:, chosen], input_effect=part, tolerance=tolerance, guess=guess)
+                run(
+                    model,
+                    scheme,
+                    parameters,
+                    inputs,
+                    duration,
+                    effect=effect[:, chosen],
+                    input_effect=part,
+                    tolerance=tolerance,
+                    guess=guess,
+                )
             )
         shortest = min(parts, key=lambda p: len(p.t))
         columns_of = [p.columns[: len(shortest.t)] for p in parts if p.columns is not None]
-        return replace(shortest, columns=np.concatenate(columns_of, axis=2), sweeps=sum(p.sweeps for p in parts))
+        return replace(
+            shortest, columns=np.concatenate(columns_of, axis=2), sweeps=sum(p.sweeps for p in parts)
+        )
     simulator = Simulator(model, scheme, tolerance, parameters)
     dt, stages = scheme.dt, scheme.stages
     steps = int(np.floor(duration / dt + 1e-9))

@@ -1,0 +1,349 @@
+"""The large study of diagnosis: many cases with hidden effects, from a simulator of its own, and how often the verdicts are right.
+
+    python benchmarks/study.py --output study --singles 80 --clean 80 --pairs 24 --outside 24
+    python benchmarks/study.py --output study --table docs/study.md
+
+Every case is one task (joblib processes, or a Dask cluster with --cluster ADDRESS). Results go to DIR/results.jsonl, one line a case; a run that
+is stopped goes on where it was. Seeds are the stratum's first seed plus the number of the case.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import os
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parent.parent
+Z95 = 1.959964
+
+
+def one(stratum: str, seed: int) -> dict[str, Any]:
+    """Make a case, diagnose it, then open the answer."""
+    for folder in (ROOT, ROOT / "test" / "diagnosis"):
+        if str(folder) not in sys.path:
+            sys.path.insert(0, str(folder))
+    from ctr_dynamics.diagnosis.diagnose import diagnose
+    from ctr_dynamics.diagnosis.findings import findings
+    from ctr_dynamics.diagnosis.recording import read_recording
+    from ctr_dynamics.robot import load_robot
+    from truth.cases import make_case
+
+    with tempfile.TemporaryDirectory() as folder:
+        begin = time.time()
+        case = make_case(seed, stratum, folder)
+        made = time.time() - begin
+        robot = load_robot(case.robot)
+        result = diagnose(
+            robot, [read_recording(case.protocol, robot)], [read_recording(case.sweep, robot)], workers=1
+        )
+        content = findings(result, "", None)
+        answer = case.unseal()
+        sizes = separations(result, answer) if result.search is not None else {}
+        removable = removed(result, case, answer)
+    kept = (
+        "verdict",
+        "causes",
+        "cause_set95",
+        "residual",
+        "validation",
+        "seconds",
+        "probabilities",
+        "numerics",
+        "not_observable",
+        "notes",
+    )
+    return {
+        "stratum": stratum,
+        "seed": seed,
+        "hidden": answer["hidden"],
+        "rival": answer["rival"],
+        "separations": sizes,
+        "removed": removable,
+        "making_s": made,
+        **{key: content[key] for key in kept},
+    }
+
+
+def separations(result: Any, answer: dict[str, Any]) -> dict[str, float]:
+    """d_sep of every true cause, from the true effects fitted to the data, against the nearest rival."""
+    from ctr_dynamics.diagnosis.search import explain, linearise, separation
+
+    problem, found = result.problem, result.search
+    members = []
+    for item in answer["hidden"]:
+        names = set(item.get("parameters", {}))
+        options = [
+            c for c in found.pool if c.effect == item["effect"] and {q.name for q in c.quantities} & names
+        ]
+        if not options:
+            return {}
+        exact = [c for c in options if {q.name for q in c.quantities} <= names]
+        members.append((exact or options)[0])
+    if not members:
+        return {}
+    best = explain(problem, tuple(members), found.clean.fit.point, None)
+    lin = linearise(problem, best.fit.point, found.pool, lambda text: None) if best else None
+    if best is None or lin is None:
+        return {}
+    own = {m.effect for m in members}
+    out = {}
+    for member in members:
+        rivals = [c for c in lin.signatures if c.effect not in own]
+        out[member.effect] = min(separation(problem, best, member, rival, lin) for rival in rivals)
+    return out
+
+
+def removed(result: Any, case: Any, answer: dict[str, Any]) -> float | None:
+    """Share of the removable held-out error that the extension removes: 1 - (ext^2 - floor^2) / (rec^2 - floor^2)."""
+    from ctr_dynamics.diagnosis.noise import noise_floor
+
+    v = result.validation
+    if v is None or not answer["hidden"]:
+        return None
+    floor2 = noise_floor(result.robot) ** 2
+    before = v.rms_recalibrated**2 - floor2
+    return None if before < 0.05 * floor2 else 1.0 - (v.rms_extended**2 - floor2) / before
+
+
+def wilson(hits: int, count: int) -> tuple[float, float]:
+    """95 % interval of a share."""
+    if count == 0:
+        return 0.0, 1.0
+    p = hits / count
+    centre = (p + Z95**2 / (2 * count)) / (1 + Z95**2 / count)
+    half = Z95 * math.sqrt(p * (1 - p) / count + Z95**2 / (4 * count**2)) / (1 + Z95**2 / count)
+    return max(0.0, centre - half), min(1.0, centre + half)
+
+
+def share(hits: list[bool]) -> str:
+    """Hits of count, share and interval."""
+    count, n = len(hits), sum(hits)
+    if not count:
+        return "no case"
+    low, high = wilson(n, count)
+    return f"{n} of {count} = {100 * n / count:.0f} % [{100 * low:.0f}, {100 * high:.0f}]"
+
+
+def true_set(row: dict[str, Any]) -> list[str]:
+    """Sorted IDs of what was hidden."""
+    return sorted({h["effect"] for h in row["hidden"]})
+
+
+def named(row: dict[str, Any]) -> list[str]:
+    """Sorted IDs of what was found."""
+    return sorted({c["effect"] for c in row["causes"]})
+
+
+def coverage(rows: list[dict[str, Any]], level: str) -> list[bool]:
+    """Whether the intervals of rightly found causes hold the true totals."""
+    hits = []
+    for row in rows:
+        for item in row["hidden"]:
+            for cause in row["causes"]:
+                if cause["effect"] != item["effect"]:
+                    continue
+                for name, value in item["parameters"].items():
+                    found = cause["parameters"].get(name)
+                    truth = value["total"] if isinstance(value, dict) else value
+                    if found is None or found.get(level) is None or not isinstance(truth, int | float):
+                        continue
+                    low, high = found[level]
+                    hits.append((low is None or low <= truth) and (high is None or truth <= high))
+    return hits
+
+
+def table(rows: list[dict[str, Any]]) -> list[tuple[str, str, str]]:
+    """(figure, demanded, measured)."""
+    by = {s: [r for r in rows if r["stratum"] == s] for s in {r["stratum"] for r in rows}}
+    singles, pairs = by.get("single", []), by.get("pair", [])
+    clear = [r for r in singles if r["separations"] and min(r["separations"].values()) >= 8.0]
+    clear_pairs = [r for r in pairs if len(r["separations"]) == 2 and min(r["separations"].values()) >= 8.0]
+    sure = [
+        r
+        for r in rows
+        if r["cause_set95"]
+        and r["probabilities"]
+        and r["probabilities"][0]["probability"] >= 0.95
+        and r["hidden"]
+    ]
+    right_sure = [
+        sorted(r["probabilities"][0]["effects"]) == true_set(r) or named(r) == true_set(r)
+        for r in sure
+        if r["stratum"] != "not_excited"
+    ]
+    sizes = [len(r["cause_set95"]) for r in clear]
+    gains = sorted(r["removed"] for r in clear if r["removed"] is not None)
+    seconds = sorted(r["seconds"] for r in rows)
+    median = gains[len(gains) // 2] if gains else math.nan
+    return [
+        (
+            "singles with d_sep >= 8: right cause first",
+            ">= 95 %",
+            share([bool(r["causes"]) and r["causes"][0]["effect"] == true_set(r)[0] for r in clear]),
+        ),
+        (
+            "singles with d_sep >= 8: truth in the 95 % set",
+            ">= 95 %",
+            share([true_set(r) in [sorted(s) for s in r["cause_set95"]] for r in clear]),
+        ),
+        ("their mean size of the 95 % set", "<= 3", f"{sum(sizes) / max(len(sizes), 1):.2f}"),
+        (
+            "all singles: right cause first",
+            "-",
+            share([bool(r["causes"]) and r["causes"][0]["effect"] == true_set(r)[0] for r in singles]),
+        ),
+        ("clean bags named", "<= 2 %", share([r["verdict"] not in ("clean",) for r in by.get("none", [])])),
+        ("90 % intervals that hold the truth", "84-96 %", share(coverage(clear + clear_pairs, "ci90"))),
+        ("99 % intervals that hold the truth", "-", share(coverage(clear + clear_pairs, "ci99"))),
+        (
+            "removable held-out error removed (median)",
+            ">= 85 %",
+            f"{100 * median:.0f} % of {len(gains)} cases",
+        ),
+        (
+            "pairs with both d_sep >= 8 exactly right",
+            ">= 80 %",
+            share([named(r) == true_set(r) for r in clear_pairs]),
+        ),
+        (
+            "outside the catalogue called unknown",
+            ">= 90 %",
+            share([r["verdict"] == "unknown" or "unknown" in named(r) for r in by.get("outside", [])]),
+        ),
+        ("probability >= 0.95 right", ">= 93 %", share(right_sure)),
+        (
+            "not excited called so",
+            "-",
+            share([r["verdict"] == "not_excited" for r in by.get("not_excited", [])]),
+        ),
+        (
+            "near ties: truth in the 95 % set",
+            "-",
+            share([true_set(r) in [sorted(s) for s in r["cause_set95"]] for r in by.get("near_tie", [])]),
+        ),
+        (
+            "time of a diagnosis on one core (median, largest)",
+            "-",
+            f"{seconds[len(seconds) // 2]:.0f} s, {seconds[-1]:.0f} s" if seconds else "-",
+        ),
+    ]
+
+
+def show(rows: list[dict[str, Any]], seeds: dict[str, int], wall: float | None) -> str:
+    """The table as Markdown."""
+    lines = ["| figure | demanded | measured, Wilson 95 % interval |", "|---|---|---|"]
+    lines += [f"| {a} | {b} | {c} |" for a, b, c in table(rows)]
+    counts = {s: sum(r["stratum"] == s for r in rows) for s in seeds}
+    lines.append("")
+    lines.append(
+        "Cases (first seed): " + ", ".join(f"{s} {counts[s]} ({seeds[s]})" for s in seeds if counts[s]) + "."
+    )
+    total = sum(r["seconds"] + r["making_s"] for r in rows)
+    lines.append(
+        f"Work: {total / 3600:.2f} core hours"
+        + (f", {wall / 60:.0f} min of wall time in the last run." if wall else ".")
+    )
+    return "\n".join(lines) + "\n"
+
+
+SEEDS = {
+    "none": 50_000,
+    "single": 51_000,
+    "pair": 52_000,
+    "outside": 53_000,
+    "not_excited": 54_000,
+    "near_tie": 55_000,
+}
+
+
+def main() -> None:
+    """Run what is missing, then print the table."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--output", type=Path, required=True)
+    parser.add_argument("--clean", type=int, default=80)
+    parser.add_argument("--singles", type=int, default=80)
+    parser.add_argument("--pairs", type=int, default=24)
+    parser.add_argument("--outside", type=int, default=24)
+    parser.add_argument("--not-excited", type=int, default=8)
+    parser.add_argument("--near-ties", type=int, default=8)
+    parser.add_argument(
+        "--offset", type=int, default=0, help="added to every seed: other cases than the published ones"
+    )
+    parser.add_argument("--workers", type=int, default=os.cpu_count() or 1)
+    parser.add_argument("--cluster", default="", help="address of a Dask scheduler")
+    parser.add_argument("--table", type=Path, help="write the table here, and run nothing")
+    options = parser.parse_args()
+    options.output.mkdir(parents=True, exist_ok=True)
+    path = options.output / "results.jsonl"
+    rows = [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
+    seeds = {s: first + options.offset for s, first in SEEDS.items()}
+    begin = time.time()
+    if options.table is None:
+        counts = {
+            "none": options.clean, "single": options.singles, "pair": options.pairs, "outside": options.outside,
+            "not_excited": options.not_excited, "near_tie": options.near_ties,
+        }  # fmt: skip
+        done = {(r["stratum"], r["seed"]) for r in rows}
+        # strata take turns, so that a study that is stopped early has some of each
+        todo = sorted(
+
+                (k / max(counts[s], 1), s, seeds[s] + k)
+                for s in counts
+                for k in range(counts[s])
+                if (s, seeds[s] + k) not in done
+
+        )
+        with path.open("a") as stream:
+            for row in _work([(s, seed) for _, s, seed in todo], options):
+                rows.append(row)
+                stream.write(json.dumps(row) + "\n")
+                stream.flush()
+                print(
+                    f"{len(rows)}: {row['stratum']} {row['seed']}: {true_set(row)} -> {row['verdict']} {named(row)} {row.get('error', '')}",
+                    flush=True,
+                )
+    rows = [r for r in rows if "error" not in r]
+    text = show(rows, seeds, time.time() - begin if options.table is None else None)
+    print(text)
+    if options.table is not None:
+        options.table.write_text(text)
+
+
+def guarded(stratum: str, seed: int) -> dict[str, Any]:
+    """A case that cannot be made or diagnosed is said, not lost."""
+    try:
+        return one(stratum, seed)
+    except Exception as error:
+        return {
+            "stratum": stratum,
+            "seed": seed,
+            "hidden": [],
+            "causes": [],
+            "verdict": "error",
+            "error": f"{type(error).__name__}: {error}",
+        }
+
+
+def _work(todo: list[tuple[str, int]], options: argparse.Namespace) -> Any:
+    if options.cluster:
+        from dask.distributed import Client, as_completed
+
+        with Client(options.cluster) as client:
+            for future in as_completed([client.submit(guarded, s, seed) for s, seed in todo]):
+                yield future.result()
+        return
+    from joblib import Parallel, delayed
+
+    yield from Parallel(options.workers, return_as="generator_unordered", batch_size=1)(
+        delayed(guarded)(s, seed) for s, seed in todo
+    )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,267 @@
+"""report.html of a diagnosis: one page that opens offline. First the verdict in sentences, then what they rest on."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+from scipy.signal import periodogram
+
+from ctr_dynamics.bagio.writer import atomic_file
+from ctr_dynamics.effects import EFFECTS
+from ctr_dynamics.report.figures import Panel, figure_svg, to_svg
+from ctr_dynamics.report.page import Page
+
+from .checks import by_axis
+from .diagnose import Diagnosis
+from .experiment import Experiment
+from .fit import Fit
+from .noise import noise_floor
+from .search import separation
+from .sentences import summary
+
+Floats = NDArray[np.float64]
+AXES = "xyz"
+SHOWN_CAUSES = 12
+
+
+def write_report(path: Path, diagnosis: Diagnosis, content: dict[str, Any]) -> None:
+    """Write the page."""
+    page = Page(f"Diagnosis of {', '.join(r.name for r in diagnosis.recordings)}")
+    first, *others = summary(content)
+    page.paragraph(first, "note" if diagnosis.verdict in ("clean", "named") else "warning")
+    for text in others:
+        page.paragraph(text)
+    for text in content["notes"]:
+        page.paragraph(text, "warning")
+    if diagnosis.problem is not None and diagnosis.clean is not None and diagnosis.best is not None:
+        _traces(page, diagnosis, diagnosis.clean, diagnosis.best)
+        _evidence(page, diagnosis)
+        _rivals(page, diagnosis)
+        _validation(page, diagnosis)
+        _whiteness(page, diagnosis, diagnosis.clean, diagnosis.best)
+        _values(page, diagnosis.best)
+    _scope(page, content)
+    with atomic_file(path) as part:
+        part.write_text(page.text(), encoding="utf-8")
+
+
+def _residuals(experiment: Experiment, fit: Fit) -> tuple[Floats, Floats]:
+    prediction = experiment.predict(fit.point)
+    return prediction.position, experiment.residual(prediction)
+
+
+def _traces(page: Page, d: Diagnosis, clean: Fit, best: Fit) -> None:
+    assert d.problem is not None
+    for experiment in d.problem.experiments:
+        recording = experiment.recording
+        t = recording.stamps
+        before, left = _residuals(experiment, clean)
+        after, rest = _residuals(experiment, best)
+        band = np.full(len(t), 2e3 * noise_floor(d.robot) / np.sqrt(3.0))
+        page.heading(f"Measured and simulated: {recording.name}")
+        panels, errors = [], []
+        for i, axis in enumerate(AXES):
+            panels.append(
+                Panel(f"{axis} (mm)")
+                .line(t, 1e3 * recording.position[:, i], "tracker", "tracker", dots=True)
+                .line(t, 1e3 * before[:, i], "re-calibrated", "alone")
+                .line(t, 1e3 * after[:, i], "extended", "fused", band=band)
+            )
+            signature = 1e3 * (after - before)[:, i]
+            errors.append(
+                Panel(f"{axis} (mm)")
+                .line(t, 1e3 * left[:, i], "residual, re-calibrated", "tracker", dots=True)
+                .line(t, signature, "what the causes explain", "fused")
+                .line(t, 1e3 * rest[:, i], "residual, extended", "other", dots=True)
+            )
+        page.figure(
+            figure_svg(panels),
+            "Tip position in the tracker's axes; the band is two standard deviations of the tracker's noise.",
+        )
+        page.figure(figure_svg(errors), "Residuals with the signature of the causes over them.")
+        page.figure(
+            _loops(recording.joints, t, left, rest),
+            "Residual length over each tube's angle: loops point to friction and play.",
+        )
+        page.figure(_envelope(t, left, rest), "Residual length, averaged over half a second.")
+
+
+def _loops(joints: Floats, t: Floats, left: Floats, rest: Floats):  # type: ignore[no-untyped-def]
+    n = (joints.shape[1] - 1) // 2
+    figure = Figure(figsize=(10, 3.2), layout="constrained")
+    axes = figure.subplots(1, n, squeeze=False)[0]
+    for i, ax in enumerate(axes):
+        angle = np.degrees(np.interp(t, joints[:, 0], joints[:, 1 + i]))
+        ax.plot(
+            angle,
+            1e3 * np.linalg.norm(left[:, :3], axis=1),
+            ".",
+            ms=2,
+            color="#8c959f",
+            label="re-calibrated",
+        )
+        ax.plot(
+            angle, 1e3 * np.linalg.norm(rest[:, :3], axis=1), ".", ms=2, color="#cf222e", label="extended"
+        )
+        ax.set_xlabel(f"tube {i + 1} angle (deg)")
+        ax.set_ylabel("residual (mm)")
+        ax.grid(alpha=0.25)
+    axes[0].legend(fontsize=8, frameon=False)
+    return to_svg(figure)
+
+
+def _envelope(t: Floats, left: Floats, rest: Floats):  # type: ignore[no-untyped-def]
+    block = np.floor(t / 0.5).astype(int)
+    groups = np.unique(block, return_inverse=True)[1]
+    panel = Panel("residual (mm)", log=True)
+    count = np.bincount(groups)
+    centre = np.bincount(groups, t) / count
+    for values, label, colour in ((left, "re-calibrated", "alone"), (rest, "extended", "fused")):
+        squares = np.bincount(groups, np.sum(values[:, :3] ** 2, axis=1)) / count
+        panel.line(centre, 1e3 * np.sqrt(squares), label, colour)
+    return figure_svg([panel])
+
+
+def _evidence(page: Page, d: Diagnosis) -> None:
+    if d.search is None:
+        return
+    page.heading("Evidence")
+    shown = d.search.explanations[:SHOWN_CAUSES]
+    clean = next(e for e in d.search.explanations if not e.members)
+    labels = [" + ".join(c.label for c in e.members) or "no cause" for e in shown]
+    values = [max(e.score - clean.score, -5.0) for e in shown]
+    figure = Figure(figsize=(10, 0.6 + 0.3 * len(shown)), layout="constrained")
+    ax = figure.subplots()
+    ax.barh(range(len(shown)), values, color="#0969da")
+    ax.set_yticks(range(len(shown)), labels, fontsize=8)
+    ax.invert_yaxis()
+    ax.set_xscale("symlog", linthresh=5)
+    ax.set_xlabel("log posterior over that of no cause")
+    ax.grid(axis="x", alpha=0.25)
+    page.figure(to_svg(figure), "Explanations that were fitted in full.")
+    rows = [
+        (label, f"{p:.3f}", f"{e.fit.chi2 / max(d.problem.size, 1):.3f}" if d.problem else "-")
+        for label, p, e in zip(labels, d.search.probabilities, shown, strict=False)
+    ]
+    page.table(rows, ("explanation", "probability", "squares over noise"))
+    linear = [(c.label, float(gain)) for gain, c in d.search.screened[:SHOWN_CAUSES] if np.isfinite(gain)]
+    page.paragraph(
+        "Log evidence that each single cause gains by the linear estimate at the re-calibrated model:"
+    )
+    page.table(linear, ("cause", "gain"))
+
+
+def _rivals(page: Page, d: Diagnosis) -> None:
+    if d.at_best is None or d.problem is None or d.search is None:
+        return
+    members = [c for e in d.search.explanations[:1] for c in e.members]
+    if not members:
+        return
+    best = d.search.explanations[0]
+    names = sorted({c.effect for c in d.at_best.signatures})
+    table = np.full((len(members), len(names)), np.nan)
+    for i, member in enumerate(members):
+        for rival in d.at_best.signatures:
+            if rival.effect != member.effect:
+                k = names.index(rival.effect)
+                value = separation(d.problem, best, member, rival, d.at_best)
+                table[i, k] = np.nanmin([table[i, k], value])
+    figure = Figure(figsize=(10, 1.8 + 0.3 * len(members)), layout="constrained")
+    ax = figure.subplots()
+    image = ax.imshow(np.log10(np.maximum(table, 0.1)), aspect="auto", cmap="viridis")
+    ax.set_xticks(range(len(names)), names, rotation=90, fontsize=7)
+    ax.set_yticks(range(len(members)), [m.label for m in members], fontsize=8)
+    figure.colorbar(image, ax=ax, label="log10 of separation")
+    page.heading("What these data cannot tell apart")
+    page.figure(
+        to_svg(figure),
+        "Separation of each cause from every rival; below 5 (0.7 on this scale) the data do not decide.",
+    )
+
+
+def _validation(page: Page, d: Diagnosis) -> None:
+    v = d.validation
+    if v is None:
+        return
+    page.heading("Bags that were not fitted")
+    figure = Figure(figsize=(10, 2.2), layout="constrained")
+    ax = figure.subplots()
+    x = np.arange(len(v.bags))
+    ax.bar(x - 0.2, [1e3 * b[1] for b in v.bags], 0.4, label="re-calibrated", color="#0969da")
+    ax.bar(x + 0.2, [1e3 * b[2] for b in v.bags], 0.4, label="extended", color="#cf222e")
+    ax.axhline(1e3 * noise_floor(d.robot), color="#bf8700", ls="--", label="noise floor")
+    ax.set_xticks(x, [b[0] for b in v.bags])
+    ax.set_ylabel("rms (mm)")
+    ax.legend(fontsize=8, frameon=False)
+    page.figure(
+        to_svg(figure), f"Gain {v.gain:.3f}, 95 % interval {v.interval[0]:.3f} to {v.interval[1]:.3f}."
+    )
+    page.table([("NIS per degree of freedom", v.nis_before, v.nis_after)], ("", "re-calibrated", "extended"))
+
+
+def _whiteness(page: Page, d: Diagnosis, clean: Fit, best: Fit) -> None:
+    assert d.problem is not None
+    page.heading("Is what is left noise?")
+    figure = Figure(figsize=(10, 3.0), layout="constrained")
+    left, right = figure.subplots(1, 2)
+    for fit, label, colour in ((clean, "re-calibrated", "#0969da"), (best, "extended", "#cf222e")):
+        sequences = by_axis(d.problem, fit.whitened)
+        lags = np.arange(1, 21)
+        values = [[float(x[k:] @ x[:-k]) / max(float(x @ x), 1e-30) for k in lags] for x in sequences]
+        left.plot(lags, np.mean(values, axis=0), ".-", color=colour, label=label)
+        rate = 1.0 / np.median(np.diff(d.recordings[0].stamps))
+        frequency, power = periodogram(sequences[1], rate)
+        right.plot(frequency, np.cumsum(power) / max(power.sum(), 1e-30), color=colour, label=label)
+    bound = 2.0 / np.sqrt(len(by_axis(d.problem, best.whitened)[0]) * 3)
+    left.axhspan(-bound, bound, color="#8c959f", alpha=0.3)
+    left.set_xlabel("lag (samples)")
+    left.set_ylabel("autocorrelation")
+    left.legend(fontsize=8, frameon=False)
+    right.plot([0, right.get_xlim()[1]], [0, 1], color="#8c959f", ls="--")
+    right.set_xlabel("frequency (Hz)")
+    right.set_ylabel("cumulative periodogram, y")
+    page.figure(
+        to_svg(figure),
+        "Autocorrelation of the whitened residual, and the cumulative periodogram of the y axis; noise follows the dashed line.",
+    )
+    rows = [
+        (label, w.power, w.p_correlation, w.p_power)
+        for label, w in (("re-calibrated", d.white_before), ("extended", d.white))
+        if w
+    ]
+    page.table(rows, ("model", "mean square", "p of Ljung-Box", "p of mean square"))
+
+
+def _values(page: Page, fit: Fit) -> None:
+    page.heading("Values")
+    causes = {q.key for q in fit.causes}
+    rows = []
+    for q, value, sigma in zip(fit.active, fit.values, fit.sigma, strict=True):
+        pull = (value - q.off) / q.tolerance if q.tolerance > 0.0 else None
+        rows.append(
+            (q.effect, q.name, float(value), float(sigma), q.off, pull, "cause" if q.key in causes else "")
+        )
+    page.table(rows, ("effect", "parameter", "value", "deviation", "robot file", "in tolerances", ""))
+    page.paragraph(
+        "Values are the fit's coordinates: a stiffness that acts as a compliance is shown as its reciprocal."
+    )
+
+
+def _scope(page: Page, content: dict[str, Any]) -> None:
+    page.heading("What was tested")
+    page.table(
+        [(name, EFFECTS[name].text if name in EFFECTS else "") for name in content["tested"]], ("cause", "")
+    )
+    if content["not_observable"]:
+        page.paragraph("These data could not see: " + ", ".join(content["not_observable"]) + ".", "note")
+    n = content["numerics"]
+    if n["time_error_m"] is not None:
+        page.paragraph(
+            f"The solver's own error on these bags: {n['time_error_m'] * 1e6:.1f} um by its time step, {n['space_error_m'] * 1e6:.2f} um by its mesh."
+        )
+    page.heading("To reproduce")
+    page.preformatted(content["reproduce"])
