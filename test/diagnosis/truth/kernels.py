@@ -24,7 +24,7 @@ from numba import njit
 S3 = math.sqrt(3.0)
 GAUSS = np.array([[0.25, 0.25 - S3 / 6.0], [0.25 + S3 / 6.0, 0.25]])  # of the unit cell
 NODES = np.array([0.5 - S3 / 6.0, 0.5 + S3 / 6.0])
-SLOW = 0.3  # rate of convergence that calls for new Jacobians
+SLOW = 0.55  # rate of convergence that calls for new Jacobians
 TIP = 18  # numbers of the tip's state: p, R (row major), v, omega in base axes
 
 
