@@ -8,6 +8,7 @@ from typing import Annotated
 
 import typer
 
+from ctr_dynamics.diagnosis.rehearsal import rehearse as rehearse_diagnosis
 from ctr_dynamics.nodes.rehearsal import rehearse
 from ctr_dynamics.parameters import Settings
 from ctr_dynamics.robot import load_robot
@@ -25,5 +26,6 @@ def warmup(
         begin = time.perf_counter()
         for policy in ("predict", "wait"):
             steps = rehearse(loaded, Settings({"robot": name, "output.policy": policy}))
+        rehearse_diagnosis(loaded)
         typer.echo(f"{name}: {loaded.n_tubes} tubes, {steps} steps, {time.perf_counter() - begin:.1f} s")
     typer.echo(f"kernels are in {os.environ['NUMBA_CACHE_DIR']}")

@@ -17,6 +17,7 @@ from .diagnose import Diagnosis, diagnose
 from .findings import findings, write
 from .planning import Plan, plan
 from .recording import read_recording
+from .rehearsal import rehearse
 
 SCENARIO = "next_experiment.yaml"
 
@@ -44,6 +45,8 @@ def run(request: Request, note: Callable[[str], None] = _quiet) -> dict[str, Any
     Raises:
         InputError: a bag that cannot be used.
     """
+    note("kernels: compiled at the first use")
+    rehearse(request.robot)
     note("reading")
     recordings = [read_recording(path, request.robot) for path in request.bags]
     others = [read_recording(path, request.robot) for path in request.validation]

@@ -168,7 +168,7 @@ def diagnose(
     clean = fit(problem, (), clean.point) or clean
     result.clean = result.best = clean
     result.tested += ["time_discretisation", "space_discretisation"]
-    pool = candidates(known, recordings[0].position.mean(axis=0))
+    pool = candidates(known, np.concatenate([r.position[np.isfinite(r.position).all(axis=1)] for r in recordings]))
     result.tested += sorted({c.effect for c in pool})
     result.white_before = whiteness(problem, clean.whitened, len(clean.active))
     found = search(problem, pool, clean, note, workers)
@@ -245,7 +245,7 @@ def _decide(
     result.sets = cause_sets(found)
     if best.members:
         note("separability")
-        result.at_best = linearise(problem, best.fit.point, found.pool, lambda text: None)
+        result.at_best = best.lin or linearise(problem, best.fit.point, found.pool, lambda text: None)
         lin = result.at_best or found.linearised
         for c in best.members:
             result.members.append(_member(problem, found, best, c, lin))

@@ -57,8 +57,19 @@ class Candidate:
         return frozenset(q.key for q in self.quantities + self.shapes)
 
 
-def candidates(known: Sequence[Quantity], anchor: Floats | None = None) -> list[Candidate]:
-    """Every candidate of the catalogue; ``anchor`` (3,) m is where springs start to pull from."""
+def candidates(known: Sequence[Quantity], positions: Floats) -> list[Candidate]:
+    """Every candidate of the catalogue.
+
+    ``positions`` (s, 3) m of the tip say where springs are anchored to begin with, and where planes of contact may lie: on each of six sides,
+    so that a tenth of the samples is behind.
+    """
+    anchor = positions.mean(axis=0)
+    planes: list[Mapping[str, float]] = []
+    for axis in range(3):
+        for sign in (1.0, -1.0):
+            normal = dict.fromkeys(("nx", "ny", "nz"), 0.0)
+            normal["n" + "xyz"[axis]] = sign
+            planes.append({**normal, "offset_m": float(np.quantile(sign * positions[:, axis], 0.1))})
     found: list[Candidate] = []
     for name, effect in EFFECTS.items():
         if effect.nuisance:
@@ -72,13 +83,13 @@ def candidates(known: Sequence[Quantity], anchor: Floats | None = None) -> list[
         else:
             groups = [([q], [s for s in shapes if _tube(s) == _tube(q)]) for q in amplitudes]
         for group, extra in groups:
-            for preset in effect.presets:
+            presets = effect.presets if name != "contact" else planes
+            for preset in presets:
                 start = {s.key: preset.get(s.parameter.name.split(".")[-1], s.off) for s in extra}
-                if anchor is not None:
-                    for i, axis in enumerate("xyz"):
-                        key = (name, f"anchor_{axis}_m")
-                        if key in start:
-                            start[key] = float(anchor[i])
+                for i, axis in enumerate("xyz"):
+                    key = (name, f"anchor_{axis}_m")
+                    if key in start:
+                        start[key] = float(anchor[i])
                 if all(math.isfinite(v) for v in start.values()):
                     found.append(Candidate(name, tuple(group), tuple(extra), tuple(start.items())))
     return found
@@ -95,6 +106,7 @@ class Explanation:
     members: tuple[Candidate, ...]
     fit: Fit
     score: float = 0.0  # log posterior, up to a constant
+    lin: Linearisation | None = None  # of everything else at its best point, where that was needed
 
     @property
     def effects(self) -> tuple[str, ...]:
@@ -140,7 +152,7 @@ def linearise(
     """Columns of nuisances and all candidates at ``point``; those without a derivative by finite probes."""
     smooth: dict[Key, Quantity] = {q.key: q for q in problem.nuisances}
     for c in pool:
-        if EFFECTS[c.effect].smooth and not c.shapes:
+        if EFFECTS[c.effect].smooth and not c.shapes and not c.quantities[0].extended:
             smooth.update({q.key: q for q in c.quantities})
     wanted = tuple(smooth.values())
     found = problem.linearise(point, wanted)
@@ -163,9 +175,12 @@ def linearise(
                 break
         else:
             merged.append((dict(start), list(members)))
+    rest = [c for c in pool if EFFECTS[c.effect].smooth and not c.shapes and c.quantities[0].extended]
+    merged = merged or [({}, [])]
+    merged[0][1].extend(rest)
     for at, members in merged:
         quantities = tuple(q for c in members for q in c.quantities)
-        here = {**point, **at}
+        here = {**at, **point}
         shaped_found = problem.linearise(here, quantities)
         if shaped_found is None:
             continue
@@ -358,48 +373,34 @@ def search(
     return Search(found, _probabilities(found, problem), base, lin, screened, pool)
 
 
-def _seconds(
-    problem: Problem,
-    pool: list[Candidate],
-    found: list[Explanation],
-    note: Callable[[str], None],
-    workers: int,
-) -> list[Explanation]:
-    """Two causes, and three where that pays: from each of the best, what it leaves is screened again."""
+def _seconds(problem: Problem, pool: list[Candidate], found: list[Explanation], note: Callable[[str], None], workers: int) -> list[Explanation]:
+    """Two causes, and three where that pays: what each of the best leaves is screened again."""
     out: list[Explanation] = []
     tried: set[frozenset[str]] = set()
     leaders = [e for e in found if e.members][:3]
-    best = leaders[0].score
-    leaders = [e for e in leaders if e.score > best - 40.0]
-    for depth in (2, 3):
+    much = _leftover(problem, leaders[0].fit) > 4.0
+    leaders = [e for e in leaders if e.score > leaders[0].score - (60.0 if much else 3.0)]
+    for _ in range(2):
         new: list[Explanation] = []
         for leader in leaders:
-            if _leftover(problem, leader.fit) < 4.0:
-                continue
             note(f"what {', '.join(leader.effects)} leaves")
-            lin = linearise(problem, leader.fit.point, pool, note)
-            if lin is None:
+            leader.lin = linearise(problem, leader.fit.point, pool, note)
+            if leader.lin is None:
                 continue
-            gains = [
-                (g, c) for g, c in screen(problem, lin, leader.members, pool) if g > SECOND_EVIDENCE - 2.0
-            ]
+            gains = [c for g, c in screen(problem, leader.lin, leader.members, pool) if g > SECOND_EVIDENCE - 2.0]
             jobs = []
-            for _, c in gains[:SECOND]:
+            for c in _distinct(gains)[:SECOND]:
                 names = frozenset(x.label for x in (*leader.members, c))
-                if names in tried:
-                    continue
-                tried.add(names)
-                jobs.append(((*leader.members, c), leader.fit.point, lin))
-            for e in _fits(problem, jobs, workers):
-                if e.fit.log_evidence > leader.fit.log_evidence + SECOND_EVIDENCE:
-                    new.append(e)
+                if names not in tried:
+                    tried.add(names)
+                    jobs.append(((*leader.members, c), leader.fit.point, leader.lin))
+            enough = leader.fit.log_evidence + SECOND_EVIDENCE
+            new += [e for e in _fits(problem, jobs, workers) if e.fit.log_evidence > enough]
         if not new:
             break
         out += new
         _score(new, pool)
-        leaders = new[:2]
-        if depth == 3 or _leftover(problem, new[0].fit) < 4.0:
-            break
+        leaders = new[: 2 if _leftover(problem, new[0].fit) > 4.0 else 1]
     return out
 
 

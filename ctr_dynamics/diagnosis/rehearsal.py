@@ -1,0 +1,35 @@
+"""A dry run of what diagnosis compiles: plain and extended simulations with their sensitivities, on a moment of rest."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ctr_dynamics.effects import quantities
+from ctr_dynamics.robot import Robot
+
+from .experiment import Experiment
+from .recording import Recording
+
+MOMENT = 0.02  # s
+
+
+def rehearse(robot: Robot) -> None:
+    """Compile everything that a diagnosis of ``robot`` needs, or load it from the cache."""
+    t = np.array([0.0, 0.5 * MOMENT, MOMENT])
+    rest = np.concatenate([robot.rest.alpha.value, robot.rest.beta.value])
+    still = Recording(
+        "rest",
+        "",
+        {},
+        np.column_stack([t, np.tile(rest, (3, 1))]),
+        np.zeros((0, 7)),
+        t,
+        np.zeros((3, 3)),
+        np.tile([1.0, 0.0, 0.0, 0.0], (3, 1)),
+        (),
+    )
+    known = {q.key: q for q in quantities(robot)}
+    wanted = [known["youngs_modulus", "tube1.scale"], known["air_drag", "linear_Ns_per_m2"]]
+    experiment = Experiment(still, robot)
+    experiment.jacobian({}, wanted)
+    experiment.predict({("air_drag", "linear_Ns_per_m2"): 0.01})
