@@ -280,14 +280,24 @@ def _decide(
 
 
 def _member(problem: Problem, found: Search, best: Explanation, c: Candidate, lin: Linearisation) -> Member:
-    """A cause with its nearest rivals: candidates that could stand in its place."""
+    """A cause with its nearest rivals: candidates that could stand in its place.
+
+    Where a rival has been fitted in its place, the difference of the costs counts; it knows what linear signatures do not.
+    """
     distances: dict[str, float] = {}
     own = {m.effect for m in best.members}
     for rival in lin.signatures:
-        if rival.effect in own:
-            continue
-        d = separation(problem, best, c, rival, lin)
-        distances[rival.effect] = min(d, distances.get(rival.effect, math.inf))
+        if rival.effect not in own:
+            d = separation(problem, best, c, rival, lin)
+            distances[rival.effect] = min(d, distances.get(rival.effect, math.inf))
+    rest = best.keys - c.keys
+    swaps: dict[str, float] = {}
+    for e in found.explanations:
+        others = [m for m in e.members if not m.keys <= rest]
+        if len(others) == 1 and e.keys - others[0].keys == rest and others[0].effect not in own:
+            d = math.sqrt(max(e.fit.cost - best.fit.cost, 0.0))
+            swaps[others[0].effect] = min(d, swaps.get(others[0].effect, math.inf))
+    distances.update(swaps)
     probability = float(
         sum(p for e, p in zip(found.explanations, found.probabilities, strict=True) if c.effect in e.effects)
     )

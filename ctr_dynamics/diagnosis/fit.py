@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import log_ndtr
 
 from ctr_dynamics.effects import EFFECTS, Quantity
 from ctr_dynamics.robot import Robot
@@ -22,7 +23,10 @@ from .recording import Recording
 
 Floats = NDArray[np.float64]
 Key = tuple[str, str]
+INSIDE = 2.9  # tolerances: an error beyond is not one of tolerance, and needs a cause
 NUMERICS_SIGMA = 0.6  # of the difference to a finer solution, which the prediction includes
+
+LOG_INSIDE = float(log_ndtr(INSIDE))
 
 
 @dataclass
@@ -32,7 +36,8 @@ class Fit:
     Attributes:
         causes: quantities beyond tolerance. active: all quantities that were free, causes included.
         values: (a,) coordinates. sigma: (a,) posterior deviations. covariance: (a, a).
-        chi2: whitened squares of the residual. log_evidence: relative to no model at all; only differences count.
+        chi2: whitened squares of the residual. cost: twice the negative log posterior density.
+        log_evidence: relative to no model at all; only differences count.
         whitened: residuals at the best point. columns: (m, a) their derivatives, in coordinates.
     """
 
@@ -44,8 +49,7 @@ class Fit:
     log_evidence: float
     whitened: Floats
     columns: Floats
-    extra: Floats
-    ok: bool = True
+    cost: float
 
     @property
     def sigma(self) -> Floats:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from ctr_dynamics.effects import EFFECTS, Quantity
 
-from .fit import Fit, Key, Problem, fit, posterior, variances
+from .fit import Fit, Key, Problem, fit, inside, posterior, variances
 
 Floats = NDArray[np.float64]
 
@@ -220,7 +220,8 @@ def screen(
     active, variance = variances(problem.nuisances, fixed)
     columns = np.hstack([_column(lin, base, q) for q in active])
     values = np.array([lin.point.get(q.key, q.off) - q.off for q in active])
-    _, _, reference = posterior(lin.residual, columns, values, variance, problem.numerics)
+    before, spread, reference = posterior(lin.residual, columns, values, variance, problem.numerics)
+    reference += inside(active, {q.key for q in fixed}, before, spread)
     scored = []
     taken = {c.effect + _tube(c.quantities[0]) for c in base}
     nuisance = {q.key: i for i, q in enumerate(active)}
@@ -237,7 +238,8 @@ def screen(
             J = np.hstack([columns, signature[:, new]])
             wide = np.append(wide, [c.quantities[i].scale ** 2 for i in new])
         start = np.append(values, np.zeros(len(new)))
-        departure, _, evidence = posterior(lin.residual, J, start, wide, problem.numerics)
+        departure, spread, evidence = posterior(lin.residual, J, start, wide, problem.numerics)
+        evidence += inside(active, {q.key for q in (*fixed, *c.quantities)}, departure, spread)
         gain = evidence - reference
         for q, value in zip(c.quantities, _own(c, nuisance, new, departure, len(variance)), strict=True):
             if math.isfinite(q.low) and q.low == q.off and value < 0.0 and len(c.quantities) == 1:

@@ -51,8 +51,10 @@ def check_extensions(given: Mapping[str, Mapping[str, Any]]) -> None:
     Raises:
         PydanticCustomError: with the name and what is known.
     """
+    from ctr_dynamics.effects import EFFECTS
+
     for name, values in given.items():
-        extension = EXTENSIONS.get(name)
+        extension = EXTENSIONS.get(name) or EFFECTS.get(name)
         if extension is None:
             near = get_close_matches(name, EXTENSIONS, 1)
             known = ", ".join(sorted(EXTENSIONS)) or "none"
@@ -60,6 +62,6 @@ def check_extensions(given: Mapping[str, Mapping[str, Any]]) -> None:
             raise problem(f"unknown extension '{name}'; {hint}")
         for parameter, value in values.items():
             if not extension.accepts(parameter):
-                known = ", ".join(extension.parameters)
+                known = ", ".join(p if isinstance(p, str) else p.name for p in extension.parameters)
                 raise problem(f"extension '{name}' has no parameter '{parameter}'; known: {known}")
             number(value)

@@ -1,0 +1,109 @@
+"""Effects hidden by a simulator of its own, sealed until the verdict is in. The large study is benchmarks/study.py; these seeds are others."""
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from joblib import Parallel, delayed
+
+ROOT = Path(__file__).resolve().parents[2]
+# (name, stratum, seed, what is hidden): one of each kind; None leaves the choice to the seed
+CASES = (
+    ("clean", "none", 91001, None),
+    ("stiffness", "single", 91002, ("youngs_modulus",)),
+    ("payload", "single", 91003, ("payload_mass",)),
+    ("latency", "single", 91004, ("tracker_latency",)),
+    ("offset", "single", 91005, ("encoder_offset",)),
+    ("pair", "pair", 91006, ("base_coulomb", "encoder_offset")),
+    ("outside", "outside", 91007, ("pulse",)),
+    ("at_rest", "not_excited", 91008, None),
+)
+
+
+def _run(folder: str, stratum: str, seed: int, effects):
+    import sys
+
+    sys.path.insert(0, str(ROOT / "test" / "diagnosis"))
+    from truth.cases import make_case
+
+    from ctr_dynamics.diagnosis.command import Request, run
+    from ctr_dynamics.robot import load_robot
+
+    case = make_case(seed, stratum, folder, effects=effects)
+    output = str(Path(folder) / "out")
+    request = Request(load_robot(case.robot), [str(case.protocol)], [str(case.sweep)], output, "command", workers=1)
+    return run(request), case.unseal()
+
+
+@pytest.fixture(scope="module")
+def outcomes(tmp_path_factory):
+    """Findings and answers of all cases, two at a time."""
+    folders = [str(tmp_path_factory.mktemp(name)) for name, *_ in CASES]
+    jobs = (delayed(_run)(folder, stratum, seed, effects) for folder, (_, stratum, seed, effects) in zip(folders, CASES, strict=True))
+    found = Parallel(2)(jobs)
+    return {name: (*pair, Path(folder) / "out") for (name, *_), pair, folder in zip(CASES, found, folders, strict=True)}
+
+
+@pytest.mark.parametrize("name", ["stiffness", "payload", "latency", "offset", "pair"])
+def test_hidden_causes_are_named_with_their_size(outcomes, name):
+    findings, answer, _ = outcomes[name]
+    truth = {h["effect"]: h["parameters"] for h in answer["hidden"]}
+    assert {c["effect"] for c in findings["causes"]} == set(truth)
+    assert findings["verdict"] == "named"
+    assert sorted(truth) in [sorted(s) for s in findings["cause_set95"]]
+    for cause in findings["causes"]:
+        for parameter, value in truth[cause["effect"]].items():
+            low, high = cause["parameters"][parameter]["ci99"]
+            width = high - low
+            assert low - 0.2 * width <= value["total"] <= high + 0.2 * width
+    assert findings["validation"]["gain"] > 0.3
+    assert findings["validation"]["ci95"][0] > 0.0
+
+
+def test_a_clean_bag_is_clean(outcomes):
+    findings, _, _ = outcomes["clean"]
+    assert findings["verdict"] == "clean"
+    assert findings["causes"] == []
+    assert findings["cause_set95"][0] == []
+
+
+def test_what_is_outside_the_catalogue_is_unknown(outcomes):
+    findings, _, _ = outcomes["outside"]
+    assert findings["verdict"] == "unknown"
+    assert findings["causes"][0]["effect"] == "unknown"
+    assert findings["causes"][0]["separation"] is None
+
+
+def test_a_robot_at_rest_cannot_be_diagnosed(outcomes):
+    findings, _, folder = outcomes["at_rest"]
+    assert findings["verdict"] == "not_excited"
+    assert findings["causes"] == []
+    assert (folder / findings["next_experiment"]["scenario_file"]).is_file()
+
+
+def test_findings_are_plain_json_without_nan_and_files_are_there(outcomes):
+    for findings, _, folder in outcomes.values():
+        stored = json.loads((folder / "findings.json").read_text(), parse_constant=lambda text: pytest.fail(text))
+        assert stored["schema"] == "ctr_dynamics/findings/1"
+        assert stored["verdict"] == findings["verdict"]
+        for key in ("extended_robot", "recalibrated_robot"):
+            assert (folder / stored[key]).is_file()
+        assert "<script src" not in (folder / "report.html").read_text()
+
+
+def test_extended_robot_predicts_better_through_the_same_door(outcomes):
+    """The robot file that diagnosis writes, used by replay without fusion."""
+    from ctr_dynamics.bagio.replay import replay
+    from ctr_dynamics.parameters import Settings
+
+    findings, _, folder = outcomes["payload"]
+    bag = folder.parent / "sweep.mcap"
+    residual = []
+    for robot in ("till2020_tissue", folder / findings["extended_robot"]):
+        settings = Settings({"output.policy": "wait", "filter.enabled": False})
+        residual.append(replay(bag, robot, settings).summary["residual_rms_m"]["predicted"])
+    assert np.isfinite(residual).all()
+    assert residual[1] < 0.8 * residual[0]
+    assert math.isclose(residual[1], findings["validation"]["rms_extended_m"], rel_tol=0.15)

@@ -1,0 +1,99 @@
+"""The pieces of a diagnosis on problems with known answers."""
+
+import math
+
+import numpy as np
+import pytest
+
+from ctr_dynamics.cli.main import spread
+from ctr_dynamics.diagnosis.checks import block_bootstrap
+from ctr_dynamics.diagnosis.experiment import at_times, play, product, rotate, to_vectors
+from ctr_dynamics.diagnosis.fit import posterior
+from ctr_dynamics.diagnosis.noise import Whitener
+from ctr_dynamics.diagnosis.search import candidates
+from ctr_dynamics.effects import EFFECTS, quantities
+from ctr_dynamics.robot import load_robot
+
+
+def test_posterior_is_bayes_rule():
+    """Against the dense formulas of a linear Gaussian model."""
+    rng = np.random.default_rng(1)
+    J, N = rng.normal(size=(40, 3)), rng.normal(size=(40, 2))
+    variance = np.array([0.5, 2.0, 0.01])
+    departure = np.array([0.3, -0.2, 0.1])
+    y = rng.normal(size=40)  # residual at the departure
+    mean, covariance, evidence = posterior(y, J, departure, variance, N)
+    data = y + J @ departure
+    noise = np.eye(40) + N @ N.T
+    precision = np.diag(1 / variance) + J.T @ np.linalg.solve(noise, J)
+    np.testing.assert_allclose(covariance, np.linalg.inv(precision), rtol=1e-9)
+    np.testing.assert_allclose(mean, np.linalg.solve(precision, J.T @ np.linalg.solve(noise, data)), rtol=1e-9)
+    total = noise + J @ np.diag(variance) @ J.T
+    expected = -0.5 * data @ np.linalg.solve(total, data) - 0.5 * np.linalg.slogdet(total)[1]
+    assert evidence == pytest.approx(expected, rel=1e-9)
+
+
+def test_whitener_gives_unit_noise():
+    robot = load_robot("till2020_tissue")
+    noise = robot.tracker.noise
+    t = np.arange(400) / 40.0
+    rng = np.random.default_rng(2)
+    drift = np.zeros((400, 3))
+    drift[0] = noise.drift.value * rng.normal(size=3)
+    keep = math.exp(-1 / (40.0 * noise.drift_time.value))
+    for k in range(1, 400):
+        drift[k] = keep * drift[k - 1] + noise.drift.value * math.sqrt(1 - keep**2) * rng.normal(size=3)
+    values = np.hstack([drift + noise.position.value * rng.normal(size=(400, 3)), noise.rotation.value * rng.normal(size=(400, 3))])
+    whiten = Whitener(robot, t, np.ones(6, bool), np.ones(400, bool))
+    white = whiten(values)
+    assert white.size == whiten.size == 2400
+    assert np.mean(white**2) == pytest.approx(1.0, abs=0.1)
+    assert abs(float(white[1:400] @ white[:399])) / 400 < 0.15
+    # derivatives go the same way as values
+    np.testing.assert_allclose(whiten(values[:, :, None])[:, 0], white)
+
+
+def test_play_follows_after_the_dead_zone():
+    x = np.concatenate([np.linspace(0, 1, 50), np.linspace(1, -1, 100)])
+    y = play(x, 0.2)
+    assert y[49] == pytest.approx(0.9)
+    assert y[55] == pytest.approx(0.9)  # still inside the dead zone of the reversal
+    assert y[-1] == pytest.approx(-0.9)
+
+
+def test_interpolation_is_exact_for_cubics_and_held_outside():
+    t = np.arange(20) * 0.003
+    values = np.stack([t**3 - t, 2 * t**2], axis=1)
+    at = np.array([0.0, 0.0041, 0.02, 0.0559])
+    np.testing.assert_allclose(at_times(values, t, at), np.stack([at**3 - at, 2 * at**2], axis=1), atol=1e-14)
+    np.testing.assert_allclose(at_times(values, t, np.array([9.0])), values[-1:], atol=1e-14)
+
+
+def test_rotations_by_rows():
+    h = np.array([[math.cos(0.2), 0.0, 0.0, math.sin(0.2)], [1.0, 0.0, 0.0, 0.0]])
+    v = np.array([[1.0, 0.0, 0.0], [0.0, 2.0, 0.0]])
+    np.testing.assert_allclose(rotate(h, v), [[math.cos(0.4), math.sin(0.4), 0.0], [0.0, 2.0, 0.0]], atol=1e-15)
+    np.testing.assert_allclose(to_vectors(product(h, h)), [[0.0, 0.0, 0.8], [0.0, 0.0, 0.0]], atol=1e-15)
+
+
+def test_bootstrap_interval_holds_the_gain():
+    rng = np.random.default_rng(3)
+    t = np.arange(400) / 40.0
+    before, after = rng.chisquare(3, 400), 0.25 * rng.chisquare(3, 400)
+    low, high = block_bootstrap(before, after, t)
+    assert low < 1 - after.sum() / before.sum() < high
+    assert 0.6 < low < high < 0.85
+
+
+def test_every_effect_of_the_catalogue_is_a_candidate():
+    robot = load_robot("till2020_tissue")
+    positions = np.random.default_rng(4).normal(size=(100, 3)) * 0.02
+    found = {c.effect for c in candidates(quantities(robot), positions)}
+    assert found == {name for name, effect in EFFECTS.items() if not effect.nuisance}
+
+
+def test_validate_takes_every_bag_up_to_the_next_option():
+    given = ["diagnose", "a", "--validate", "b", "c", "--robot", "r", "--validate", "d", "--json"]
+    assert spread(given, ("--validate",)) == [
+        "diagnose", "a", "--validate", "b", "--validate", "c", "--robot", "r", "--validate", "d", "--json",
+    ]  # fmt: skip
