@@ -19,16 +19,21 @@ from ctr_dynamics.robot import load_robot
 EDGES_MS = tuple(float(x) for x in np.round(np.geomspace(0.1, 30.0, 51), 4))
 
 
-def fused_replay(bag: Path, robot_name: str, nodes: int | None, seconds: float | None) -> dict[str, Any]:
+def fused_replay(
+    bag: Path, robot_name: str, nodes: int | None, seconds: float | None, rank: int | None = None
+) -> dict[str, Any]:
     """Replay `bag` with fusion: ratio, percentiles and histogram of the steps' times in ms, and cost in plain sweeps.
 
     Args:
         nodes: `model.nodes`; None for its default.
         seconds: how much of the bag; None for all of it.
+        rank: `filter.rank`; None for its default.
     """
     values: dict[str, Any] = {"output.policy": "wait"}
     if nodes is not None:
         values["model.nodes"] = nodes
+    if rank is not None:
+        values["filter.rank"] = rank
     settings, robot = Settings(values), load_robot(robot_name)
     opened = open_bag(bag)
     start = min(block.start_ns for file in opened.files for block in file.blocks)
@@ -48,6 +53,7 @@ def fused_replay(bag: Path, robot_name: str, nodes: int | None, seconds: float |
     return {
         "bag": bag.name,
         "nodes": model.nodes,
+        "rank": int(settings["filter.rank"]),
         "steps": steps,
         "realtime_ratio": steps * DT_NS * 1e-9 / wall,
         "tick_ms": {"p50": p50, "p99": p99, "p99.9": p999, "max": worst, "mean": float(ticks.mean())},

@@ -30,22 +30,22 @@ def text(result: Result) -> str:
     lines += [
         "",
         "release test, sdirk3 at 3 ms",
-        "nodes  sweeps/solve  sweeps/step  step (us)  plain sweeps  times real time",
+        "nodes  sweeps/solve  sweeps/step  Jacobians/step  step (us)  plain sweeps  times real time  in a compiled loop",
     ]
     lines += [
-        f"{r['nodes']:5d}  {r['sweeps_per_solve']:12.2f}  {r['sweeps_per_step']:11.2f}  {r['step_us']:9.0f}  "
-        f"{r['step_ratio_to_plain_sweep']:12.1f}  {r['realtime_ratio']:15.1f}"
+        f"{r['nodes']:5d}  {r['sweeps_per_solve']:12.2f}  {r['sweeps_per_step']:11.2f}  {r['jacobians_per_step']:14.2f}  "
+        f"{r['step_us']:9.0f}  {r['step_ratio_to_plain_sweep']:12.1f}  {r['realtime_ratio']:15.1f}  {r['compiled_realtime_ratio']:18.1f}"
         for r in result["simulate"]
     ]
     lines += [
         "",
         "replay with fusion and the model alone beside it",
-        "nodes  times real time  p50 (ms)  p99 (ms)  p99.9 (ms)  max (ms)",
+        "nodes  rank  times real time  p50 (ms)  p99 (ms)  p99.9 (ms)  max (ms)",
     ]
-    for r in result["replay"]:
+    for r in [*result["replay"], *result["rank"]]:
         tick = r["tick_ms"]
         lines.append(
-            f"{r['nodes']:5d}  {r['realtime_ratio']:15.1f}  {tick['p50']:8.2f}  {tick['p99']:8.2f}  "
+            f"{r['nodes']:5d}  {r['rank']:4d}  {r['realtime_ratio']:15.1f}  {tick['p50']:8.2f}  {tick['p99']:8.2f}  "
             f"{tick['p99.9']:10.2f}  {tick['max']:8.2f}"
         )
     error = result["time_error"]
@@ -58,6 +58,15 @@ def text(result: Result) -> str:
         f"{'  ' + r['failure'] if r['failure'] else ''}"
         for r in error["schemes"]
     ]
+    lines += ["", "real-time ratio over time step and node spacing (release test, steps from Python)"]
+    steps = sorted({r["dt_s"] for r in result["figure_13"]})
+    lines += ["spacing (mm)" + "".join(f"{1e3 * dt:9g} ms" for dt in steps)]
+    for spacing in sorted({r["spacing_m"] for r in result["figure_13"]}, reverse=True):
+        found = {r["dt_s"]: r for r in result["figure_13"] if r["spacing_m"] == spacing}
+        cells = [
+            _number(None if found[dt]["failure"] else found[dt]["realtime_ratio"], ".1f") for dt in steps
+        ]
+        lines += [f"{1e3 * spacing:12.2f}" + "".join(f"{cell:>12s}" for cell in cells)]
     space = result["figure_14"]
     lines += [
         "",
@@ -69,6 +78,19 @@ def text(result: Result) -> str:
         for r in space["rows"]
     ]
     return "\n".join(lines)
+
+
+def page(result: Result) -> str:
+    """The figures as a page of documentation, Markdown."""
+    return (
+        "# Performance\n\n"
+        "Written by `ctr-dynamics bench --page FILE`; do not edit by hand. The machine and its load are part of the figures: compare ratios to a\n"
+        "plain sweep (one pass from base to tip), which the same run has measured, rather than times. `ctr-dynamics bench --output DIR` writes the\n"
+        "same figures as JSON and as plots: real-time ratio over step and spacing (Till et al. 2020, Fig. 13), error over spacing (Fig. 14),\n"
+        "the histogram of the steps' times.\n\n"
+        "The default time scheme, `sdirk3`, is the one with the smallest error at 3 ms below.\n\n"
+        f"```text\n{text(result)}\n```\n"
+    )
 
 
 def plots(result: Result, folder: Path) -> list[Path]:

@@ -24,6 +24,8 @@ class Size:
     work_nodes: tuple[int, ...]
     replay_nodes: tuple[int | None, ...]
     replay_s: float | None
+    ranks: tuple[int, ...]
+    rank_s: float
     time_nodes: int
     time_s: float
     reference: tuple[str, float]
@@ -42,6 +44,8 @@ LONG = Size(
     work_nodes=(24, 100, 400),
     replay_nodes=(None, 100),
     replay_s=None,
+    ranks=(10, 16, 24, 40),
+    rank_s=4.0,
     time_nodes=100,
     time_s=6.0,
     reference=("bdf2", 0.00025),
@@ -59,6 +63,8 @@ QUICK = Size(
     work_nodes=(24, 100),
     replay_nodes=(None,),
     replay_s=0.6,
+    ranks=(),
+    rank_s=0.0,
     time_nodes=24,
     time_s=0.3,
     reference=("sdirk3", 0.001),
@@ -92,6 +98,8 @@ def measure(bag: Path, quick: bool, say: Callable[[str], None]) -> dict[str, Any
     result["replay"] = [
         fused_replay(bag, "till2020_tissue", nodes, size.replay_s) for nodes in size.replay_nodes
     ]
+    say("replay with fusion over the rank")
+    result["rank"] = [fused_replay(bag, "till2020_tissue", None, size.rank_s, rank) for rank in size.ranks]
     say("release test: error of the time schemes")
     result["time_error"] = time_error(test, size.time_nodes, size.time_s, size.reference, size.since)
     say("real-time ratio over time step and node spacing")

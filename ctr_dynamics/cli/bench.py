@@ -18,6 +18,9 @@ def bench(
         Path, typer.Option("--output", metavar="DIR", help="Folder for bench.json and the plots.")
     ] = Path("bench"),
     quick: Annotated[bool, typer.Option("--quick", help="Few and short measurements.")] = False,
+    page: Annotated[
+        Path | None, typer.Option("--page", metavar="FILE", help="Also write the figures as a Markdown page.")
+    ] = None,
     bag: Annotated[
         Path | None,
         typer.Option(metavar="BAG", help="Bag of till2020_tissue to replay; default: the shipped one."),
@@ -29,6 +32,7 @@ def bench(
     of a plain sweep measured in the same run as well.
     """
     # imported late: --help must not wait for the compiled model
+    from ctr_dynamics.bench.report import page as as_page
     from ctr_dynamics.bench.report import plots, text
     from ctr_dynamics.bench.suite import measure
 
@@ -39,6 +43,8 @@ def bench(
     result = measure(bag or shipped_file(f"{SHIPPED}.mcap"), quick, say)
     with atomic_file(output / "bench.json") as part:
         part.write_text(json.dumps(result, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    if page is not None:
+        page.write_text(as_page(result), encoding="utf-8")
     files = plots(result, output)
     print(text(result))
     print()

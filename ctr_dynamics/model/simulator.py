@@ -16,7 +16,7 @@ from ctr_dynamics.model.model import Model
 from ctr_dynamics.model.newton import CONVERGED, NOT_FINITE
 from ctr_dynamics.model.scheme import RATES, Y_BEFORE, Y_NOW, Scheme, make_scheme
 from ctr_dynamics.model.statics import Statics
-from ctr_dynamics.model.step import step
+from ctr_dynamics.model.step import EARLIER, RENEW, extrapolate, step
 
 OUTCOMES = {
     CONVERGED: "ok",
@@ -37,7 +37,6 @@ class Inputs:
     torque: np.ndarray = field(default_factory=lambda: np.zeros(3))
 
 
-RENEW = 2  # sweeps a stage beyond which the next step starts with a new Jacobian, which costs two
 InputsAt = Callable[[float], Inputs]
 """Inputs at a time in s. One that also has ``stages(times)``, which returns what :func:`stage_inputs` does, is asked for all stages at once."""
 
@@ -150,7 +149,7 @@ class Simulator:
             equilibrium.mesh,
             bank,
             unknowns,
-            np.stack([unknowns, unknowns]),
+            np.stack([unknowns] * EARLIER),
             np.zeros((m, m)),
             False,
             equilibrium.nodes,
@@ -170,16 +169,18 @@ class Simulator:
 
         A step that fails is tried again with a fresh Jacobian and, for one-step schemes, in up to 32 substeps. With ``record`` the result
         carries what the tangent of the step needs; with "end", of its last stage alone, and the record holds until the state is written
-        to. ``start`` (stages, 5 + N): where to look for the unknowns, in place of their straight extrapolation.
+        to. ``start`` (stages, 5 + N): where to look for the unknowns, in place of their extrapolation.
         """
         result = self._attempt(state, self.scheme, t, inputs_at, not state.usable, record, start)
         if result.ok:
             return result
         totals = [result.iterations, result.sweeps, result.jacobians]
-        quadratic = 3.0 * (state.unknowns - state.earlier[0]) + state.earlier[1]
-        retries = [(1, quadratic), (1, None)] + [
-            (2**halving, None) for halving in range(1, 6) if self.scheme.one_step
-        ]
+        line = 2.0 * state.unknowns - state.earlier[0]
+        retries = [
+            (1, line),
+            (1, line + state.unknowns - 2.0 * state.earlier[0] + state.earlier[1]),
+            (1, None),
+        ] + [(2**halving, None) for halving in range(1, 6) if self.scheme.one_step]
         for count, start in retries:
             trial = state.copy()
             if start is None:  # from where the last step ended
@@ -227,9 +228,11 @@ class Simulator:
             fresh = True
         mesh = now_mesh
         small, big = self._work(key, mesh)
-        guess = (
-            2.0 * state.unknowns - state.earlier[0] if start is None else start
-        )  # linear in time, stage by stage
+        if start is None:
+            guess = np.empty_like(state.unknowns)
+            extrapolate(state.unknowns, state.earlier, self.model.step, guess)
+        else:
+            guess = start
         before = bank[:RATES].copy() if record is True else bank[:0]
         found = np.empty_like(guess)
         outcome, iterations, sweeps, jacobians = step(
@@ -242,7 +245,7 @@ class Simulator:
             return StepResult(False, OUTCOMES[outcome], iterations, sweeps, jacobians)
         state.key, state.mesh, state.bank = key, mesh, bank
         earlier = np.empty_like(state.earlier)
-        earlier[0], earlier[1] = state.unknowns, state.earlier[0]
+        earlier[0], earlier[1:] = state.unknowns, state.earlier[:-1]
         state.earlier, state.unknowns = earlier, found
         state.nodes = small[6].reshape(-1, 16 + 3 * n).copy()
         state.inputs = last

@@ -8,6 +8,43 @@ from ctr_dynamics.model.newton import CONVERGED, solve
 from ctr_dynamics.model.scheme import RATE_NOW, RATES, Y_BEFORE, Y_NOW
 from ctr_dynamics.model.workspace import input_row
 
+RENEW = 2  # sweeps a stage beyond which the next step starts with a new Jacobian, which costs two
+
+
+EARLIER = 4  # steps whose unknowns are kept to start the next one from
+
+
+@njit(cache=True, nogil=True)
+def extrapolate(unknowns, earlier, unit, guess):
+    """Start of the next step, stage by stage, into ``guess`` (stages, m): the straight line, parabola or cubic through the last steps'
+    ``unknowns`` (stages, m) and ``earlier`` (EARLIER, stages, m), whichever would have met the last step best.
+
+    Smooth motion is followed by the cubic; noise in the actuators makes the line the better one. ``unit`` (m,) of each unknown.
+    """
+    stages, m = unknowns.shape
+    missed = np.zeros(3)
+    for j in range(stages):
+        for i in range(m):
+            y0, y1, y2, y3, y4 = (
+                unknowns[j, i],
+                earlier[0, j, i],
+                earlier[1, j, i],
+                earlier[2, j, i],
+                earlier[3, j, i],
+            )
+            missed[0] += abs(y0 - 2.0 * y1 + y2) / unit[i]
+            missed[1] += abs(y0 - 3.0 * (y1 - y2) - y3) / unit[i]
+            missed[2] += abs(y0 - 4.0 * (y1 + y3) + 6.0 * y2 + y4) / unit[i]
+    for j in range(stages):
+        for i in range(m):
+            y0, y1, y2, y3 = unknowns[j, i], earlier[0, j, i], earlier[1, j, i], earlier[2, j, i]
+            if missed[0] <= missed[1] and missed[0] <= missed[2]:
+                guess[j, i] = 2.0 * y0 - y1
+            elif missed[1] <= missed[2]:
+                guess[j, i] = 3.0 * (y0 - y1) + y2
+            else:
+                guess[j, i] = 4.0 * (y0 + y2) - 6.0 * y1 - y3
+
 
 @njit(cache=True, nogil=True)
 def history(weights, bank, hist, histb):

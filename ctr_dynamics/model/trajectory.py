@@ -20,7 +20,7 @@ from ctr_dynamics.model.model import Model
 from ctr_dynamics.model.newton import CONVERGED
 from ctr_dynamics.model.scheme import RATES, Scheme
 from ctr_dynamics.model.simulator import Inputs, Record, Simulator, State, remap_fields
-from ctr_dynamics.model.step import step
+from ctr_dynamics.model.step import EARLIER, RENEW, extrapolate, step
 from ctr_dynamics.model.tangent import linearise, step_tangent
 
 Floats = NDArray[np.float64]
@@ -60,16 +60,15 @@ def _advance(tubes, lane, lanes, mesh, c0, weights, par, inputs, bank, unknowns,
     guess, found = np.empty_like(unknowns), np.empty_like(unknowns)
     total = 0
     for k in range(len(inputs)):
-        for i in range(unknowns.shape[0]):
-            for j in range(unknowns.shape[1]):
-                guess[i, j] = 2.0 * unknowns[i, j] - earlier[0, i, j]
+        extrapolate(unknowns, earlier, perturb, guess)
         outcome, _, sweeps, _ = step(tubes, lane, lanes, mesh, c0, weights, par, inputs[k], bank, guess, found, inverse, fresh, small, big,
                                      scale, perturb, tolerance, limit)  # fmt: skip
         total += sweeps
         if outcome != CONVERGED:
             return k, total, outcome
-        fresh = False
-        earlier[1] = earlier[0]
+        fresh = sweeps > RENEW * len(c0)
+        for i in range(EARLIER - 1, 0, -1):
+            earlier[i] = earlier[i - 1]
         earlier[0] = unknowns
         unknowns[:] = found
         for i in range(tips.shape[1]):
@@ -88,17 +87,16 @@ def _advance_tangent(tubes, lane, lanes, wide, mesh, c0, weights, par, inputs, b
     stages = len(c0)
     total = 0
     for k in range(len(inputs)):
-        for i in range(unknowns.shape[0]):
-            for j in range(unknowns.shape[1]):
-                guess[i, j] = 2.0 * unknowns[i, j] - earlier[0, i, j]
+        extrapolate(unknowns, earlier, perturb, guess)
         before[:] = bank[:RATES]
         outcome, _, sweeps, _ = step(tubes, lane, lanes, mesh, c0, weights, par, inputs[k], bank, guess, found, inverse, fresh, small, big,
                                      scale, perturb, tolerance, limit)  # fmt: skip
         total += sweeps
         if outcome != CONVERGED:
             return k, total, outcome
-        fresh = False
-        earlier[1] = earlier[0]
+        fresh = sweeps > RENEW * len(c0)
+        for i in range(EARLIER - 1, 0, -1):
+            earlier[i] = earlier[i - 1]
         earlier[0] = unknowns
         unknowns[:] = found
         for i in range(tips.shape[1]):

@@ -21,10 +21,10 @@ def numbers(item):
 
 
 def test_quick_bench_writes_figures_and_plots(tmp_path, capsys):
-    assert main(["bench", "--quick", "--output", str(tmp_path)]) == 0
+    assert main(["bench", "--quick", "--output", str(tmp_path), "--page", str(tmp_path / "page.md")]) == 0
     result = json.loads((tmp_path / "bench.json").read_text())
     assert set(result) == {
-        "quick", "machine", "sweeps", "simulate", "replay", "time_error", "figure_13", "figure_14",
+        "quick", "machine", "sweeps", "simulate", "replay", "rank", "time_error", "figure_13", "figure_14",
     }  # fmt: skip
     assert result["machine"]["cores"] >= 1
     assert {"numpy", "numba", "ctr_dynamics", "python"} <= set(result["machine"]["versions"])
@@ -55,7 +55,15 @@ def test_quick_bench_writes_figures_and_plots(tmp_path, capsys):
     assert all(ratio > 0 and math.isfinite(ratio) for ratio in ratios)
     assert all(math.isfinite(x) for x in numbers(result))
 
-    # what does not depend on the machine
+    # what does not depend on the machine, or only as ratios within the run do
+    for row in result["simulate"]:
+        assert row["sweeps_per_step"] + 2 * row["jacobians_per_step"] <= 12
+        assert row["sweeps_per_solve"] <= 4
+        assert (
+            row["step_ratio_to_plain_sweep"] < 60
+        )  # three times what it is; a quarter of it would be lost to Python
+    lanes = {(r["nodes"], r["lanes"]): r["lane_ratio_to_plain_sweep"] for r in result["sweeps"]}
+    assert lanes[100, 8] < 0.6  # of a plain sweep a lane: lanes vectorise
     error = {r["scheme"]: r["error_m"] for r in result["time_error"]["schemes"]}
     assert error["sdirk3"] < error["sdirk2"] < error["bdf2"] < error["backward_euler"]
     space = [r["error_m"] for r in result["figure_14"]["rows"]]
@@ -63,6 +71,7 @@ def test_quick_bench_writes_figures_and_plots(tmp_path, capsys):
 
     for name in ("sweeps", "ticks", "figure_13", "figure_14", "time_error"):
         assert (tmp_path / f"{name}.png").read_bytes().startswith(b"\x89PNG")
+    assert (tmp_path / "page.md").read_text().startswith("# Performance")
     shown = capsys.readouterr().out
     assert "sweeps/step" in shown
     assert str(tmp_path / "bench.json") in shown
