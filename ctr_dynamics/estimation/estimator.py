@@ -467,8 +467,8 @@ class Estimator:
         self._failures = 0
         return self._output(k, result)
 
-    def _step(self, k: int) -> StepResult:
-        """Both runs from step k - 1 to k, and every sample that has become due."""
+    def _step(self, k: int, track: Kept | None = None) -> StepResult:
+        """Both runs from step k - 1 to k, and every sample that has become due; with ``track`` the covariance is taken from there."""
         assert self._fused is not None and self._alone is not None
         before, t = (k - 1) * DT_NS * 1e-9, k * DT_NS * 1e-9
         self._known.clear()
@@ -478,7 +478,7 @@ class Estimator:
             - 3.0 * (a.earlier[0] - f.earlier[0])
             + (a.earlier[1] - f.earlier[1])
         )
-        result = self.simulator.step(f, before, self._inputs(True), record="end")
+        result = self.simulator.step(f, before, self._inputs(True), record=False if track else "end")
         # the actuators' noise moves both runs alike: what lies between their unknowns is smooth, so a parabola meets it
         start = f.unknowns + apart if result.ok else None
         alone = self.reference.step(a, before, self._inputs(False), start=start)
@@ -490,11 +490,14 @@ class Estimator:
             return result
         if result.substeps > 1:
             self.health.substeps += 1
-        if not self.fusion.predict(self._fused, result, t):
+        if track is not None:
+            self.fusion.follow(track.fusion, self._fused)
+        elif not self.fusion.predict(self._fused, result, t):
             self.health.note(
                 "tracker", "tangent", "the step could not be linearised; the covariance was held"
             )
-        self._fuse(k, t)
+        if track is None:
+            self._fuse(k, t)
         self._keep(k)
         return result
 
@@ -596,15 +599,19 @@ class Estimator:
         assert from_ns is not None and self.t0_ns is not None
         reached = self.k
         usable = [kept for kept in self._kept if self.t0_ns + kept.k * DT_NS <= from_ns]
+        tracks: dict[int, Kept] = {}
         if not usable and self._kept and self._kept[0].k == 0:
             if self._start(0):
                 return
             k = 0
         elif self._kept:
             kept = usable[-1] if usable else self._kept[0]
-            while self._kept and self._kept[-1].k > kept.k:
-                self._kept.pop()
             k = kept.k
+            while self._kept and self._kept[-1].k > k:
+                track = self._kept.pop()
+                tracks[track.k] = track
+            changed = self._first_fusion(k)
+            tracks = {again: track for again, track in tracks.items() if again < changed}
             self._fused, self._alone = kept.fused.copy(), kept.alone.copy()
             self.fusion.restore(kept.fusion)
             self._alone_tips.restore(kept.alone_tips)
@@ -617,13 +624,28 @@ class Estimator:
         counters = self._frozen()
         for again in range(k + 1, reached + 1):
             self.health.rolled_back += 1
-            result = self._step(again)
+            result = self._step(again, tracks.get(again))
             if not result.ok:
+                tracks.clear()
                 self.health.failed(result.reason)
                 if self._alone_tips.last.stamp < again * DT_NS * 1e-9 - 1e-9:  # the model alone failed too
                     self._fused = None
                     break
         self._thaw(counters, before[0], k)
+
+    def _first_fusion(self, k: int) -> float:
+        """The first step after ``k`` at which a sample has been fused or now will be; up to there the covariance knows no other course."""
+        assert self.t0_ns is not None
+        delay_ns = self.tracker.delay * 1e9
+        first = math.inf
+        for sample in self._samples:
+            if sample.fused_k is None:
+                first = min(
+                    first, max(k + 1, math.ceil((sample.stamp_ns - self.t0_ns - delay_ns) / DT_NS - 1e-3))
+                )
+            elif sample.fused_k > k:
+                first = min(first, sample.fused_k)
+        return first
 
     def _frozen(self) -> tuple:
         h = self.health

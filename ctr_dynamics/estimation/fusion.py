@@ -354,3 +354,10 @@ class Fusion:
         self.columns.restore(columns)
         self.tips.restore(tips)
         self._apply_theta()
+
+    def follow(self, snapshot: tuple, state: State) -> None:
+        """After a step that was taken again with slightly other inputs: the covariance as it was after that step in ``snapshot``, around the
+        tips of the steps taken now. Good while no reading has been fused since the first of them."""
+        means = self.tips.means
+        self.restore(snapshot)
+        self.tips.replace_means(means, state.nodes[-1], float(state.inputs.beta_rate[0]))

@@ -119,6 +119,17 @@ class TipWindow:
         new_v = scalar * v + w * half + np.cross(half, v)
         self.means[:, 3:4], self.means[:, 4:7] = new_w, new_v
 
+    def replace_means(self, means: Floats, node: Floats, insertion_rate: float) -> None:
+        """Put ``means`` (size, 13) in place of the kept tips, and the last node's state (S,) in that of the newest; columns stay."""
+        self.means = means
+        tip_rows(
+            node,
+            np.zeros((len(node), 1)),
+            insertion_rate,
+            means[(self.count - 1) % self.size],
+            np.empty((12, 1)),
+        )
+
     def snapshot(self) -> tuple:
         """What :meth:`restore` needs."""
         return self.count, self.stamps.copy(), self.means.copy(), self.columns.copy()
