@@ -1,0 +1,410 @@
+"""The estimator live under faults: what it does meanwhile, how soon it is back, and what is lost.
+
+    python benchmarks/fault_study.py --output faults.json [--only NAME ...] [--table]
+
+Each fault changes the messages of the shipped release bag between 2 s and 3 s (or all of them, or the machine) and plays them over
+DDS to a fresh estimator node that records. Looked at are the node's outputs and its recording: numbers that are not finite, stamps
+that repeat or go back, time without valid output, time from the end of the fault to the next valid output, tip error against the
+truth in the last second, and what of the recording is readable. A last case runs the estimator for a long simulated time without
+ROS. Exit code 1 when a promise was broken: the node must live, publish no NaN and no stamp twice, and be valid again after every
+fault.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import dataclasses
+import json
+import math
+import os
+import resource
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ctr_dynamics.bagio.reader import RawMessage, open_bag
+from ctr_dynamics.cli.demo import shipped_file
+from ctr_dynamics.messages import cdr, topics
+from ctr_dynamics.messages.encode import encode_joint_state, encode_pose_stamped
+from ctr_dynamics.nodes import live_report, qos
+from ctr_dynamics.nodes.listener import Listener
+from ctr_dynamics.nodes.naming import message_class
+from ctr_dynamics.nodes.playback import load, pace, shifted
+from ctr_dynamics.nodes.processes import ESTIMATOR, NodeProcess, free_domain
+
+SECONDS = 5.0
+BEGIN_S, END_S = 2.0, 3.0
+PATIENCE_S = 900.0
+Messages = list[RawMessage]
+Change = Callable[[RawMessage], list[RawMessage]]
+
+
+def during(
+    topic: str | None, change: Change, begin_s: float = BEGIN_S, end_s: float = END_S
+) -> Callable[[Messages], Messages]:
+    """A fault that changes the messages of `topic` (None: of all) in that time."""
+
+    def apply(messages: Messages) -> Messages:
+        first = messages[0].log_ns
+        result: Messages = []
+        for m in messages:
+            hit = begin_s <= (m.log_ns - first) * 1e-9 < end_s and topic in (None, m.topic)
+            result += change(m) if hit else [m]
+        return sorted(result, key=lambda m: m.log_ns)
+
+    return apply
+
+
+def pose(edit: Callable[[cdr.PoseIn], cdr.PoseIn]) -> Change:
+    """Change what a pose holds."""
+
+    def change(m: RawMessage) -> list[RawMessage]:
+        p = edit(cdr.decode_pose_stamped(m.data))
+        return [m._replace(data=encode_pose_stamped(p.stamp_ns, p.frame_id, p.position, p.quaternion_xyzw))]
+
+    return change
+
+
+def joints(edit: Callable[[cdr.JointStateIn], cdr.JointStateIn]) -> Change:
+    """Change what a joint state holds."""
+
+    def change(m: RawMessage) -> list[RawMessage]:
+        j = edit(cdr.decode_joint_state(m.data))
+        return [m._replace(data=encode_joint_state(j.stamp_ns, j.names, j.positions))]
+
+    return change
+
+
+def stamps(shift_s: float) -> Change:
+    return lambda m: [m._replace(data=shifted(m.data, round(shift_s * 1e9)))]
+
+
+def third(m: RawMessage) -> bool:
+    return (m.log_ns // 25_000_000) % 3 == 0
+
+
+def tenfold(messages: Messages) -> Messages:
+    """Ten messages for each, linear in between: joints at 1 kHz, tracker at 400 Hz."""
+    result: Messages = []
+    last: dict[str, RawMessage] = {}
+    decoders = {topics.JOINT_STATES: cdr.decode_joint_state, topics.TRACKER_TIP: cdr.decode_pose_stamped}
+    for m in messages:
+        before = last.get(m.topic)
+        last[m.topic] = m
+        if before is None or m.topic not in decoders:
+            result.append(m)
+            continue
+        a, b = decoders[m.topic](before.data), decoders[m.topic](m.data)
+        for k in range(1, 11):
+            share = k / 10
+            stamp = a.stamp_ns + round(share * (b.stamp_ns - a.stamp_ns))
+            log = before.log_ns + round(share * (m.log_ns - before.log_ns))
+
+            def mix(x: Any, y: Any, share: float = share) -> list[float]:
+                return [(1 - share) * u + share * v for u, v in zip(x, y, strict=True)]
+
+            if isinstance(a, cdr.JointStateIn) and isinstance(b, cdr.JointStateIn):
+                data = encode_joint_state(stamp, a.names, mix(a.positions, b.positions))
+            elif isinstance(a, cdr.PoseIn) and isinstance(b, cdr.PoseIn):
+                q = np.array(mix(a.quaternion_xyzw, b.quaternion_xyzw))
+                data = encode_pose_stamped(
+                    stamp, a.frame_id, mix(a.position, b.position), (q / np.linalg.norm(q)).tolist()
+                )
+            result.append(RawMessage(m.topic, log, data))
+    return sorted(result, key=lambda m: m.log_ns)
+
+
+def late(m: RawMessage) -> list[RawMessage]:
+    """Every other pose 150 ms late, so that the order is broken."""
+    return [m._replace(log_ns=m.log_ns + (150_000_000 if (m.log_ns // 25_000_000) % 2 else 0))]
+
+
+NAN = float("nan")
+J, T = topics.JOINT_STATES, topics.TRACKER_TIP
+FAULTS: dict[str, Callable[[Messages], Messages]] = {
+    "none": lambda messages: messages,
+    "tracker silent for 1 s": during(T, lambda m: []),
+    "joints silent for 1 s": during(J, lambda m: []),
+    "everything silent for 1 s": during(None, lambda m: []),
+    "tracker holds NaN": during(T, pose(lambda p: p._replace(position=(NAN, 0.0, NAN)))),
+    "tracker in another frame": during(T, pose(lambda p: p._replace(frame_id="camera"))),
+    "tracker in millimetres": during(
+        T, pose(lambda p: p._replace(position=tuple(1e3 * x for x in p.position)))
+    ),
+    "tracker quaternion zero": during(T, pose(lambda p: p._replace(quaternion_xyzw=(0.0, 0.0, 0.0, 0.0)))),
+    "tracker outliers of 100 mm, one in three": during(
+        T,
+        lambda m: (
+            pose(lambda p: p._replace(position=(p.position[0] + 0.1, *p.position[1:])))(m)
+            if third(m)
+            else [m]
+        ),
+    ),
+    "tracker 150 ms late, out of order": during(T, late),
+    "joints hold NaN": during(J, joints(lambda j: j._replace(positions=(NAN,) * len(j.positions)))),
+    "a joint is missing": during(
+        J, joints(lambda j: j._replace(names=j.names[1:], positions=j.positions[1:]))
+    ),
+    "joints in degrees and millimetres": during(
+        J, joints(lambda j: j._replace(positions=tuple(57.3 * x for x in j.positions)))
+    ),
+    "messages cut in half": during(None, lambda m: [m._replace(data=m.data[: len(m.data) // 2])]),
+    "every message three times": during(None, lambda m: [m, m, m]),
+    "clock jumps 1 h ahead and back": during(None, stamps(3600.0)),
+    "clock jumps 0.5 s back and forth": during(None, stamps(-0.5)),
+    "clock jumps 10 s back for good": during(None, stamps(-10.0), BEGIN_S, math.inf),
+    "10 times the message rate": tenfold,
+    "CPU load of twice the cores": lambda messages: messages,
+    "disk full": lambda messages: messages,
+    "kill -9 while recording": lambda messages: messages,
+}
+WHOLE_RUN = {
+    "none",
+    "10 times the message rate",
+    "CPU load of twice the cores",
+    "disk full",
+    "kill -9 while recording",
+}
+
+
+@dataclasses.dataclass
+class Result:
+    """What one fault did. Times in s, errors in m; None where it has no meaning."""
+
+    fault: str
+    steps: int
+    invalid_s: float
+    back_after_s: float | None
+    tip_rms_m: float | None
+    not_finite: int
+    repeated_stamps: int
+    exit_code: int
+    recorded: int | None = None
+    lost_s: float | None = None
+    broken: list[str] = dataclasses.field(default_factory=list)
+
+
+@contextlib.contextmanager
+def busy(count: int) -> Iterator[None]:
+    """Processes that take all the time they get."""
+    spinning = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(count)]
+    try:
+        yield
+    finally:
+        for process in spinning:
+            process.kill()
+            process.wait()
+
+
+def play(listener: Listener, messages: Messages, stop: threading.Event) -> int:
+    """Publish in real time; returns how far the stamps were moved, ns."""
+    profile = qos.profile("reliable", 100)
+    node = listener.node
+    outputs = {
+        topic.name: node.create_publisher(message_class(topic.ros_type), topic.name, profile)
+        for topic in topics.INPUTS
+    }
+    listener.wait_for(lambda: all(p.get_subscription_count() for p in outputs.values()), 60.0)
+    start = time.time_ns() + 200_000_000
+    shift = start - messages[0].log_ns
+    for index, _ in pace([m.log_ns for m in messages], start, stop.is_set, time.time_ns):
+        m = messages[index]
+        data = shifted(m.data, shift) if len(m.data) >= 12 else m.data
+        outputs[m.topic].publish(data)
+    time.sleep(0.3)
+    for publisher in outputs.values():
+        node.destroy_publisher(publisher)
+    return shift
+
+
+def run(fault: str, folder: Path) -> Result:
+    """One fault on a fresh node."""
+    bag = shipped_file("clean_release.mcap")
+    messages = FAULTS[fault](load(bag, 0.0, SECONDS))
+    recording = folder / "recorded.mcap"
+    domain = free_domain()
+    stop = threading.Event()
+    load_of = busy(2 * (os.cpu_count() or 2)) if fault.startswith("CPU") else contextlib.nullcontext()
+    names = [topics.TIP_POSE, topics.VALID, topics.BACKBONE_STATE]
+    with (
+        NodeProcess(ESTIMATOR, {"record.path": str(recording)}, domain, folder / "estimator.log") as node,
+        Listener(domain, names, depth=5000) as listener,
+    ):
+        ready = listener.wait_for(lambda: listener.matched() or node.code is not None, PATIENCE_S)
+        if not ready or node.code is not None:
+            raise RuntimeError(node.output())
+        if fault == "disk full":
+            resource.prlimit(node.pid, resource.RLIMIT_FSIZE, (300_000, 300_000))
+        if fault.startswith("kill"):
+            threading.Timer(3.0, lambda: node.send(signal.SIGKILL)).start()
+        with load_of:
+            shift = play(listener, messages, stop)
+        killed_ns = time.time_ns()
+        code = node.stop() if node.code is None else node.code
+    return judge(fault, listener, messages, shift, code, recording, killed_ns)
+
+
+def judge(
+    fault: str, listener: Listener, messages: Messages, shift: int, code: int, recording: Path, end_ns: int
+) -> Result:
+    """Figures and broken promises."""
+    poses = listener.heard[topics.TIP_POSE]
+    valid = [(m.arrival_ns, bool(m.data[4])) for m in listener.heard[topics.VALID]]
+    marks = [cdr.decode_stamp(m.data) for m in poses]
+    clouds = [cdr.decode_point_cloud(m.data).rows for m in listener.heard[topics.BACKBONE_STATE]]
+    finite = [np.isfinite(cdr.decode_numbers(m.data, 43)[2]).all() for m in poses] + [
+        np.isfinite(c).all() for c in clouds
+    ]
+    start_ns = messages[0].log_ns + shift
+    arrivals = np.array([m.arrival_ns for m in poses])
+    gaps = np.diff(
+        np.concatenate([arrivals, [min(end_ns, start_ns + round(SECONDS * 1e9))]])
+        if len(arrivals)
+        else np.zeros(1)
+    )
+    fault_end = start_ns + round(END_S * 1e9)
+    after = arrivals[arrivals >= fault_end] if len(arrivals) else arrivals
+    result = Result(
+        fault,
+        steps=len(valid),
+        invalid_s=round(float(gaps[gaps > 20_000_000].sum()) * 1e-9, 3),
+        back_after_s=None
+        if fault in WHOLE_RUN or not len(after)
+        else round(float(after[0] - fault_end) * 1e-9, 3),
+        tip_rms_m=error(poses, start_ns, fault),
+        not_finite=sum(not ok for ok in finite),
+        repeated_stamps=int(np.sum(np.diff(marks) <= 0))
+        if fault != "clock jumps 10 s back for good"
+        else len(marks) - len(set(marks)),
+        exit_code=code,
+    )
+    if recording.exists():
+        recorded = list(open_bag(recording).messages({topics.TIP_POSE}))
+        result.recorded = len(recorded)
+        if fault.startswith("kill") and marks and recorded:
+            result.lost_s = round((marks[-1] - recorded[-1].log_ns) * 1e-9, 3)
+    killed = fault.startswith("kill")
+    if code != (-signal.SIGKILL if killed else 0):
+        result.broken.append(f"exit code {code}")
+    if result.not_finite:
+        result.broken.append("numbers that are not finite")
+    if result.repeated_stamps:
+        result.broken.append("stamps repeated")
+    if not len(poses) or (fault not in WHOLE_RUN and result.back_after_s is None):
+        result.broken.append("not valid again")
+    if killed and (result.lost_s is None or result.lost_s > 1.0):
+        result.broken.append("more than 1 s of the recording lost")
+    return result
+
+
+def error(poses: list[Any], start_ns: int, fault: str) -> float | None:
+    """Tip error (rms, 3-D, m) against the truth in the last second."""
+    if "for good" in fault or fault.startswith("kill"):
+        return None
+    fused = live_report.trace_of(poses, start_ns)
+    best = math.inf
+    for truth in live_report.truth_of(shipped_file("clean_release.npz")):
+        inside = (fused.t > SECONDS - 1.0) & (fused.t < SECONDS - 0.05)
+        if inside.any():
+            distance = np.linalg.norm(fused.p[inside] - truth.at(fused.t[inside]), axis=1)
+            best = min(best, float(np.sqrt(np.mean(distance**2))))
+    return best if math.isfinite(best) else None
+
+
+def long_run(hours: float) -> dict[str, Any]:
+    """The estimator alone on the bag's last second again and again, stamps running on: memory, failures, drift of the step's time."""
+    from ctr_dynamics.estimation.estimator import Estimator
+    from ctr_dynamics.parameters import Settings
+    from ctr_dynamics.robot import load_robot
+
+    inputs = [
+        item
+        for item in open_bag(shipped_file("clean_release.mcap")).inputs()
+        if item.topic != topics.TIP_LOAD
+    ]
+    first = inputs[0].log_ns
+    part = [item for item in inputs if 4_000_000_000 <= item.log_ns - first < 5_000_000_000]
+    estimator = Estimator(load_robot("till2020_tissue"), Settings({"output.policy": "wait"}))
+    rounds = round(3600 * hours)
+    invalid = steps = 0
+    memory, spent = [], []
+    for k in range(rounds):
+        begin = time.perf_counter()
+        for item in part:
+            m, stamp = item.message, item.message.stamp_ns + k * 1_000_000_000
+            if isinstance(m, cdr.JointStateIn):
+                estimator.add_joint_state(stamp, m.names, m.positions)
+            elif isinstance(m, cdr.PoseIn):
+                estimator.add_tracker_pose(stamp, m.position, m.quaternion_xyzw, m.frame_id)
+            for out in estimator.advance(stamp):
+                steps += 1
+                invalid += not out.valid
+        spent.append(time.perf_counter() - begin)
+        memory.append(int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize())
+    tenth = max(1, rounds // 10)
+    return {
+        "hours": hours,
+        "steps": steps,
+        "invalid": invalid,
+        "memory_after_tenth_MB": round(memory[tenth - 1] / 1e6, 1),
+        "memory_at_end_MB": round(memory[-1] / 1e6, 1),
+        "second_median_s": round(float(np.median(spent)), 4),
+        "second_median_last_tenth_s": round(float(np.median(spent[-tenth:])), 4),
+    }
+
+
+def table(results: list[dict[str, Any]]) -> str:
+    """Markdown table of the faults."""
+    lines = [
+        "| fault | steps | without valid output, s | valid again after, s | tip error at the end, mm | kept of the recording |",
+        "|---|---|---|---|---|---|",
+    ]
+    for r in results:
+        tip = "-" if r["tip_rms_m"] is None else f"{1e3 * r['tip_rms_m']:.2f}"
+        back = "-" if r["back_after_s"] is None else f"{max(r['back_after_s'], 0):.3f}"
+        kept = (
+            "all"
+            if r["recorded"] is not None and r["lost_s"] is None
+            else f"all but the last {r['lost_s']} s"
+        )
+        if r["fault"] == "disk full":
+            kept = f"{r['recorded']} poses, to the limit"
+        lines.append(f"| {r['fault']} | {r['steps']} | {r['invalid_s']:.2f} | {back} | {tip} | {kept} |")
+    return "\n".join(lines)
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n", maxsplit=1)[0])
+    parser.add_argument("--only", nargs="+", choices=FAULTS, help="these faults alone")
+    parser.add_argument("--output", type=Path, help="JSON file for the figures")
+    parser.add_argument("--table", action="store_true", help="print the Markdown table")
+    parser.add_argument("--hours", type=float, default=3.0, help="simulated time of the long run; 0: none")
+    options = parser.parse_args()
+    os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    results: list[dict[str, Any]] = []
+    for fault in options.only or FAULTS:
+        with tempfile.TemporaryDirectory() as name:
+            result = run(fault, Path(name))
+        print(json.dumps(dataclasses.asdict(result)), file=sys.stderr, flush=True)
+        results.append(dataclasses.asdict(result))
+    figures: dict[str, Any] = {"faults": results}
+    if options.hours > 0:
+        figures["long"] = long_run(options.hours)
+    text = table(results) if options.table else json.dumps(figures, indent=1)
+    print(text)
+    if options.output:
+        options.output.write_text(json.dumps(figures, indent=1), encoding="utf-8")
+    return 1 if any(r["broken"] for r in results) or figures.get("long", {}).get("invalid") else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
