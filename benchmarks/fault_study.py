@@ -183,6 +183,7 @@ class Result:
     fault: str
     steps: int
     invalid_s: float
+    longest_wait_s: float
     back_after_s: float | None
     tip_rms_m: float | None
     not_finite: int
@@ -266,17 +267,16 @@ def judge(
     ]
     start_ns = messages[0].log_ns + shift
     arrivals = np.array([m.arrival_ns for m in poses])
-    gaps = np.diff(
-        np.concatenate([arrivals, [min(end_ns, start_ns + round(SECONDS * 1e9))]])
-        if len(arrivals)
-        else np.zeros(1)
-    )
+    stop_ns = min(end_ns, start_ns + round(SECONDS * 1e9))
+    within = [ok for arrival, ok in valid if arrival <= stop_ns]
+    waits = np.diff([arrival for arrival, _ in valid if arrival <= stop_ns])
     fault_end = start_ns + round(END_S * 1e9)
     after = arrivals[arrivals >= fault_end] if len(arrivals) else arrivals
     result = Result(
         fault,
-        steps=len(valid),
-        invalid_s=round(float(gaps[gaps > 20_000_000].sum()) * 1e-9, 3),
+        steps=len(within),
+        invalid_s=round(3e-3 * sum(not ok for ok in within), 3),
+        longest_wait_s=round(float(waits.max()) * 1e-9, 3) if len(waits) else math.inf,
         back_after_s=None
         if fault in WHOLE_RUN or not len(after)
         else round(float(after[0] - fault_end) * 1e-9, 3),
@@ -365,8 +365,8 @@ def long_run(hours: float) -> dict[str, Any]:
 def table(results: list[dict[str, Any]]) -> str:
     """Markdown table of the faults."""
     lines = [
-        "| fault | steps | without valid output, s | valid again after, s | tip error at the end, mm | kept of the recording |",
-        "|---|---|---|---|---|---|",
+        "| fault | steps | invalid, s | longest wait for a step, s | valid again after, s | tip error at the end, mm | kept of the recording |",
+        "|---|---|---|---|---|---|---|",
     ]
     for r in results:
         tip = "-" if r["tip_rms_m"] is None else f"{1e3 * r['tip_rms_m']:.2f}"
@@ -378,7 +378,9 @@ def table(results: list[dict[str, Any]]) -> str:
         )
         if r["fault"] == "disk full":
             kept = f"{r['recorded']} poses, to the limit"
-        lines.append(f"| {r['fault']} | {r['steps']} | {r['invalid_s']:.2f} | {back} | {tip} | {kept} |")
+        lines.append(
+            f"| {r['fault']} | {r['steps']} | {r['invalid_s']:.2f} | {r['longest_wait_s']:.2f} | {back} | {tip} | {kept} |"
+        )
     return "\n".join(lines)
 
 
