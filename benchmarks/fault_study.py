@@ -30,6 +30,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from builtin_interfaces.msg import Time
+from rclpy.serialization import serialize_message
+from rosgraph_msgs.msg import Clock
 
 from ctr_dynamics.bagio.reader import RawMessage, open_bag
 from ctr_dynamics.cli.demo import shipped_file
@@ -206,38 +209,70 @@ def busy(count: int) -> Iterator[None]:
             process.wait()
 
 
-def play(listener: Listener, messages: Messages, stop: threading.Event) -> int:
-    """Publish in real time; returns how far the stamps were moved, ns."""
+@dataclasses.dataclass(frozen=True)
+class Played:
+    """When and how fast messages were played: `start_ns` of the wall clock is the first log time, `shift_ns` went onto the stamps."""
+
+    start_ns: int
+    shift_ns: int
+    speed: float
+
+    def robot_s(self, arrival_ns: int) -> float:
+        """Time since the first message on the robot's clock, s."""
+        return (arrival_ns - self.start_ns) * 1e-9 * self.speed
+
+
+def play(listener: Listener, messages: Messages, speed: float) -> Played:
+    """Publish at `speed` times real time; below 1 with the recording's own clock on /clock."""
     profile = qos.profile("reliable", 100)
     node = listener.node
     outputs = {
         topic.name: node.create_publisher(message_class(topic.ros_type), topic.name, profile)
         for topic in topics.INPUTS
     }
+    clock = node.create_publisher(Clock, "/clock", qos.profile("reliable", 10))
     listener.wait_for(lambda: all(p.get_subscription_count() for p in outputs.values()), 60.0)
+    first = messages[0].log_ns
+    items = list(messages)
+    if speed < 1.0:
+        listener.wait_for(lambda: clock.get_subscription_count() > 0, 60.0)
+        end = messages[-1].log_ns + 200_000_000
+        items += [
+            RawMessage("", t, serialize_message(Clock(clock=stamp_of(t))))
+            for t in range(first, end, 3_000_000)
+        ]
+        items.sort(key=lambda m: (m.log_ns, m.topic))
     start = time.time_ns() + 200_000_000
-    shift = start - messages[0].log_ns
-    for index, _ in pace([m.log_ns for m in messages], start, stop.is_set, time.time_ns):
-        m = messages[index]
-        data = shifted(m.data, shift) if len(m.data) >= 12 else m.data
-        outputs[m.topic].publish(data)
+    shift = start - first if speed >= 1.0 else 0
+    times = [first + round((m.log_ns - first) / min(speed, 1.0)) for m in items]
+    for index, _ in pace(times, start, lambda: False, time.time_ns):
+        m = items[index]
+        if m.topic:
+            outputs[m.topic].publish(shifted(m.data, shift) if len(m.data) >= 12 else m.data)
+        else:
+            clock.publish(m.data)
     time.sleep(0.3)
-    for publisher in outputs.values():
+    for publisher in (*outputs.values(), clock):
         node.destroy_publisher(publisher)
-    return shift
+    return Played(start, shift, min(speed, 1.0))
 
 
-def run(fault: str, folder: Path) -> Result:
+def stamp_of(t: int) -> Time:
+    seconds, nanoseconds = cdr.split_stamp(t)
+    return Time(sec=seconds, nanosec=nanoseconds)
+
+
+def run(fault: str, folder: Path, speed: float) -> Result:
     """One fault on a fresh node."""
     bag = shipped_file("clean_release.mcap")
     messages = FAULTS[fault](load(bag, 0.0, SECONDS))
     recording = folder / "recorded.mcap"
     domain = free_domain()
-    stop = threading.Event()
+    settings = {"record.path": str(recording), "use_sim_time": speed < 1.0}
     load_of = busy(2 * (os.cpu_count() or 2)) if fault.startswith("CPU") else contextlib.nullcontext()
     names = [topics.TIP_POSE, topics.VALID, topics.BACKBONE_STATE]
     with (
-        NodeProcess(ESTIMATOR, {"record.path": str(recording)}, domain, folder / "estimator.log") as node,
+        NodeProcess(ESTIMATOR, settings, domain, folder / "estimator.log") as node,
         Listener(domain, names, depth=5000) as listener,
     ):
         ready = listener.wait_for(lambda: listener.matched() or node.code is not None, PATIENCE_S)
@@ -246,41 +281,34 @@ def run(fault: str, folder: Path) -> Result:
         if fault == "disk full":
             resource.prlimit(node.pid, resource.RLIMIT_FSIZE, (300_000, 300_000))
         if fault.startswith("kill"):
-            threading.Timer(3.0, lambda: node.send(signal.SIGKILL)).start()
+            threading.Timer(3.0 / speed, lambda: node.send(signal.SIGKILL)).start()
         with load_of:
-            shift = play(listener, messages, stop)
-        killed_ns = time.time_ns()
+            played = play(listener, messages, speed)
         code = node.stop() if node.code is None else node.code
-    return judge(fault, listener, messages, shift, code, recording, killed_ns)
+    return judge(fault, listener, messages, played, code, recording)
 
 
 def judge(
-    fault: str, listener: Listener, messages: Messages, shift: int, code: int, recording: Path, end_ns: int
+    fault: str, listener: Listener, messages: Messages, played: Played, code: int, recording: Path
 ) -> Result:
     """Figures and broken promises."""
     poses = listener.heard[topics.TIP_POSE]
-    valid = [(m.arrival_ns, bool(m.data[4])) for m in listener.heard[topics.VALID]]
+    valid = [(played.robot_s(m.arrival_ns), bool(m.data[4])) for m in listener.heard[topics.VALID]]
     marks = [cdr.decode_stamp(m.data) for m in poses]
     clouds = [cdr.decode_point_cloud(m.data).rows for m in listener.heard[topics.BACKBONE_STATE]]
     finite = [np.isfinite(cdr.decode_numbers(m.data, 43)[2]).all() for m in poses] + [
         np.isfinite(c).all() for c in clouds
     ]
-    start_ns = messages[0].log_ns + shift
-    arrivals = np.array([m.arrival_ns for m in poses])
-    stop_ns = min(end_ns, start_ns + round(SECONDS * 1e9))
-    within = [ok for arrival, ok in valid if arrival <= stop_ns]
-    waits = np.diff([arrival for arrival, _ in valid if arrival <= stop_ns])
-    fault_end = start_ns + round(END_S * 1e9)
-    after = arrivals[arrivals >= fault_end] if len(arrivals) else arrivals
+    within = [(t, ok) for t, ok in valid if t <= SECONDS]
+    waits = np.diff([t for t, _ in within])
+    after = [t for m in poses if (t := played.robot_s(m.arrival_ns)) >= END_S]
     result = Result(
         fault,
         steps=len(within),
-        invalid_s=round(3e-3 * sum(not ok for ok in within), 3),
-        longest_wait_s=round(float(waits.max()) * 1e-9, 3) if len(waits) else math.inf,
-        back_after_s=None
-        if fault in WHOLE_RUN or not len(after)
-        else round(float(after[0] - fault_end) * 1e-9, 3),
-        tip_rms_m=error(poses, start_ns, fault),
+        invalid_s=round(3e-3 * sum(not ok for _, ok in within), 3),
+        longest_wait_s=round(float(waits.max()), 3) if len(waits) else math.inf,
+        back_after_s=None if fault in WHOLE_RUN or not len(after) else round(after[0] - END_S, 3),
+        tip_rms_m=error(poses, messages[0].log_ns + played.shift_ns, fault),
         not_finite=sum(not ok for ok in finite),
         repeated_stamps=int(np.sum(np.diff(marks) <= 0))
         if fault != "clock jumps 10 s back for good"
@@ -389,13 +417,19 @@ def main() -> int:
     parser.add_argument("--only", nargs="+", choices=FAULTS, help="these faults alone")
     parser.add_argument("--output", type=Path, help="JSON file for the figures")
     parser.add_argument("--table", action="store_true", help="print the Markdown table")
+    parser.add_argument(
+        "--speed",
+        type=float,
+        default=1.0,
+        help="share of real time; below 1 by /clock, for machines with other work to do",
+    )
     parser.add_argument("--hours", type=float, default=3.0, help="simulated time of the long run; 0: none")
     options = parser.parse_args()
     os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
     results: list[dict[str, Any]] = []
     for fault in options.only or FAULTS:
         with tempfile.TemporaryDirectory() as name:
-            result = run(fault, Path(name))
+            result = run(fault, Path(name), options.speed)
         print(json.dumps(dataclasses.asdict(result)), file=sys.stderr, flush=True)
         results.append(dataclasses.asdict(result))
     figures: dict[str, Any] = {"faults": results}
