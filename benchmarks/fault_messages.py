@@ -144,3 +144,5 @@ WHOLE_RUN = {
     "disk full",
     "kill -9 while recording",
 }
+# Stamps that stay behind what was published: nothing more goes out until ~/reset is called, and /diagnostics says so.
+NEEDS_RESET = {"clock jumps 10 s back for good"}

@@ -44,7 +44,7 @@ from ctr_dynamics.nodes.playback import load, pace, shifted
 from ctr_dynamics.nodes.processes import ESTIMATOR, NodeProcess, free_domain
 
 sys.path.insert(0, str(Path(__file__).parent))
-from fault_messages import END_S, FAULTS, WHOLE_RUN, Messages
+from fault_messages import END_S, FAULTS, NEEDS_RESET, WHOLE_RUN, Messages
 
 SECONDS = 5.0
 PATIENCE_S = 900.0
@@ -198,7 +198,7 @@ def judge(
         result.broken.append("numbers that are not finite")
     if result.repeated_stamps:
         result.broken.append("stamps repeated")
-    if not len(poses) or (fault not in WHOLE_RUN and result.back_after_s is None):
+    if not len(poses) or (fault not in WHOLE_RUN | NEEDS_RESET and result.back_after_s is None):
         result.broken.append("not valid again")
     if killed and (result.lost_s is None or result.lost_s > 1.0):
         result.broken.append("more than 1 s of the recording lost")
