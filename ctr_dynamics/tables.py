@@ -1,4 +1,4 @@
-"""Tables of README.md and config/estimator.yaml, written from the code's own tables.
+"""Tables of README.md, config/estimator.yaml and docs/reference.md, written from the code's own tables.
 
 `python -m ctr_dynamics.tables` says what is out of date (exit code 1); with `--write` it mends it.
 """
@@ -12,6 +12,7 @@ from typing import Any
 
 import yaml
 
+from ctr_dynamics import reference
 from ctr_dynamics.errors import InputError
 from ctr_dynamics.messages.topics import TOPICS
 from ctr_dynamics.parameters import PARAMETERS, Parameter
@@ -117,6 +118,7 @@ def outdated(root: Path) -> dict[Path, str]:
     wanted = {
         readme: render_readme(readme.read_text(encoding="utf-8")),
         root / ESTIMATOR_YAML: estimator_yaml(),
+        root / reference.PAGE: reference.render(),
     }
     return {
         path: text
@@ -134,6 +136,7 @@ def main(argv: list[str] | None = None) -> int:
     late = outdated(options.root)
     for path, text in late.items():
         if options.write:
+            path.parent.mkdir(parents=True, exist_ok=True)
             path.write_text(text, encoding="utf-8")
             print(f"wrote {path}")
         else:

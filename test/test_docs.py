@@ -1,0 +1,158 @@
+"""Everything public is documented, and the documents say what is there: options, parameters, topics, links, messages."""
+
+from __future__ import annotations
+
+import ast
+import re
+from pathlib import Path
+
+import pytest
+import yaml
+
+from ctr_dynamics import reference
+from ctr_dynamics.cli import main as cli
+from ctr_dynamics.messages.pages import undocumented
+from ctr_dynamics.messages.topics import TOPICS
+from ctr_dynamics.parameters import PARAMETERS
+from ctr_dynamics.view.markers import TUBES_TOPIC
+
+ROOT = Path(__file__).parents[1]
+PAGES = [
+    ROOT / "README.md",
+    ROOT / "CONTRIBUTING.md",
+    ROOT / "CHANGELOG.md",
+    *sorted((ROOT / "docs").glob("*.md")),
+]
+TEXT = {
+    page: page.read_text(encoding="utf-8") for page in [*PAGES, *sorted((ROOT / "examples").rglob("*.md"))]
+}
+
+
+@pytest.fixture(scope="module")
+def commands():
+    return dict(reference.commands())
+
+
+def test_every_command_and_option_is_explained(commands):
+    page = TEXT[ROOT / reference.PAGE]
+    for name, command in commands.items():
+        assert f"### ctr-dynamics {name}\n" in page
+        assert command.help, name
+        for option in command.params:
+            if option.name != "help":
+                assert getattr(option, "help", ""), f"{name}: {option.name} has no help"
+                for flag in option.opts if option.param_type_name == "option" else []:
+                    assert f"`{flag}`" in page, f"{name} {flag}"
+    assert set(cli.available()) == {name.split()[0] for name in commands}
+
+
+def test_every_parameter_is_documented():
+    readme, page = TEXT[ROOT / "README.md"], TEXT[ROOT / reference.PAGE]
+    for parameter in PARAMETERS:
+        assert f"`{parameter.name}`" in readme
+        assert parameter.text
+    for node in reference.NODES:
+        found = reference.node_parameters(node)
+        assert found
+        for name, (_, text) in found.items():
+            assert text
+            assert f"| `{name}` |" in page
+
+
+def test_every_topic_and_field_is_documented():
+    readme = TEXT[ROOT / "README.md"]
+    for topic in TOPICS:
+        assert f"`{topic.name}`" in readme
+        assert (ROOT / "msg_docs" / topic.page).is_file()
+        assert undocumented(topic) == []
+    assert TUBES_TOPIC in TEXT[ROOT / "docs" / "view.md"]
+    assert "/ctr/joint_commands" in TEXT[ROOT / "docs" / "controller.md"]
+
+
+def test_every_service_of_the_node_is_documented():
+    text = (ROOT / "ctr_dynamics" / "nodes" / "estimator_node.py").read_text()
+    offered = set(re.findall(r'create_service\(\w+, "~/(\w+)"', text))
+    assert {name.rsplit("/", 1)[1] for name in reference.SERVICES} == offered
+
+
+def test_every_public_argument_is_explained():
+    missing = [line for name, thing in reference.public() for line in reference.unexplained(name, thing)]
+    assert missing == []
+    assert all(thing.__doc__ for _, thing in reference.public())
+
+
+def test_the_glossary_holds_only_names_that_occur():
+    used = {argument for _, thing in reference.public() for argument in reference.arguments(thing)}
+    assert set(reference.GLOSSARY) - used == set()
+
+
+@pytest.mark.parametrize("page", list(TEXT), ids=lambda page: page.name)
+def test_links_lead_somewhere(page):
+    for target in re.findall(r"\]\(([^)]+)\)", TEXT[page]):
+        if target.startswith(("http://", "https://")):
+            continue
+        file, _, anchor = target.partition("#")
+        there = (page.parent / file).resolve() if file else page
+        assert there.exists(), f"{page.name}: {target}"
+        if anchor:
+            heads = re.findall(r"^#+ (.+)$", there.read_text(), re.MULTILINE)
+            assert anchor in {
+                re.sub(r"[^\w -]", "", head).strip().lower().replace(" ", "-") for head in heads
+            }, target
+
+
+@pytest.mark.parametrize("page", list(TEXT), ids=lambda page: page.name)
+def test_commands_in_the_pages_exist(page, commands):
+    """Every `ctr-dynamics NAME --option` that a page tells to type."""
+    blocks = "\n".join(re.findall(r"```sh\n(.*?)```", TEXT[page], re.DOTALL)).replace("\\\n", " ")
+    for line in re.findall(r"^ctr-dynamics (.+)$", blocks, re.MULTILINE):
+        words = line.split("#")[0].split()
+        name = next((n for n in (" ".join(words[:2]), words[0]) if n in commands), None)
+        if name is None and words[0] in cli.COMMANDS:
+            continue  # a command of a later version
+        assert name is not None, line
+        known = {flag for p in commands[name].params for flag in [*p.opts, *p.secondary_opts]}
+        used = {word.split("=")[0] for word in re.sub(r'"[^"]*"', "X", line).split() if word.startswith("--")}
+        assert used <= known, line
+        for assignment in re.findall(r"--set (\w[\w.]*)=", line):
+            assert assignment in {p.name for p in PARAMETERS}, line
+
+
+def string_constants() -> str:
+    """Every string of the package, f-strings with their fields as *."""
+    texts = []
+    for file in (ROOT / "ctr_dynamics").rglob("*.py"):
+        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.JoinedStr):
+                texts.append(
+                    "".join(str(v.value) if isinstance(v, ast.Constant) else "*" for v in node.values)
+                )
+            elif isinstance(node, ast.Constant) and isinstance(node.value, str):
+                texts.append(node.value)
+    return "\n".join(texts)
+
+
+def test_messages_in_the_troubleshooting_page_are_ours():
+    """Its headings quote what the program says; * stands for a number or name."""
+    said = string_constants()
+    page = TEXT[ROOT / "docs" / "troubleshooting.md"]
+    quoted = re.findall(r"^### `(.+)`$", page, re.MULTILINE)
+    assert len(quoted) > 15
+    for text in quoted:
+        parts = [part.strip() for part in text.split("*") if len(part.strip()) > 3]
+        assert parts
+        for part in parts:
+            assert part in said, f"'{part}' of '{text}' is nowhere said"
+
+
+def test_citation_is_a_citation_file():
+    data = yaml.safe_load((ROOT / "CITATION.cff").read_text())
+    assert data["cff-version"] == "1.2.0"
+    assert {"message", "title", "authors", "license", "version"} <= set(data)
+    assert data["references"][0]["year"] == 2020
+
+
+def test_readme_leads_to_every_page():
+    readme = TEXT[ROOT / "README.md"]
+    for page in (ROOT / "docs").glob("*.md"):
+        assert f"(docs/{page.name})" in readme, page.name
