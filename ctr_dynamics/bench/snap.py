@@ -29,6 +29,7 @@ def snap_cost(quick: bool) -> dict[str, Any]:
         "dt_s": 1e-5,
         "steps": len(motion.t),
         "step_ms": 1e3 * motion.wall_s / max(len(motion.t), 1),
+        "step_cpu_ms": 1e3 * motion.cpu_s / max(len(motion.t), 1),
         "iterations_per_step": float(motion.iterations.mean()),
         "jacobians_per_step": float(motion.jacobians.mean()),
         "residual_ms": 1e3 * best_of(lambda: residual(arrays, x, par, c0, work), repeats),
