@@ -292,12 +292,10 @@ def main() -> None:
         done = {(r["stratum"], r["seed"]) for r in rows}
         # strata take turns, so that a study that is stopped early has some of each
         todo = sorted(
-
-                (k / max(counts[s], 1), s, seeds[s] + k)
-                for s in counts
-                for k in range(counts[s])
-                if (s, seeds[s] + k) not in done
-
+            (k / max(counts[s], 1), s, seeds[s] + k)
+            for s in counts
+            for k in range(counts[s])
+            if (s, seeds[s] + k) not in done
         )
         with path.open("a") as stream:
             for row in _work([(s, seed) for _, s, seed in todo], options):

@@ -77,6 +77,14 @@ def text(result: Result) -> str:
         f"{r['nodes']:5d}  {1e3 * r['spacing_m']:12.2f}  {_number(None if r['error_m'] is None else 1e3 * r['error_m'], '.2e'):>11s}"
         for r in space["rows"]
     ]
+    snap = result["snap"]
+    lines += [
+        "",
+        f"snap-through, finite differences, {snap['unknowns']} unknowns at {1e6 * snap['dt_s']:g} us (ms)",
+        "  step  of processor time  iterations  Jacobians  residual  Jacobian  back solve  published program",
+        f"{snap['step_ms']:6.2f}  {snap['step_cpu_ms']:17.2f}  {snap['iterations_per_step']:10.2f}  {snap['jacobians_per_step']:9.2f}  "
+        f"{snap['residual_ms']:8.3f}  {snap['jacobian_ms']:8.2f}  {snap['back_solve_ms']:10.3f}  {'{:g} to {:g}'.format(*snap['published_program_ms']):>17s}",
+    ]
     return "\n".join(lines)
 
 

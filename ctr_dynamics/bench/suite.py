@@ -11,6 +11,7 @@ from ctr_dynamics.bagio.replay import plain
 from ctr_dynamics.bench.fused import fused_replay
 from ctr_dynamics.bench.machine import machine
 from ctr_dynamics.bench.release import Release, grid, space_error, time_error, work
+from ctr_dynamics.bench.snap import snap_cost
 from ctr_dynamics.bench.sweeps import sweeps
 from ctr_dynamics.parameters import Settings
 
@@ -106,4 +107,6 @@ def measure(bag: Path, quick: bool, say: Callable[[str], None]) -> dict[str, Any
     result["figure_13"] = grid(test, size.grid_dts, size.grid_nodes, size.grid_s)
     say("error over node spacing")
     result["figure_14"] = space_error(test, size.space_nodes, size.fine_nodes, size.space_s)
+    say("snap-through: cost of a step")
+    result["snap"] = snap_cost(quick)
     return dict(plain(result))

@@ -55,5 +55,6 @@ def bench(
         *result["figure_13"],
         *result["figure_14"]["rows"],
         *result["time_error"]["schemes"],
+        result["snap"],
     ]
     return 1 if any(row["failure"] for row in rows) else 0

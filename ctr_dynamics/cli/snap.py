@@ -104,6 +104,7 @@ def _figures(
         "jacobians_per_step": float(run.jacobians.mean()) if len(run.t) else None,
         "wall_s": run.wall_s,
         "ms_per_step": 1e3 * run.wall_s / len(run.t) if len(run.t) else None,
+        "cpu_ms_per_step": 1e3 * run.cpu_s / len(run.t) if len(run.t) else None,
         "failure": run.failure,
     }
 
@@ -238,8 +239,8 @@ def _show(summary: dict[str, Any], found: list[Extremum]) -> None:
     ]
     if summary["steps"]:
         rows.append(
-            ("cost", f"{summary['ms_per_step']:.2f} ms, {summary['iterations_per_step']:.2f} iterations, "
-             f"{summary['jacobians_per_step']:.2f} Jacobians a step")
+            ("cost", f"{summary['ms_per_step']:.2f} ms ({summary['cpu_ms_per_step']:.2f} ms of processor time), "
+             f"{summary['iterations_per_step']:.2f} iterations, {summary['jacobians_per_step']:.2f} Jacobians a step")
         )  # fmt: skip
     for name, value in rows:
         print(f"{name:18s} {value}")

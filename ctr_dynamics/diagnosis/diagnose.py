@@ -168,7 +168,9 @@ def diagnose(
     clean = fit(problem, (), clean.point) or clean
     result.clean = result.best = clean
     result.tested += ["time_discretisation", "space_discretisation"]
-    pool = candidates(known, np.concatenate([r.position[np.isfinite(r.position).all(axis=1)] for r in recordings]))
+    pool = candidates(
+        known, np.concatenate([r.position[np.isfinite(r.position).all(axis=1)] for r in recordings])
+    )
     result.tested += sorted({c.effect for c in pool})
     result.white_before = whiteness(problem, clean.whitened, len(clean.active))
     found = search(problem, pool, clean, note, workers)

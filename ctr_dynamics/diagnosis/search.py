@@ -375,7 +375,13 @@ def search(
     return Search(found, _probabilities(found, problem), base, lin, screened, pool)
 
 
-def _seconds(problem: Problem, pool: list[Candidate], found: list[Explanation], note: Callable[[str], None], workers: int) -> list[Explanation]:
+def _seconds(
+    problem: Problem,
+    pool: list[Candidate],
+    found: list[Explanation],
+    note: Callable[[str], None],
+    workers: int,
+) -> list[Explanation]:
     """Two causes, and three where that pays: what each of the best leaves is screened again."""
     out: list[Explanation] = []
     tried: set[frozenset[str]] = set()
@@ -389,7 +395,9 @@ def _seconds(problem: Problem, pool: list[Candidate], found: list[Explanation], 
             leader.lin = linearise(problem, leader.fit.point, pool, note)
             if leader.lin is None:
                 continue
-            gains = [c for g, c in screen(problem, leader.lin, leader.members, pool) if g > SECOND_EVIDENCE - 2.0]
+            gains = [
+                c for g, c in screen(problem, leader.lin, leader.members, pool) if g > SECOND_EVIDENCE - 2.0
+            ]
             jobs = []
             for c in _distinct(gains)[:SECOND]:
                 names = frozenset(x.label for x in (*leader.members, c))

@@ -27,6 +27,7 @@ Floats = NDArray[np.float64]
 InputRows = Callable[[Floats], Floats]
 TIP_ROWS = 13  # p, h, q, omega
 CHUNK = 256  # steps between returns to Python
+PATIENCE = 40  # steps that may need more than the compiled loop before a run is given up
 WIDE = 5  # times eight lanes for sensitivities: one lane count, compiled once, for any number of columns
 EPSILON = 1e-6  # of a column's unit: small against the curvature of the step, large against rounding
 
@@ -259,7 +260,7 @@ def run(
         columns = _Columns(model, effect, give)
         out = np.empty((steps + 1, TIP_ROWS, r))
         out[0] = columns.start(state, parameters, first, give(np.zeros(1))[0], RATES + stages)
-    k, sweeps, failure = 0, 0, ""
+    k, sweeps, failure, hard = 0, 0, "", 0
     beta_rate = np.zeros(steps + 1)
     while k < steps:
         count = min(CHUNK, steps - k)
@@ -287,6 +288,10 @@ def run(
                 break
         k += taken
         if taken < count:
+            hard += usable == count
+            if hard > PATIENCE:
+                failure = f"step at {k * dt:.4f} s: more than {PATIENCE} steps did not converge at once"
+                break
             mesh, before = state.mesh, state.inputs.beta
             key = state.key
             result = simulator.step(

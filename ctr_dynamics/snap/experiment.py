@@ -132,7 +132,8 @@ class Trajectory:
         inner_tip, outer_tip: (k, 3) m in ``ctr_base``.
         iterations, jacobians: (k,) of each step.
         frame_t: (f,) s, positions: (f, nodes, 3) m and quaternions: (f, nodes, 4) wxyz of the kept backbones.
-        theta_f_rest: rad, at t = 0; wall_s: s, taken by the steps; failure: why the run ended before its time, else empty.
+        theta_f_rest: rad, at t = 0; wall_s, cpu_s: s by the clock and on the processor, of all steps;
+        failure: why the run ended before its time, else empty.
     """
 
     t: np.ndarray
@@ -150,6 +151,7 @@ class Trajectory:
     unknowns: int
     cells: tuple[int, ...]
     wall_s: float
+    cpu_s: float
     failure: str = ""
 
 
@@ -193,7 +195,7 @@ def run(robot: Robot, plan: Plan, progress: Callable[[float], None] | None = Non
     log.frames.append((0.0, *solver.backbone()))
     failure = ""
     dt, end = plan.dt, plan.duration * (1 - 1e-9)
-    begin = time.perf_counter()  # the approach has compiled everything
+    begin, begin_cpu = time.perf_counter(), time.thread_time()  # the approach has compiled everything
     count = 0
     while solver.t < end:
         if plan.adaptive is None:
@@ -245,6 +247,7 @@ def run(robot: Robot, plan: Plan, progress: Callable[[float], None] | None = Non
         unknowns=solver.grid.unknowns,
         cells=solver.grid.cells,
         wall_s=time.perf_counter() - begin,
+        cpu_s=time.thread_time() - begin_cpu,
         failure=failure,
     )
 

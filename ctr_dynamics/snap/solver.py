@@ -65,7 +65,7 @@ class SnapSolver:
         self.parameters[model.layout["beta"]] = self.beta
         self.work = make_work(self.grid.arrays)
         size = self.work.left.shape[1]
-        self._scratch = (np.zeros((size, size)), np.zeros((size, size)))
+        self.scratch = (np.zeros((size, size)), np.zeros((size, size)))
         self.x = np.zeros(self.grid.unknowns)
         self.x_before = self.x.copy()
         self.x_earlier = self.x.copy()
@@ -104,7 +104,7 @@ class SnapSolver:
             self.work.hist_base.flat[:] = history[main:]
         x = guess.copy()
         outcome, iterations, jacobians, norm = solve(
-            self.grid.arrays, x, self.parameters, c0, self.work, *self._scratch, self._fresh or c0 != self._c0, self.tolerance, limit
+            self.grid.arrays, x, self.parameters, c0, self.work, *self.scratch, self._fresh or c0 != self._c0, self.tolerance, limit
         )  # fmt: skip
         self._c0 = c0
         self._fresh = outcome != CONVERGED

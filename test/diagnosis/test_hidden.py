@@ -33,7 +33,9 @@ def _run(folder: str, stratum: str, seed: int, effects):
 
     case = make_case(seed, stratum, folder, effects=effects)
     output = str(Path(folder) / "out")
-    request = Request(load_robot(case.robot), [str(case.protocol)], [str(case.sweep)], output, "command", workers=1)
+    request = Request(
+        load_robot(case.robot), [str(case.protocol)], [str(case.sweep)], output, "command", workers=1
+    )
     return run(request), case.unseal()
 
 
@@ -41,9 +43,15 @@ def _run(folder: str, stratum: str, seed: int, effects):
 def outcomes(tmp_path_factory):
     """Findings and answers of all cases, two at a time."""
     folders = [str(tmp_path_factory.mktemp(name)) for name, *_ in CASES]
-    jobs = (delayed(_run)(folder, stratum, seed, effects) for folder, (_, stratum, seed, effects) in zip(folders, CASES, strict=True))
+    jobs = (
+        delayed(_run)(folder, stratum, seed, effects)
+        for folder, (_, stratum, seed, effects) in zip(folders, CASES, strict=True)
+    )
     found = Parallel(2)(jobs)
-    return {name: (*pair, Path(folder) / "out") for (name, *_), pair, folder in zip(CASES, found, folders, strict=True)}
+    return {
+        name: (*pair, Path(folder) / "out")
+        for (name, *_), pair, folder in zip(CASES, found, folders, strict=True)
+    }
 
 
 @pytest.mark.parametrize("name", ["stiffness", "payload", "latency", "offset", "pair"])
@@ -85,7 +93,9 @@ def test_a_robot_at_rest_cannot_be_diagnosed(outcomes):
 
 def test_findings_are_plain_json_without_nan_and_files_are_there(outcomes):
     for findings, _, folder in outcomes.values():
-        stored = json.loads((folder / "findings.json").read_text(), parse_constant=lambda text: pytest.fail(text))
+        stored = json.loads(
+            (folder / "findings.json").read_text(), parse_constant=lambda text: pytest.fail(text)
+        )
         assert stored["schema"] == "ctr_dynamics/findings/1"
         assert stored["verdict"] == findings["verdict"]
         for key in ("extended_robot", "recalibrated_robot"):

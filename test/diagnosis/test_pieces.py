@@ -27,7 +27,9 @@ def test_posterior_is_bayes_rule():
     noise = np.eye(40) + N @ N.T
     precision = np.diag(1 / variance) + J.T @ np.linalg.solve(noise, J)
     np.testing.assert_allclose(covariance, np.linalg.inv(precision), rtol=1e-9)
-    np.testing.assert_allclose(mean, np.linalg.solve(precision, J.T @ np.linalg.solve(noise, data)), rtol=1e-9)
+    np.testing.assert_allclose(
+        mean, np.linalg.solve(precision, J.T @ np.linalg.solve(noise, data)), rtol=1e-9
+    )
     total = noise + J @ np.diag(variance) @ J.T
     expected = -0.5 * data @ np.linalg.solve(total, data) - 0.5 * np.linalg.slogdet(total)[1]
     assert evidence == pytest.approx(expected, rel=1e-9)
@@ -43,7 +45,12 @@ def test_whitener_gives_unit_noise():
     keep = math.exp(-1 / (40.0 * noise.drift_time.value))
     for k in range(1, 400):
         drift[k] = keep * drift[k - 1] + noise.drift.value * math.sqrt(1 - keep**2) * rng.normal(size=3)
-    values = np.hstack([drift + noise.position.value * rng.normal(size=(400, 3)), noise.rotation.value * rng.normal(size=(400, 3))])
+    values = np.hstack(
+        [
+            drift + noise.position.value * rng.normal(size=(400, 3)),
+            noise.rotation.value * rng.normal(size=(400, 3)),
+        ]
+    )
     whiten = Whitener(robot, t, np.ones(6, bool), np.ones(400, bool))
     white = whiten(values)
     assert white.size == whiten.size == 2400
@@ -72,7 +79,9 @@ def test_interpolation_is_exact_for_cubics_and_held_outside():
 def test_rotations_by_rows():
     h = np.array([[math.cos(0.2), 0.0, 0.0, math.sin(0.2)], [1.0, 0.0, 0.0, 0.0]])
     v = np.array([[1.0, 0.0, 0.0], [0.0, 2.0, 0.0]])
-    np.testing.assert_allclose(rotate(h, v), [[math.cos(0.4), math.sin(0.4), 0.0], [0.0, 2.0, 0.0]], atol=1e-15)
+    np.testing.assert_allclose(
+        rotate(h, v), [[math.cos(0.4), math.sin(0.4), 0.0], [0.0, 2.0, 0.0]], atol=1e-15
+    )
     np.testing.assert_allclose(to_vectors(product(h, h)), [[0.0, 0.0, 0.8], [0.0, 0.0, 0.0]], atol=1e-15)
 
 

@@ -24,7 +24,7 @@ def test_quick_bench_writes_figures_and_plots(tmp_path, capsys):
     assert main(["bench", "--quick", "--output", str(tmp_path), "--page", str(tmp_path / "page.md")]) == 0
     result = json.loads((tmp_path / "bench.json").read_text())
     assert set(result) == {
-        "quick", "machine", "sweeps", "simulate", "replay", "rank", "time_error", "figure_13", "figure_14",
+        "quick", "machine", "sweeps", "simulate", "replay", "rank", "time_error", "figure_13", "figure_14", "snap",
     }  # fmt: skip
     assert result["machine"]["cores"] >= 1
     assert {"numpy", "numba", "ctr_dynamics", "python"} <= set(result["machine"]["versions"])
