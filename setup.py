@@ -55,6 +55,7 @@ setup(
         "typer>=0.12",
         "rich>=13",
         "matplotlib>=3.9",
+        "joblib>=1.3",
         "zstandard>=0.22",
         "lz4>=4.3",
     ],
@@ -67,10 +68,12 @@ setup(
             "ros-kilted-std-srvs==5.5.1",
             *(f"ros-kilted-{name}-msgs==5.5.1" for name in ROS_MESSAGES),
         ],
+        # `ctr-dynamics diagnose --cluster`
+        "cluster": ["distributed>=2024.8"],
         # `ctr-dynamics view`, 54 MB.
         "view": ["foxglove-sdk>=0.14"],
         # colcon runs pytest when it finds it in this extra.
-        "test": ["pytest>=8", "hypothesis>=6.100", "ruff", "mypy", "types-PyYAML", "build"],
+        "test": ["distributed>=2024.8", "pytest>=8", "hypothesis>=6.100", "ruff", "mypy", "types-PyYAML", "build"],
     },
     python_requires=">=3.10",
     zip_safe=False,

@@ -28,11 +28,12 @@ def one(stratum: str, seed: int) -> dict[str, Any]:
     for folder in (ROOT, ROOT / "test" / "diagnosis"):
         if str(folder) not in sys.path:
             sys.path.insert(0, str(folder))
+    from truth.cases import make_case
+
     from ctr_dynamics.diagnosis.diagnose import diagnose
     from ctr_dynamics.diagnosis.findings import findings
     from ctr_dynamics.diagnosis.recording import read_recording
     from ctr_dynamics.robot import load_robot
-    from truth.cases import make_case
 
     with tempfile.TemporaryDirectory() as folder:
         begin = time.time()

@@ -122,13 +122,7 @@ class Experiment:
         stamps = self.recording.stamps
         times = stamps / (1.0 + setup.skew) - setup.delay
         tip = trajectory.tip[:, :7]
-        if setup.averaging > 0.0:
-            rows = sum(
-                w * at_times(tip, trajectory.t, times - x * setup.averaging)
-                for x, w in zip(AVERAGE_POINTS, AVERAGE_WEIGHTS, strict=True)
-            )
-        else:
-            rows = at_times(tip, trajectory.t, times)
+        rows = _mean(tip, trajectory.t, times, _window(setup))
         h = rows[:, 3:] / np.linalg.norm(rows[:, 3:], axis=1, keepdims=True)
         point = setup.tracker_scale * (rows[:, :3] + rotate(h, setup.lever))
         position = rotate(setup.rotation, point) + setup.translation + setup.drift * stamps[:, None]
@@ -229,11 +223,9 @@ class Experiment:
         times = self.recording.stamps / (1.0 + setup.skew) - setup.delay
         flat = trajectory.columns[:, :7].reshape(len(trajectory.t), -1)
         tip = trajectory.tip[:, :7]
-        parts = [(0.0, 1.0)]
-        if setup.averaging > 0.0:
-            parts = [(x * setup.averaging, w) for x, w in zip(AVERAGE_POINTS, AVERAGE_WEIGHTS, strict=True)]
-        rows = sum(w * at_times(flat, trajectory.t, times - x) for x, w in parts).reshape(len(times), 7, -1)
-        h = sum(w * at_times(tip, trajectory.t, times - x) for x, w in parts)[:, 3:]
+        parts = _window(setup)
+        rows = _mean(flat, trajectory.t, times, parts).reshape(len(times), 7, -1)
+        h = _mean(tip, trajectory.t, times, parts)[:, 3:]
         norm2 = np.sum(h * h, axis=1)[:, None]
         r = rows.shape[2]
         back = conjugated(h)
@@ -273,7 +265,27 @@ def at_times(values: Floats, t: Floats, times: Floats) -> Floats:
         (x + 1.0) * x * (x - 1.0) / 6.0,
     )
     last = len(t) - 1
-    return sum(w * values[np.minimum(i + k - 1, last)] for k, w in enumerate(weights))
+    out = np.zeros((len(times), values.shape[1]))
+    for k, w in enumerate(weights):
+        out += w * values[np.minimum(i + k - 1, last)]
+    return out
+
+
+def _window(setup: Setup) -> list[tuple[float, float]]:
+    """(age in s, weight) of what a tracker averages."""
+    if setup.averaging <= 0.0:
+        return [(0.0, 1.0)]
+    return [
+        (float(x) * setup.averaging, float(w)) for x, w in zip(AVERAGE_POINTS, AVERAGE_WEIGHTS, strict=True)
+    ]
+
+
+def _mean(values: Floats, t: Floats, times: Floats, parts: Sequence[tuple[float, float]]) -> Floats:
+    """Weighted mean of ``values`` at ``times`` minus the ages of ``parts``."""
+    out = np.zeros((len(times), values.shape[1]))
+    for age, weight in parts:
+        out += weight * at_times(values, t, times - age)
+    return out
 
 
 def conjugated(h: Floats) -> Floats:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from scipy.special import log_ndtr
 
 from ctr_dynamics.effects import EFFECTS, Quantity
+from ctr_dynamics.errors import InputError
 from ctr_dynamics.robot import Robot
 
 from .experiment import Experiment
@@ -89,7 +90,10 @@ class Problem:
         """(m,) whitened residual at ``point``; None where a simulation fails."""
         parts = []
         for experiment, whiten in zip(self.experiments, self.whiteners, strict=True):
-            prediction = experiment.predict(point)
+            try:
+                prediction = experiment.predict(point)
+            except InputError:  # no equilibrium to start from
+                return None
             if prediction.failure:
                 return None
             parts.append(whiten(experiment.residual(prediction)))
@@ -101,7 +105,10 @@ class Problem:
         """Whitened residual (m,) at ``point`` and derivatives (m, len(wanted)) of the prediction, each by its coordinate."""
         residuals, columns = [], []
         for experiment, whiten in zip(self.experiments, self.whiteners, strict=True):
-            prediction, jacobian = experiment.jacobian(point, wanted)
+            try:
+                prediction, jacobian = experiment.jacobian(point, wanted)
+            except InputError:
+                return None
             if prediction.failure:
                 return None
             residuals.append(whiten(experiment.residual(prediction)))
@@ -264,18 +271,25 @@ def fit(
     evidence = _laplace(here, columns, variance, numerics)
     one_sided = {q.key for q in causes if (math.isfinite(q.low) and q.low == q.off)}
     evidence += math.log(2.0) * len(one_sided)
-    extra = _numerics_part(residual, numerics)
-    return Fit(
-        tuple(causes),
-        active,
-        values,
-        covariance,
-        float(np.sum((residual - extra) ** 2)),
-        evidence,
-        residual - extra,
-        columns,
-        extra,
-    )
+    evidence += inside(active, {q.key for q in causes}, values - off, covariance)
+    left = residual - _numerics_part(residual, numerics)
+    return Fit(tuple(causes), active, values, covariance, float(left @ left), evidence, left, columns, here)
+
+
+def inside(active: Sequence[Quantity], causes: set[Key], departure: Floats, covariance: Floats) -> float:
+    """Log probability that the nuisances lie within ``INSIDE`` tolerances, over that before the data.
+
+    A tolerance is the deviation of normal errors; what lies far outside is no error of tolerance, however small its share of the evidence.
+    """
+    total = 0.0
+    for i, q in enumerate(active):
+        if q.key in causes or q.tolerance <= 0.0:
+            continue
+        sigma = math.sqrt(max(covariance[i, i], 0.0)) / q.tolerance + 1e-9
+        z = departure[i] / q.tolerance
+        tail = log_ndtr((INSIDE - z) / sigma) if z > 0.0 else log_ndtr((INSIDE + z) / sigma)
+        total += float(tail) - LOG_INSIDE
+    return total
 
 
 def _laplace(here: float, columns: Floats, variance: Floats, numerics: Floats) -> float:

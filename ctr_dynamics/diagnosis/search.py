@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from joblib import Parallel, delayed
@@ -86,12 +86,13 @@ def candidates(known: Sequence[Quantity], positions: Floats) -> list[Candidate]:
             presets = effect.presets if name != "contact" else planes
             for preset in presets:
                 start = {s.key: preset.get(s.parameter.name.split(".")[-1], s.off) for s in extra}
-                for i, axis in enumerate("xyz"):
-                    key = (name, f"anchor_{axis}_m")
+                for i, letter in enumerate("xyz"):
+                    key = (name, f"anchor_{letter}_m")
                     if key in start:
                         start[key] = float(anchor[i])
                 if all(math.isfinite(v) for v in start.values()):
-                    found.append(Candidate(name, tuple(group), tuple(extra), tuple(start.items())))
+                    shapes_here = tuple(replace(q, off=start[q.key]) for q in extra)
+                    found.append(Candidate(name, tuple(group), shapes_here, tuple(start.items())))
     return found
 
 
@@ -478,9 +479,6 @@ def separation(
     wide = {q.key for q in result.causes}
     prior = {q.key: q.tolerance**2 + (q.scale**2 if q.key in wide else 0.0) for q in result.active}
     parts = [result.columns[:, i] * math.sqrt(prior[result.active[i].key]) for i in others]
-    for i, q in enumerate(result.active):
-        if q.key in own and q.tolerance > 0.0:
-            parts.append(result.columns[:, i] * q.tolerance)
     if rival is not None and rival in lin.signatures:
         parts += [lin.signatures[rival][:, k] * q.scale for k, q in enumerate(rival.quantities)]
     J = np.stack(parts, axis=1)
