@@ -179,7 +179,7 @@ def fit(
     start: Mapping[Key, float],
     known: tuple[Floats, Floats, Sequence[Quantity]] | None = None,
     *,
-    iterations: int = 8,
+    iterations: int = 6,
     exact: bool = True,
 ) -> Fit | None:
     """Best values of nuisances and ``causes`` from ``start``.

@@ -23,8 +23,8 @@ Floats = NDArray[np.float64]
 LOG_PRIOR_CLEAN = math.log(0.5)
 PRIOR_SINGLE, PRIOR_PAIR, PRIOR_TRIPLE = 0.38, 0.1, 0.02
 TEMPERATURE = 1.6  # of the log evidence; tuned on simulated cases of other seeds than the tests'
-SHORTLIST = 9  # candidates that are fitted in full
-SECOND = 6  # second causes that are fitted for each of the best first ones
+SHORTLIST = 8  # candidates that are fitted in full
+SECOND = 4  # second causes that are fitted beside a first
 SECOND_EVIDENCE = 5.0  # log evidence that a further cause must add
 SEPARATION = 5.0  # whitened units: below, two explanations cannot be told apart
 PROBE = 0.7  # of the scale: finite probes of effects without a derivative at zero
@@ -386,7 +386,7 @@ def _seconds(
     """Two causes, and three where that pays: what each of the best leaves is screened again."""
     out: list[Explanation] = []
     tried: set[frozenset[str]] = set()
-    leaders = [e for e in found if e.members][:3]
+    leaders = [e for e in found if e.members][:2]
     much = _leftover(problem, leaders[0].fit) > 4.0
     leaders = [e for e in leaders if e.score > leaders[0].score - (60.0 if much else 3.0)]
     for _ in range(2):
@@ -411,7 +411,7 @@ def _seconds(
             break
         out += new
         _score(new, pool)
-        leaders = new[: 2 if _leftover(problem, new[0].fit) > 4.0 else 1]
+        leaders = new[:1]
     return out
 
 
