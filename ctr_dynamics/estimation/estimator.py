@@ -43,6 +43,9 @@ WAITING_SAMPLES = 200  # poses kept until the first joint state
 MODES_EVERY = 132  # steps between refreshes of the vibration modes
 RETRY_EVERY = 33  # steps between starts while there is no equilibrium: looking for one in vain takes long
 MAX_FAILURES = 10  # steps in a row that may fail before the model starts anew at rest
+SAME_COURSE = (
+    8  # steps: joints no later than that move the robot so little that the covariance need not be moved again
+)
 MAX_BEHIND = 1000  # steps to catch up at once; beyond, the model starts anew
 
 
@@ -126,6 +129,7 @@ class Estimator:
         self._samples: list[Sample] = []
         self._kept: deque[Kept] = deque()
         self._return_to: int | None = None  # ns: inputs from here on have changed
+        self._joints_only = True  # and nothing but joints
         self._fused: State | None = None
         self._alone: State | None = None
         self._alone_tips = TipWindow(self.fusion.tips.size)
@@ -309,6 +313,9 @@ class Estimator:
             self._changed(self.t0_ns - 1)
         elif kind == "late" or not np.array_equal(self._load.values[i], self._load.values[i - 1]):
             self._changed(self._load.stamps[i - 1])
+        else:
+            return
+        self._joints_only = False
 
     def _open_load(self) -> None:
         """Before the first load there is none, or that one if it comes soon enough after the first joints."""
@@ -596,6 +603,7 @@ class Estimator:
     def _go_back(self) -> None:
         """Return to the last kept state before the changed inputs and step again, silently, to where the estimator was."""
         from_ns, self._return_to = self._return_to, None
+        joints_only, self._joints_only = self._joints_only, True
         assert from_ns is not None and self.t0_ns is not None
         reached = self.k
         usable = [kept for kept in self._kept if self.t0_ns + kept.k * DT_NS <= from_ns]
@@ -610,7 +618,7 @@ class Estimator:
             while self._kept and self._kept[-1].k > k:
                 track = self._kept.pop()
                 tracks[track.k] = track
-            changed = self._first_fusion(k)
+            changed = self._first_fusion(k) if joints_only and reached - k <= SAME_COURSE else 0
             tracks = {again: track for again, track in tracks.items() if again < changed}
             self._fused, self._alone = kept.fused.copy(), kept.alone.copy()
             self.fusion.restore(kept.fusion)
