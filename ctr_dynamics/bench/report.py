@@ -83,7 +83,8 @@ def text(result: Result) -> str:
         f"snap-through, finite differences, {snap['unknowns']} unknowns at {1e6 * snap['dt_s']:g} us (ms)",
         "  step  of processor time  iterations  Jacobians  residual  Jacobian  back solve  published program",
         f"{snap['step_ms']:6.2f}  {snap['step_cpu_ms']:17.2f}  {snap['iterations_per_step']:10.2f}  {snap['jacobians_per_step']:9.2f}  "
-        f"{snap['residual_ms']:8.3f}  {snap['jacobian_ms']:8.2f}  {snap['back_solve_ms']:10.3f}  {'{:g} to {:g}'.format(*snap['published_program_ms']):>17s}",
+        f"{snap['residual_ms']:8.3f}  {snap['jacobian_ms']:8.2f}  {snap['back_solve_ms']:10.3f}  "
+        f"{'{:g} to {:g}'.format(*snap['published_program_ms']):>17s}",
     ]
     return "\n".join(lines)
 
