@@ -73,7 +73,15 @@ setup(
         # `ctr-dynamics view`, 54 MB.
         "view": ["foxglove-sdk>=0.14"],
         # colcon runs pytest when it finds it in this extra.
-        "test": ["distributed>=2024.8", "pytest>=8", "hypothesis>=6.100", "ruff", "mypy", "types-PyYAML", "build"],
+        "test": [
+            "distributed>=2024.8",
+            "pytest>=8",
+            "hypothesis>=6.100",
+            "ruff",
+            "mypy",
+            "types-PyYAML",
+            "build",
+        ],
     },
     python_requires=">=3.10",
     zip_safe=False,

@@ -316,7 +316,7 @@ def run(
             k += 1
     done = k + 1
     return Trajectory(
-        np.arange(done) * dt,
+        dt * np.arange(done, dtype=np.float64),
         tip[:done],
         beta_rate[:done],
         None if out is None else out[:done],

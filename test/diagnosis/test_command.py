@@ -18,7 +18,9 @@ def test_command_on_a_local_cluster(resting, tmp_path, capsys):
     """Findings come back from a worker, files are written, one line of JSON is printed."""
     from distributed import LocalCluster
 
-    with LocalCluster(n_workers=1, threads_per_worker=1, processes=True, dashboard_address=None, host="127.0.0.1") as cluster:
+    with LocalCluster(
+        n_workers=1, threads_per_worker=1, processes=True, dashboard_address=None, host="127.0.0.1"
+    ) as cluster:
         code = main(
             [
                 "diagnose", str(resting.protocol), "--validate", str(resting.sweep), "--robot", "till2020_tissue", "--output",
@@ -35,7 +37,20 @@ def test_command_on_a_local_cluster(resting, tmp_path, capsys):
 def test_next_experiment_can_be_simulated(resting, tmp_path, capsys):
     """Without a validation bag the summary says what that costs; its scenario is one that `simulate` takes."""
     out = tmp_path / "out"
-    assert main(["diagnose", str(resting.protocol), "--robot", "till2020_tissue", "--output", str(out), "--no-report"]) == 0
+    assert (
+        main(
+            [
+                "diagnose",
+                str(resting.protocol),
+                "--robot",
+                "till2020_tissue",
+                "--output",
+                str(out),
+                "--no-report",
+            ]
+        )
+        == 0
+    )
     shown = capsys.readouterr()
     assert "verdict: not_excited" in shown.out
     assert "without a validation bag" in shown.err
@@ -49,7 +64,10 @@ def test_next_experiment_can_be_simulated(resting, tmp_path, capsys):
     [
         (["nowhere.mcap", "--robot", "till2020_tissue"], "no such file"),
         (["BAG", "--robot", "three_tube"], "no complete joint state of robot"),
-        (["BAG", "--robot", "till2020_tissue", "--cluster", "tcp://127.0.0.1:1"], "no Dask scheduler answers"),
+        (
+            ["BAG", "--robot", "till2020_tissue", "--cluster", "tcp://127.0.0.1:1"],
+            "no Dask scheduler answers",
+        ),
         (["README.md", "--robot", "till2020_tissue"], "README.md"),
     ],
 )
