@@ -72,7 +72,7 @@ class TipEstimate:
 def _roots(covariance: Floats) -> tuple[Floats, Floats]:
     """L with L L^T = ``covariance`` (r, r), and its inverse; by eigenvectors, with a pseudo-inverse, where some direction has no spread."""
     try:
-        root: Floats = np.linalg.cholesky(covariance)
+        root = np.asarray(np.linalg.cholesky(covariance), dtype=np.float64)
         if root.diagonal().min() > 1e-7 * root.diagonal().max():
             return root, solve_triangular(root, np.eye(len(root)), lower=True, check_finite=False)
     except np.linalg.LinAlgError:
