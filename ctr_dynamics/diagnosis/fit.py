@@ -37,7 +37,7 @@ class Fit:
     Attributes:
         causes: quantities beyond tolerance. active: all quantities that were free, causes included.
         values: (a,) coordinates. sigma: (a,) posterior deviations. covariance: (a, a).
-        chi2: whitened squares of the residual. cost: twice the negative log posterior density.
+        chi2: whitened squares of the residual. cost: twice the negative log posterior density, tolerances ended.
         log_evidence: relative to no model at all; only differences count.
         whitened: residuals at the best point. columns: (m, a) their derivatives, in coordinates.
     """
@@ -271,9 +271,10 @@ def fit(
     evidence = _laplace(here, columns, variance, numerics)
     one_sided = {q.key for q in causes if (math.isfinite(q.low) and q.low == q.off)}
     evidence += math.log(2.0) * len(one_sided)
-    evidence += inside(active, {q.key for q in causes}, values - off, covariance)
+    within = inside(active, {q.key for q in causes}, values - off, covariance)
+    evidence += within
     left = residual - _numerics_part(residual, numerics)
-    return Fit(tuple(causes), active, values, covariance, float(left @ left), evidence, left, columns, here)
+    return Fit(tuple(causes), active, values, covariance, float(left @ left), evidence, left, columns, here - 2.0 * within)
 
 
 def inside(active: Sequence[Quantity], causes: set[Key], departure: Floats, covariance: Floats) -> float:
