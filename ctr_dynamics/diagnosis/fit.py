@@ -274,7 +274,17 @@ def fit(
     within = inside(active, {q.key for q in causes}, values - off, covariance)
     evidence += within
     left = residual - _numerics_part(residual, numerics)
-    return Fit(tuple(causes), active, values, covariance, float(left @ left), evidence, left, columns, here - 2.0 * within)
+    return Fit(
+        tuple(causes),
+        active,
+        values,
+        covariance,
+        float(left @ left),
+        evidence,
+        left,
+        columns,
+        here - 2.0 * within,
+    )
 
 
 def inside(active: Sequence[Quantity], causes: set[Key], departure: Floats, covariance: Floats) -> float:

@@ -25,6 +25,7 @@ PRIOR_SINGLE, PRIOR_PAIR, PRIOR_TRIPLE = 0.38, 0.1, 0.02
 TEMPERATURE = 1.6  # of the log evidence; tuned on simulated cases of other seeds than the tests'
 SHORTLIST = 8  # candidates that are fitted in full
 SECOND = 4  # second causes that are fitted beside a first
+HOPELESS = 0.3  # of the misfit: two causes that leave more are not made right by a third
 SECOND_EVIDENCE = 5.0  # log evidence that a further cause must add
 SEPARATION = 5.0  # whitened units: below, two explanations cannot be told apart
 PROBE = 0.7  # of the scale: finite probes of effects without a derivative at zero
@@ -371,7 +372,7 @@ def search(
     _score(found, pool)
     top = found[0]
     if top.members:
-        found += _seconds(problem, pool, found, note, workers)
+        found += _seconds(problem, pool, found, clean, note, workers)
         _score(found, pool)
     return Search(found, _probabilities(found, problem), base, lin, screened, pool)
 
@@ -380,6 +381,7 @@ def _seconds(
     problem: Problem,
     pool: list[Candidate],
     found: list[Explanation],
+    clean: Fit,
     note: Callable[[str], None],
     workers: int,
 ) -> list[Explanation]:
@@ -412,6 +414,8 @@ def _seconds(
         out += new
         _score(new, pool)
         leaders = new[:1]
+        if _leftover(problem, new[0].fit) > HOPELESS * _leftover(problem, clean):
+            break  # a third cause would not save it: it is outside the catalogue
     return out
 
 
