@@ -132,7 +132,6 @@ def motion(t):
     """A tip that turns with two tubes, which turn to and fro at different rates and stand still in between."""
     alpha = np.array([1.2 * math.sin(0.9 * t) + 0.4 * math.sin(2.3 * t), 0.9 * math.sin(1.4 * t + 1.0)])
     rate = np.array([1.08 * math.cos(0.9 * t) + 0.92 * math.cos(2.3 * t), 1.26 * math.cos(1.4 * t + 1.0)])
-    swing = 0.004 * math.sin(15 * t)
     angle = alpha.sum() / 2
 
     def place(a, s):

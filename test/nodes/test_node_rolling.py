@@ -92,7 +92,7 @@ def test_what_cannot_be_written_is_said_and_the_thread_goes_on(made, tmp_path):
 
 
 def test_a_path_that_cannot_be_is_refused_at_the_start(tmp_path):
-    with pytest.raises(InputError, match="record.rolling_path"):
+    with pytest.raises(InputError, match=r"record\.rolling_path"):
         RollingRecording(tmp_path / "none" / "a.mcap", 2.0, "r", {}, print)
 
 
