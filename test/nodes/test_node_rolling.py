@@ -114,8 +114,8 @@ def test_a_misfit_leaves_a_bag_that_diagnosis_reads(start, tmp_path):
             return pose._replace(position=(x + 0.02, y, z))
 
         robot.agreeing_pose = shifted
-        status = live.wait_for_status("misfit", 1, "run: ctr-dynamics diagnose")
-        assert str(path) in status.message
+        status = live.wait_for_status("misfit", 1, "2 times written")
+        assert f"run: ctr-dynamics diagnose {path} --robot till2020_tissue" in status.message
         recording = read_recording(path, load_robot("till2020_tissue"))
         assert recording.duration > asked.duration
         assert recording.joints.shape[1] == 5
