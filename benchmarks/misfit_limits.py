@@ -35,7 +35,7 @@ def peaks(hours: float, limits: MisfitLimits, seed: int) -> dict[str, NDArray[np
         total = np.concatenate([[0.0], nis.cumsum()])
         mean = (total[window:] - total[:-window])[LAGS + 1 :] / (AXES * window)
         ends = np.arange(window + LAGS + EVERY, len(white) + 1, EVERY)
-        size = _sums(white**2, window, ends)
+        size = np.maximum(_sums(white**2, window, ends), window)
         rho = sum(
             np.square(_sums(white[lag:] * white[:-lag], window - lag, ends - lag) / size) / (window - lag)
             for lag in range(1, LAGS + 1)

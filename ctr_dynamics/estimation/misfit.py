@@ -43,12 +43,13 @@ class MisfitLimits:
 def ljung_box(white: Floats, lags: int = LAGS) -> float:
     """Ljung-Box statistic of ``white`` (k, axes) over ``lags``, per degree of freedom: near 1 for white innovations.
 
-    Ljung and Box, Biometrika 65 (1978), without removing the mean: a bias is a misfit too.
+    Ljung and Box, Biometrika 65 (1978), without removing the mean, for a bias is a misfit too; and innovations smaller than predicted are
+    related to what was predicted: they are no misfit, however they are correlated.
     """
     k, axes = white.shape
-    size = np.einsum("ij,ij->j", white, white)
+    size = np.maximum(np.einsum("ij,ij->j", white, white), k)
     rho = np.array([np.einsum("ij,ij->j", white[lag:], white[:-lag]) for lag in range(1, lags + 1)])
-    rho /= np.maximum(size, 1e-300)
+    rho /= size
     weight = k * (k + 2.0) / (k - np.arange(1, lags + 1))
     return float(weight @ np.sum(rho**2, axis=1)) / (lags * axes)
 

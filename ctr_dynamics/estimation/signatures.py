@@ -19,9 +19,8 @@ from .rotations import matrix
 Floats = NDArray[np.float64]
 
 GRAVITY = 9.81  # m/s^2, along -y of ctr_base
-MOVING = (
-    0.02  # rad/s (and m/s times 100) beyond which an actuator counts as moving, above the encoders' noise
-)
+# rad/s (and m/s times 100) beyond which an actuator counts as moving: five times what the encoders' noise looks like
+MOVING = 0.2
 INDEPENDENT = (
     10.0  # 1/s: residuals closer than a tenth of a second count as one; the tip swings at a few hertz
 )
@@ -38,6 +37,11 @@ def _turn(m: Moment) -> Floats:
 def _moving(m: Moment) -> float:
     rate = math.hypot(*m.alpha_rate) + 100.0 * math.hypot(*m.beta_rate)
     return rate * rate / (rate * rate + MOVING * MOVING)
+
+
+def _swinging(m: Moment) -> Floats:
+    """Velocity while the actuators stand still: a wrong frequency shows as a phase that runs away."""
+    return (1.0 - _moving(m)) * m.velocity
 
 
 def _cross(m: Moment) -> Floats:
@@ -74,13 +78,13 @@ SIGNATURES: tuple[Signature, ...] = (
     ),
     Signature(
         "youngs_modulus",
-        lambda m, held: np.column_stack([m.position - [0.0, 0.0, m.position[2]], [0.0, 1.0, 0.0]]),
-        "along the deflection from the base's axis, and sag",
+        lambda m, held: np.column_stack([m.position * [1.0, 1.0, 0.0], [0.0, 1.0, 0.0], _swinging(m)]),
+        "along the deflection from the base's axis, sag, and the lag of a swing",
     ),
     Signature(
         "payload_mass",
-        lambda m, held: (m.acceleration + [0.0, GRAVITY, 0.0])[:, None],
-        "along gravity and the tip's acceleration together",
+        lambda m, held: np.column_stack([m.acceleration + [0.0, GRAVITY, 0.0], _swinging(m)]),
+        "along gravity and the tip's acceleration together, and the lag of a swing",
     ),
     Signature(
         "precurvature",
@@ -211,7 +215,7 @@ class Regression:
         found = [Cause(SIGNATURES[best].effect, explained, False)]
         for i in order[1:]:
             part = (self._square - alone[i]) / excess
-            if part >= RIVAL * explained and worth([i], alone[i]) > nothing and len(found) < MOST - 1:
+            if part >= RIVAL * explained and worth([i], alone[i]) > nothing and len(found) < MOST:
                 found.append(Cause(SIGNATURES[i].effect, part, False))
         chosen, left = [best], alone[best]
         while len(found) < MOST:

@@ -91,6 +91,11 @@ def test_the_alarm_ends_a_window_after_the_last_excess_and_counts_again():
     assert monitor.alarms == 1
 
 
+def test_innovations_far_smaller_than_predicted_are_no_misfit():
+    smooth = 0.1 * np.sin(np.arange(1200)[:, None] / 50 + np.arange(6))
+    assert fed(smooth).alarms == 0
+
+
 def test_a_gap_begins_anew():
     monitor = fed(3.0 * white_noise(5, 8))
     assert monitor.alarm
@@ -104,7 +109,7 @@ def test_ljung_box_is_one_for_white_noise_and_what_its_definition_says():
     k, lags = len(whites), 3
     total = 0.0
     for axis in whites.T:
-        size = sum(x * x for x in axis)
+        size = max(sum(x * x for x in axis), k)
         for lag in range(1, lags + 1):
             rho = sum(axis[i] * axis[i - lag] for i in range(lag, k)) / size
             total += k * (k + 2) * rho**2 / (k - lag)
@@ -231,3 +236,9 @@ def test_an_unknown_delay_of_the_tracker_is_noticed_and_ends_once_it_is_set(repl
     assert status.level == WARN
     assert "tracker_latency" in status.message
     assert replayed("latency_sweep", tracker__delay_s=0.018).estimator.health.misfit.alarms == 0
+
+
+def test_a_heavier_payload_is_noticed_and_listed(replayed):
+    monitor = replayed("payload_protocol").estimator.health.misfit
+    assert monitor.alarms > 0
+    assert "payload_mass" in [cause.effect for cause in monitor.causes()]

@@ -106,6 +106,7 @@ def test_a_misfit_leaves_a_bag_that_diagnosis_reads(start, tmp_path):
         assert answer.success, answer.message
         live.wait(path.exists, "the recording of the snapshot")
         asked = read_recording(path, load_robot("till2020_tissue"))
+        assert live.status("misfit").level == bytes([0]), live.status("misfit")
         agreeing = robot.agreeing_pose
 
         def shifted():
