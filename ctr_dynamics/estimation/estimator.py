@@ -28,8 +28,9 @@ from ctr_dynamics.robot import Robot
 from .fusion import Fusion, FusionOptions
 from .health import Health
 from .kernels import backbone_rows
+from .misfit import misfit_monitor
 from .modes import ModeTracker
-from .outputs import Innovation, Modes, SolverStats, StepOutput
+from .outputs import Innovation, Modes, Moment, SolverStats, StepOutput
 from .rotations import conjugate, from_vector, matrix
 from .signals import Signal, finite, joint_order
 from .tip import TipWindow
@@ -118,7 +119,7 @@ class Estimator:
         self.step_times_s = array("d")
         self._reported: deque[Innovation] = deque(maxlen=200)
         self._clear()
-        self.health = Health()
+        self.health = Health(misfit=misfit_monitor(settings, robot.tracker.noise.position.value))
         self.health.fusing = self._fusing = bool(settings["filter.enabled"])
 
     def _clear(self) -> None:
@@ -382,6 +383,7 @@ class Estimator:
         self.fusion._apply_theta()
         self.health.problem = "waiting for the first complete joint state"
         self.health.recent.clear()
+        self.health.misfit.clear()
 
     def set_fusion(self, on: bool) -> None:
         """Use tracker samples, or let the model run alone; samples are compared all the same."""
@@ -533,7 +535,7 @@ class Estimator:
             if time_s - self.tracker.delay > t + 1e-9:
                 continue
             sample.fused_k = k
-            self._compare(sample, time_s)
+            moment = self._compare(sample, time_s)
             if self._fusing:
                 update = self.fusion.update(self._fused, time_s, sample.position, sample.quaternion)
             else:
@@ -560,6 +562,8 @@ class Estimator:
                     update.accepted,
                     sample.late_s,
                     update.reason,
+                    update.white,
+                    moment,
                 )
             )
         limit = self.t0_ns + k * DT_NS - 2 * self.window_ns - 300_000_000
@@ -567,18 +571,25 @@ class Estimator:
             self._samples.pop(0)
         self.health.force_sigma = self.fusion.force_sigma
 
-    def _compare(self, sample: Sample, time_s: float) -> None:
-        """Residuals of the published outputs against a sample, before its update."""
-        dt = DT_NS * 1e-9
+    def _compare(self, sample: Sample, time_s: float) -> Moment | None:
+        """Residuals of the published outputs against a sample, before its update, and the moment of it."""
+        dt, n = DT_NS * 1e-9, self.model.n
         fused = self.fusion.tips.at(time_s - self.tracker.delay, dt)
         alone = self._alone_tips.at(time_s - self.tracker.delay, dt)
-        if fused is None or alone is None:
-            return
+        earlier = self._alone_tips.at(time_s - self.tracker.delay - 2 * dt, dt) or alone
+        if fused is None or alone is None or earlier is None:
+            return None
         position, _ = self.tracker.to_base(sample.position, sample.quaternion)
         estimate = registered(self.tracker, self.fusion.bias, fused)[:3]
         self._squares[0] += float(np.sum((position - alone.position) ** 2))
         self._squares[1] += float(np.sum((position - estimate) ** 2))
         self._residuals += 1
+        joints, rates = self._joints.at(sample.stamp_ns - self.tracker.delay * 1e9)
+        acceleration = (alone.velocity - earlier.velocity) / (2 * dt)
+        return Moment(
+            position - alone.position, alone.position.copy(), alone.quaternion.copy(), alone.velocity.copy(), acceleration,
+            joints[:n], rates[:n], rates[n:],
+        )  # fmt: skip
 
     # -- roll-back --
 
@@ -703,6 +714,8 @@ class Estimator:
     def _take_innovations(self) -> list[Innovation]:
         innovations, self._innovations = self._innovations, []
         self._reported.extend(innovations)
+        for innovation in innovations:
+            self.health.misfit.add(innovation)
         return innovations
 
     def _invalid(self, k: int, reason: str) -> StepOutput:

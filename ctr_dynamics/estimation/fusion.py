@@ -48,7 +48,8 @@ class FusionOptions:
 
 @dataclass(frozen=True)
 class Update:
-    """One tracker sample's outcome: residual (6,), its predicted variance (6,), NIS, degrees of freedom, accepted, reason."""
+    """One tracker sample's outcome: residual (6,), its predicted variance (6,), NIS, degrees of freedom, accepted, reason, and ``white`` (6,):
+    the residual by the inverse root of its covariance, NaN on axes that are not measured."""
 
     residual: Floats
     variance: Floats
@@ -56,6 +57,7 @@ class Update:
     dof: int
     accepted: bool
     reason: str
+    white: Floats
 
 
 @dataclass(frozen=True)
@@ -262,7 +264,7 @@ class Fusion:
         unknown = np.full(6, np.nan)
         tip = self.tips.at(stamp - self.tracker.delay - self.bias[DELAY], self.simulator.scheme.dt)
         if tip is None:
-            return Update(unknown, unknown, math.nan, 0, False, "outside the window of kept steps")
+            return Update(unknown, unknown, math.nan, 0, False, "outside the window of kept steps", unknown)
         mask = self.tracker.mask
         nu = residual(position, quaternion, *expected(self.tracker, self.bias, tip), mask)[mask]
         H = sensitivity(self.tracker, self.bias, tip)[mask]
@@ -270,10 +272,11 @@ class Fusion:
         S = H @ self.pi @ H.T + R
         nis = float(nu @ np.linalg.solve(S, nu))
         if not math.isfinite(nis):
-            return Update(unknown, unknown, math.nan, 0, False, "the innovation is not finite")
-        full, variance = unknown.copy(), unknown.copy()
+            return Update(unknown, unknown, math.nan, 0, False, "the innovation is not finite", unknown)
+        full, variance, white = unknown.copy(), unknown.copy(), unknown.copy()
         full[mask], variance[mask] = nu, np.diag(S)
-        return nu, H, R, Update(full, variance, nis, int(mask.sum()), False, "")
+        white[mask] = _roots(S)[1] @ nu
+        return nu, H, R, Update(full, variance, nis, int(mask.sum()), False, "", white)
 
     @property
     def force(self) -> Floats:

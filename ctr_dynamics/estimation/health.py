@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 
 from scipy.stats import chi2
 
+from .misfit import MisfitMonitor
 from .outputs import ERROR, OK, WARN, Status
 
 TRACKER_LIMIT_S = 1.0  # without a usable sample for longer than this the status says so
@@ -32,7 +33,7 @@ class Health:
 
     ``joints``, ``tracker``, ``load``: input problems by kind. ``nis_sum``, ``nis_dof``, ``nis_count``: over all samples that reached the gate.
     ``tracker_age_s``: since the newest sample that reached the gate, or the start.
-    ``recent``: (nis / dof, within the gate) of the last samples.
+    ``recent``: (nis / dof, within the gate) of the last samples. ``misfit``: watches the innovations.
     """
 
     joints: dict[str, Counter] = field(default_factory=dict)
@@ -57,6 +58,7 @@ class Health:
     fusing: bool = True
     force_sigma: float = 0.0
     tracker_age_s: float = 0.0
+    misfit: MisfitMonitor = field(default_factory=MisfitMonitor)
     _within: int = 0
 
     def note(self, group: str, kind: str, what: str) -> None:
@@ -108,6 +110,7 @@ class Health:
             self._tracker(),
             self._inputs("load"),
             self._consistency(),
+            self.misfit.status(),
         ]
 
     def _output(self) -> Status:

@@ -29,9 +29,29 @@ class Modes:
 
 
 @dataclass(frozen=True)
+class Moment:
+    """The model alone at a tracker sample's own time, ``ctr_base``, SI units.
+
+    Attributes:
+        residual: (3,) reading minus position. position (3,), quaternion (4,) wxyz, velocity (3,), acceleration (3,): of the tip.
+        alpha, alpha_rate, beta_rate: (n,) rad, rad/s, m/s.
+    """
+
+    residual: Floats
+    position: Floats
+    quaternion: Floats
+    velocity: Floats
+    acceleration: Floats
+    alpha: Floats
+    alpha_rate: Floats
+    beta_rate: Floats
+
+
+@dataclass(frozen=True)
 class Innovation:
     """A processed tracker sample: residual (6,) and its predicted variance (6,) (position m in the tracker's axes, rotation rad in the
-    sensor's), NIS, degrees of freedom, whether it was fused, how late it came (s), and why it was not fused."""
+    sensor's), NIS, degrees of freedom, whether it was fused, how late it came (s), and why it was not fused; for the misfit monitor the
+    whitened residual (6,) and the moment, None where the model alone has no tip of that time."""
 
     stamp_ns: int
     residual: Floats
@@ -41,6 +61,8 @@ class Innovation:
     accepted: bool
     delay_s: float
     reason: str = ""
+    white: Floats | None = None
+    moment: Moment | None = None
 
 
 @dataclass(frozen=True)

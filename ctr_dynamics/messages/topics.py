@@ -383,7 +383,7 @@ TOPICS: tuple[Topic, ...] = (
         "out",
         OUTPUT_QOS,
         "about 1 Hz, and at once when validity changes",
-        "Health of solver, timing, tracker, joints and consistency.",
+        "Health of solver, timing, tracker, joints, consistency and misfit.",
         (
             Field("header.stamp", "model time of the step it belongs to", "s, ns"),
             Field("header.frame_id", "empty"),
@@ -396,6 +396,10 @@ TOPICS: tuple[Topic, ...] = (
         ),
         (
             "`ctr_estimator: output` is ERROR with the reason while `/ctr/estimator/valid` is false.",
+            "`ctr_estimator: misfit` is WARN while mean NIS, CUSUM of the NIS or autocorrelation of the innovations were beyond their limits "
+            "(parameters `misfit.*`) within the last window. It lists the two or three likeliest causes by their effect IDs "
+            "(`ctr_dynamics.effects`), or says that none of the list explains it. With `record.rolling_s` it names the recording of the "
+            "last seconds and the `ctr-dynamics diagnose` command to run on it.",
             "In a replay no value depends on the wall clock.",
         ),
     ),

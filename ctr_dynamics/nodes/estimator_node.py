@@ -35,6 +35,7 @@ from ctr_dynamics.nodes.naming import NAME, NAMESPACE, message_class, node_topic
 from ctr_dynamics.nodes.outputs import Outputs
 from ctr_dynamics.nodes.recorder import Recorder
 from ctr_dynamics.nodes.rehearsal import rehearse
+from ctr_dynamics.nodes.rolling import RollingRecording
 from ctr_dynamics.nodes.spinning import spin_until, stop_on_signals
 from ctr_dynamics.nodes.stepping import StepLoop
 from ctr_dynamics.nodes.timing import StepTiming
@@ -66,6 +67,7 @@ class EstimatorNode(Node):
             self.settings["output.policy"], round(self.settings["input_timeout_s"] * 1e9)
         )
         self.recorder = self._open_recorder()
+        self.rolling = self._open_rolling()
         self._qos_faults = qos.QosFaults()
         self._undecodable: dict[str, tuple[int, str]] = {}
         self._next_diagnostics_ns = 0
@@ -111,15 +113,28 @@ class EstimatorNode(Node):
 
     def _open_recorder(self) -> Recorder | None:
         path = self.settings["record.path"]
-        if not path:
+        return Recorder(LiveRecorder(path, self._provenance()), self.get_logger().error) if path else None
+
+    def _open_rolling(self) -> RollingRecording | None:
+        seconds = self.settings["record.rolling_s"]
+        if not seconds:
             return None
-        metadata = {
+        path = self.settings["record.rolling_path"]
+        if not path:
+            folder = Path(get_logging_directory())
+            folder.mkdir(parents=True, exist_ok=True)
+            path = folder / "ctr_estimator_rolling.mcap"
+        return RollingRecording(
+            path, seconds, self.settings["robot"], self._provenance(), self.get_logger().warning
+        )
+
+    def _provenance(self) -> dict[str, str]:
+        return {
             "version": __version__,
             "robot": self._robot.name,
             "robot_sha256": self._robot.sha256,
             "parameters": json.dumps(self.settings.as_dict()),
         }
-        return Recorder(LiveRecorder(path, metadata), self.get_logger().error)
 
     def _clock_source(self) -> Callable[[], int]:
         """Current time of the clock that stamps the messages."""
@@ -138,13 +153,15 @@ class EstimatorNode(Node):
             topics.TRACKER_TIP: self._take_tracker,
             topics.TIP_LOAD: self._take_load,
         }[topic.name]
-        loop, now_ns, record = self.loop, self._now_ns, self.recorder
+        loop, now_ns, record, rolling = self.loop, self._now_ns, self.recorder, self.rolling
 
         def arrived(data: bytes) -> None:
             arrival_ns = now_ns()
             loop.put(partial(take, data, arrival_ns))
             if record is not None:
                 record.put(topic.name, arrival_ns, data)
+            if rolling is not None:
+                rolling.put(topic.name, arrival_ns, data)
 
         return self.create_subscription(
             message_class(topic.ros_type),
@@ -197,6 +214,8 @@ class EstimatorNode(Node):
     def _housekeeping(self, now_ns: int) -> None:
         """Diagnostics, at once when validity has changed and else at 2 Hz of the wall clock."""
         monotonic_ns = time.monotonic_ns()
+        if self.rolling is not None:
+            self.rolling.alarm(self._estimator.health.misfit.alarm, monotonic_ns)
         if self.outputs.valid == self._shown_valid and monotonic_ns < self._next_diagnostics_ns:
             return
         self._next_diagnostics_ns = monotonic_ns + DIAGNOSTICS_NS
@@ -209,8 +228,11 @@ class EstimatorNode(Node):
         self.outputs.diagnostics(max(now_ns, 0), self._statuses(now_ns))
 
     def _statuses(self, now_ns: int) -> list[Any]:
+        health = self._estimator.health.statuses()
+        if self.rolling is not None:
+            health = [self.rolling.describe(s) if s.name == "misfit" else s for s in health]
         return [
-            *self._estimator.health.statuses(),
+            *health,
             diagnostics.timing_status(
                 self.timing, self.loop.faults, self.loop.last_fault, self.outputs.withheld_behind_ns
             ),
@@ -268,6 +290,8 @@ class EstimatorNode(Node):
 
     def _save_snapshot(self) -> Path:
         snapshot = self.loop.call(self._estimator.snapshot)
+        if self.rolling is not None:
+            self.rolling.save("snapshot saved")
         folder = Path(get_logging_directory())
         folder.mkdir(parents=True, exist_ok=True)
         path = folder / f"ctr_estimator_{time.time_ns()}.json"
@@ -314,6 +338,8 @@ class EstimatorNode(Node):
         self.loop.join()
         if self.recorder is not None:
             self.recorder.close()
+        if self.rolling is not None:
+            self.rolling.close(self._estimator.health.misfit.alarm)
         path = self.settings["timing_report"]
         if path:
             Path(path).write_text(json.dumps(self.timing.report(), indent=1), encoding="utf-8")

@@ -1,0 +1,124 @@
+"""The rolling recording: what it keeps, when it writes, and over DDS that diagnosis can read what a misfit left behind."""
+
+import threading
+
+import pytest
+
+from ctr_dynamics.bagio.reader import open_bag
+from ctr_dynamics.diagnosis.recording import read_recording
+from ctr_dynamics.errors import InputError
+from ctr_dynamics.estimation.outputs import WARN, Status
+from ctr_dynamics.messages import topics
+from ctr_dynamics.messages.cdr import decode_stamp
+from ctr_dynamics.messages.encode import encode_joint_state, encode_wrench_stamped
+from ctr_dynamics.nodes import rolling
+from ctr_dynamics.nodes.rolling import RollingRecording
+from ctr_dynamics.robot import load_robot
+
+MS = 1_000_000
+S = 1_000 * MS
+
+
+def joints(stamp_ns):
+    return encode_joint_state(stamp_ns, ["tube1_rotation"], [0.1])
+
+
+@pytest.fixture
+def made(tmp_path):
+    """A recording of two seconds and the lines of its log; closed at the end."""
+    lines = []
+    recording = RollingRecording(tmp_path / "rolling.mcap", 2.0, "my robot.yaml", {}, lines.append)
+    yield recording, lines
+    if recording._thread.is_alive():
+        recording.close(active=False)
+
+
+def test_it_keeps_the_last_seconds_and_the_load_that_stood_before_them(made):
+    recording, lines = made
+    load = encode_wrench_stamped(0, "ctr_base", (0.0, -0.5, 0.0), (0.0, 0.0, 0.0))
+    recording.put(topics.TIP_LOAD, 0, load)
+    for i in range(1000):
+        recording.put(topics.JOINT_STATES, i * 10 * MS, joints(i * 10 * MS))
+    kept = recording.messages()
+    assert kept[0] == (topics.TIP_LOAD, kept[1][1], load)
+    assert len(kept) == 1 + 201
+    recording.close(active=True)
+    bag = open_bag(recording.path)
+    assert bag.topics[topics.JOINT_STATES].messages == 201
+    assert bag.topics[topics.TIP_LOAD].messages == 1
+    stamps = [item.message.stamp_ns for item in bag.inputs() if item.topic == topics.JOINT_STATES]
+    assert (min(stamps), max(stamps)) == (decode_stamp(joints(7990 * MS)), 9990 * MS)
+    assert any("exit under an alarm" in line and recording.command in line for line in lines)
+
+
+def test_memory_is_bounded_and_a_clock_that_goes_back_begins_anew(made, monkeypatch):
+    recording, _ = made
+    monkeypatch.setattr(rolling, "LIMIT_BYTES", 1000)
+    for i in range(100):
+        recording.put(topics.JOINT_STATES, 100 * S + i, bytes(100))
+    assert sum(len(data) for _, _, data in recording.messages()) <= 1000
+    recording.put(topics.JOINT_STATES, 5 * S, bytes(2000))
+    assert recording.messages() == []  # a single message beyond the limit is not kept either
+    recording.put(topics.JOINT_STATES, 5 * S, bytes(20))
+    assert [log_ns for _, log_ns, _ in recording.messages()] == [5 * S]
+
+
+def test_an_alarm_is_written_at_once_and_then_once_in_the_kept_length(made, monkeypatch):
+    recording, _ = made
+    asked = []
+    monkeypatch.setattr(recording, "save", asked.append)
+    for t in (0.0, 1.0, 1.99, 2.0, 3.9):
+        recording.alarm(True, round(t * 1e9))
+    assert len(asked) == 2
+    recording.alarm(False, 100 * S)
+    assert len(asked) == 2
+
+
+def test_what_cannot_be_written_is_said_and_the_thread_goes_on(made, tmp_path):
+    recording, lines = made
+    done = threading.Event()
+    recording._log = lambda line: (lines.append(line), done.set())
+    recording.save("asked")
+    assert done.wait(30)
+    assert "no input has come yet" in recording.error
+    assert "no input" in recording.describe(Status("misfit", WARN, "misfit", {})).values["rolling recording"]
+    recording.put(topics.JOINT_STATES, 0, joints(0))
+    recording.save("asked again")
+    recording.close(active=False)
+    assert recording.error == ""
+    status = recording.describe(Status("misfit", WARN, "misfit", {}))
+    assert f"diagnose {recording.path} --robot 'my robot.yaml'" in status.message
+    assert status.values["recording"] == str(recording.path)
+
+
+def test_a_path_that_cannot_be_is_refused_at_the_start(tmp_path):
+    with pytest.raises(InputError, match=r"record\.rolling_path"):
+        RollingRecording(tmp_path / "none" / "a.mcap", 2.0, "r", {}, print)
+
+
+@pytest.mark.ros
+def test_a_misfit_leaves_a_bag_that_diagnosis_reads(start, tmp_path):
+    path = tmp_path / "rolling.mcap"
+    with start({"record.rolling_s": 20.0, "record.rolling_path": str(path)}) as live:
+        robot = live.resting_robot()
+        live.wait_for_more(topics.INNOVATION, 150)
+        answer = live.trigger("save_snapshot")
+        assert answer.success, answer.message
+        live.wait(path.exists, "the recording of the snapshot")
+        asked = read_recording(path, load_robot("till2020_tissue"))
+        assert live.status("misfit").level == bytes([0]), live.status("misfit")
+        agreeing = robot.agreeing_pose
+
+        def shifted():
+            pose = agreeing()
+            x, y, z = pose.position
+            return pose._replace(position=(x + 0.02, y, z))
+
+        robot.agreeing_pose = shifted
+        status = live.wait_for_status("misfit", 1, "2 times written")
+        assert f"run: ctr-dynamics diagnose {path} --robot till2020_tissue" in status.message
+        recording = read_recording(path, load_robot("till2020_tissue"))
+        assert recording.duration > asked.duration
+        assert recording.joints.shape[1] == 5
+        assert set(recording.sha256) == {"rolling.mcap"}
+    assert "exit under an alarm" in live.process.output()
