@@ -12,8 +12,6 @@ if TYPE_CHECKING:
 
     from .setup import Setup
 
-LOWEST = -0.9  # a scale may fall to a tenth
-
 
 def _scaled(*groups: str):  # type: ignore[no-untyped-def]
     """Apply ``tubeN.scale`` and ``all.scale`` to groups of the parameter block."""
