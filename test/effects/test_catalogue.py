@@ -80,7 +80,8 @@ def test_units_and_off_values_are_those_of_the_contract(name):
         elif off == "robot file":
             assert callable(p.off)
         elif off == "infinite":
-            assert p.off == math.inf and p.power < 0
+            assert p.off == math.inf
+            assert p.power < 0
         else:
             assert p.off == off, param
 
@@ -98,13 +99,14 @@ def test_off_values_leave_every_bit_of_the_setup(name):
 @pytest.mark.parametrize("name", sorted(EFFECTS))
 def test_bounds_priors_and_descriptions_are_sane(name):
     effect = EFFECTS[name]
-    assert effect.text.endswith(".") and effect.source
+    assert effect.text.endswith(".")
+    assert effect.source
     for p in effect.parameters:
         assert p.text
         off = p.coordinate(float(p.off(ROBOT, 0) if callable(p.off) else p.off))
         assert p.low <= off <= p.high or (p.shape and not math.isfinite(off)), p.name
         scale = float(p.scale(ROBOT, 0) if callable(p.scale) else p.scale)
-        assert math.isfinite(scale) and scale > 0.0, p.name
+        assert 0.0 < scale < math.inf, p.name
         for coordinate in (max(off, p.low) + 0.7 * scale, max(off, p.low) + 2.0 * scale):
             if math.isfinite(coordinate):
                 assert p.coordinate(p.value(coordinate)) == pytest.approx(coordinate, rel=1e-12)
