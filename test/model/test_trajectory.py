@@ -95,7 +95,7 @@ def compare(model, slide, parameters, inputs, tolerance):
     assert not found.failure
     assert found.columns is not None
     assert found.columns.shape == (101, TIP_ROWS, len(units))
-    h = 2e-3
+    h, wrong = 2e-3, []
     for c in range(len(units)):
         ends = []
         for sign in (1.0, -1.0):
@@ -113,12 +113,9 @@ def compare(model, slide, parameters, inputs, tolerance):
         for part in (slice(0, 3), slice(3, 7), slice(7, 10), slice(10, 13)):
             size = np.abs(expected[:, part]).max()
             error = np.abs(found.columns[:, part, c] - expected[:, part]).max()
-            assert size > 0.0, (units[c], part)
-            assert error < tolerance * size, (
-                (*parameters, *inputs)[c],
-                part,
-                error / size,
-            )
+            if not (size > 0.0 and error < tolerance * size):
+                wrong.append(((*parameters, *inputs)[c], part, size, error / max(size, 1e-300)))
+    assert not wrong
 
 
 def test_sensitivities_of_a_plain_run():
@@ -163,7 +160,7 @@ def test_sensitivities_of_an_extended_run():
             },
             "clearance": {"play_rad": 0.01},
             "ovality": {"tube1.ratio": 1.1, "tube1.axis_rad": 0.4},
-            "softening": {"tube2.curvature_1_per_m": 60.0},
+            "softening": {"tube1.curvature_1_per_m": 40.0},
             "air_drag": {"linear_Ns_per_m2": 0.05, "quadratic_Ns2_per_m3": 0.1},
             "stribeck": {"static_ratio": 1.5, "speed_rad_s": 5.0},
             "distributed_friction": {"torque_Nm_per_m": 2e-3},
@@ -183,7 +180,7 @@ def test_sensitivities_of_an_extended_run():
             ("play", 0, 1e-3),
             ("play_share", 0, 0.05),
             ("oval_cos", 0, 0.01),
-            ("softening", 1, 1e-5),
+            ("softening", 0, 1e-4),
             ("drag_linear", 0, 0.01),
             ("drag_quadratic", 0, 0.02),
             ("stribeck_excess", 0, 0.05),
