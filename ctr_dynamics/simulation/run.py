@@ -134,7 +134,7 @@ def drives(scenario: Scenario, robot: Robot, model: Model) -> tuple[Drive, Drive
         follow = _behind_play(turned, setup.backlash, end, 0.2 * scenario.solver.dt_s)
 
     def late(t: float) -> tuple[Floats, Floats]:
-        if t >= setup.actuator_delay or not setup.actuator_delay:
+        if t > setup.actuator_delay or not setup.actuator_delay:
             return follow(t - setup.actuator_delay)
         return follow(0.0)[0], np.zeros(robot.n_tubes)
 

@@ -23,10 +23,24 @@ SCENARIO = Scenario.model_validate(
         "noise": False,
         "tubes": [
             {
-                "rotation": [{"kind": "sine", "duration_s": 1.2, "amplitude": 0.5, "frequency_hz": 1.5}],
-                "translation": [{"kind": "sine", "duration_s": 1.2, "amplitude": 0.004, "frequency_hz": 1.0}],
+                "rotation": [
+                    {"kind": "sine", "duration_s": 1.2, "amplitude": 0.5, "frequency_hz": 1.5, "fade_s": 0.3}
+                ],
+                "translation": [
+                    {
+                        "kind": "sine",
+                        "duration_s": 1.2,
+                        "amplitude": 0.004,
+                        "frequency_hz": 1.0,
+                        "fade_s": 0.3,
+                    }
+                ],
             },
-            {"rotation": [{"kind": "sine", "duration_s": 1.2, "amplitude": 0.4, "frequency_hz": 1.0}]},
+            {
+                "rotation": [
+                    {"kind": "sine", "duration_s": 1.2, "amplitude": 0.4, "frequency_hz": 1.0, "fade_s": 0.3}
+                ]
+            },
         ],
         "loads": [{"force_N": [0.1, -0.3, 0.0], "end_s": 0.3}],
         "solver": {"dt_s": 0.003, "nodes": 20},
@@ -67,10 +81,10 @@ def residuals(folder, robot, *readers):
                 "encoder_gain": {"tube2.gain": 1.08},
                 "exposed_length": {"tube1.beta_offset_m": 0.002},
             },
-            2e-5,
+            5e-5,
         ),
         ({"actuator_latency": {"delay_s": 0.03}}, 5e-5),
-        ({"backlash": {"tube1.width_rad": 0.15, "tube2.width_rad": 0.1}}, 2e-4),
+        ({"backlash": {"tube1.width_rad": 0.15, "tube2.width_rad": 0.1}}, 3e-4),
         (
             {
                 "tracker_scale": {"scale": 1.03},
@@ -83,13 +97,16 @@ def residuals(folder, robot, *readers):
             5e-5,
         ),
         ({"tracker_averaging": {"window_s": 0.03}, "tip_force": {"Fx_N": 0.05}}, 6e-4),
-        ({"payload_mass": {"added_kg": 1.5e-3}, "youngs_modulus": {"all.scale": 0.95}}, 2e-5),
+        ({"payload_mass": {"added_kg": 1.5e-3}, "youngs_modulus": {"all.scale": 0.95}}, 5e-5),
     ],
     ids=["encoders", "latency", "backlash", "tracker", "averaging", "parameters"],
 )
 def test_a_bag_is_explained_by_the_robot_file_that_made_it(tmp_path, extensions, limit_m):
     robot = extended(extensions)
     own, plain = residuals(tmp_path, robot, robot, PLAIN)
+    print(
+        f"rms {1e3 * own:.4f} mm with the robot file that made the bag, {1e3 * plain:.4f} mm with the plain one"
+    )
     assert own < limit_m
     assert own < 0.4 * plain
 
