@@ -10,11 +10,8 @@ import yaml
 
 from ctr_dynamics.errors import InputError
 from ctr_dynamics.robot import (
-    EXTENSIONS,
-    Extension,
     load_robot,
     quantities,
-    register_extension,
     robot_from_dict,
     robot_names,
     robot_to_dict,
@@ -365,16 +362,22 @@ def test_actuator_problem():
 # --- extensions ---------------------------------------------------------------------------------------------
 
 
-def test_registered_extension_is_taken_and_its_parameters_are_checked(tissue):
-    register_extension(Extension("test_extension", ("tubeN.scale", "gap_m")))
-    try:
-        tissue["extensions"] = {"test_extension": {"tube2.scale": 1.05, "gap_m": 1e-5}}
-        assert robot_from_dict(tissue).extensions["test_extension"]["tube2.scale"] == 1.05
-        tissue["extensions"] = {"test_extension": {"tubeN.scale": 1.0}}
-        assert "has no parameter 'tubeN.scale'" in refusal(tissue)
-        tissue["extensions"] = {"test_extension": {"gap_m": math.nan}}
-        assert "not finite" in refusal(tissue)
-        with pytest.raises(ValueError, match="registered twice"):
-            register_extension(Extension("test_extension", ("other",)))
-    finally:
-        del EXTENSIONS["test_extension"]
+def test_extensions_of_the_catalogue_are_taken_and_checked(tissue):
+    tissue["extensions"] = {"youngs_modulus": {"tube2.scale": 1.05}, "clearance": {"play_rad": 0.003}}
+    assert robot_from_dict(tissue).extensions["youngs_modulus"]["tube2.scale"] == 1.05
+    for values, words in (
+        ({"clearence": {"play_rad": 0.003}}, ["unknown extension 'clearence'", "did you mean 'clearance'?"]),
+        ({"wormhole": {}}, ["unknown extension 'wormhole'", "known extensions: ", "tip_spring"]),
+        ({"youngs_modulus": {"tubeN.scale": 1.0}}, ["no parameter 'tubeN.scale'", "tubeN.scale, all.scale"]),
+        ({"youngs_modulus": {"tube3.scale": 1.0}}, ["'tube3.scale'", "2 tubes"]),
+        ({"youngs_modulus": {"all.scale": "1.1"}}, ["'1.1' is not a number"]),
+        ({"clearance": {"play_rad": math.nan}}, ["not finite"]),
+        ({"clearance": {"play_rad": -0.003}}, ["'play_rad' is -0.003 rad", "between 0 and inf"]),
+        ({"ovality": {"tube1.ratio": 0.2}}, ["'tube1.ratio' is 0.2 1", "between 0.3 and inf"]),
+        ({"softening": {"tube1.curvature_1_per_m": 0.0}}, ["must be above 0", "leave it out"]),
+        ({"drivetrain_compliance": {"tube1.stiffness_Nm_per_rad": math.inf}}, ["not finite"]),
+    ):
+        tissue["extensions"] = values
+        message = refusal(tissue)
+        for word in words:
+            assert word in message

@@ -107,7 +107,7 @@ def test_motions_out_of_range_are_refused_before_anything_runs():
 
 
 def test_shipped_scenarios_are_valid():
-    assert scenario_names() == ("release", "sweep")
+    assert scenario_names() == ("light_release", "release", "reversals", "sweep", "turns")
     for name in scenario_names():
         assert load_scenario(name).duration_s > 1
     release = load_scenario("release")

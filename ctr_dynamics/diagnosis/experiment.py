@@ -10,10 +10,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
-from ctr_dynamics.effects import EFFECTS, Quantity, Setup, apply_effects, make_setup
+from ctr_dynamics.effects import EFFECTS, Quantity, Setup, apply_effects, make_setup, play
 from ctr_dynamics.model.model import Model
 from ctr_dynamics.model.scheme import make_scheme
 from ctr_dynamics.model.trajectory import InputRows, Trajectory, run
@@ -43,18 +42,6 @@ class Prediction:
     quaternion: Floats
     trajectory: Trajectory
     failure: str
-
-
-@njit(cache=True)
-def play(values: Floats, width: float) -> Floats:
-    """Play operator with dead zone ``width``: the output moves only when the input has crossed it. Starts in its middle."""
-    out = np.empty_like(values)
-    state = values[0]
-    half = 0.5 * width
-    for i in range(len(values)):
-        state = min(max(state, values[i] - half), values[i] + half)
-        out[i] = state
-    return out
 
 
 class Experiment:

@@ -36,7 +36,7 @@ class Parameter:
             reciprocal.
         scale: 1-sigma of a plausible departure, in the parameter's coordinate (see :meth:`coordinate`); a function where it depends on the robot.
         tolerance: 1-sigma that the robot file allows, in the same coordinate.
-        low, high: bounds of the coordinate's departure from off, inclusive.
+        low, high: bounds of the coordinate, inclusive.
         text: what it is.
         power: the coordinate is value^power: -1 for a stiffness that acts as a compliance, -2 where the effect grows with its square.
         shape: True for a parameter that has no effect by itself (a speed, an axis, a place); its ``off`` is where a search starts.

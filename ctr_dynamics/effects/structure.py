@@ -12,8 +12,6 @@ if TYPE_CHECKING:
 
     from .setup import Setup
 
-LOWEST = -0.9  # a scale may fall to a tenth
-
 
 def _scaled(*groups: str):  # type: ignore[no-untyped-def]
     """Apply ``tubeN.scale`` and ``all.scale`` to groups of the parameter block."""
@@ -274,7 +272,7 @@ register(
         ),
         _softening,
         "The moment grows slower than the curvature, as in superelastic Nitinol before its plateau.",
-        "Bergman and Yang (1990), smooth moment-curvature law; Nitinol: Rucker et al. (2010)",
+        "Goldberg and Richard (1963), law of strain and stress that saturates, with exponent 2; Nitinol: Rucker et al. (2010)",
         extended=True,
     )
 )

@@ -24,6 +24,7 @@ from ctr_dynamics.model.scheme import make_scheme
 from ctr_dynamics.model.simulator import Inputs, Simulator, State, StepResult
 from ctr_dynamics.parameters import Settings, axes_mask
 from ctr_dynamics.robot import Robot
+from ctr_dynamics.snap.stability import StabilityWatch
 
 from .fusion import Fusion, FusionOptions
 from .health import Health
@@ -32,7 +33,7 @@ from .misfit import misfit_monitor
 from .modes import ModeTracker
 from .outputs import Innovation, Modes, Moment, SolverStats, StepOutput
 from .rotations import conjugate, from_vector, matrix
-from .signals import Signal, finite, joint_order
+from .signals import Drives, Signal, finite, joint_order
 from .tip import TipWindow
 from .tracker import ROTATION, TRANSLATION, registered, tracker_model
 
@@ -41,6 +42,7 @@ DT_NS = 3_000_000
 LOAD_GRACE_NS = 100_000_000  # a first load that comes this soon after the joints is there from the start
 AHEAD_NS = 10_000_000_000  # a pose that far after the newest joint state is on another clock
 WAITING_SAMPLES = 200  # poses kept until the first joint state
+STABILITY_EVERY = 33  # steps between looks at the elastic stability
 MODES_EVERY = 132  # steps between refreshes of the vibration modes
 RETRY_EVERY = 33  # steps between starts while there is no equilibrium: looking for one in vain takes long
 MAX_FAILURES = 10  # steps in a row that may fail before the model starts anew at rest
@@ -89,8 +91,9 @@ class Estimator:
         self.simulator = Simulator(self.model, scheme, tolerance)
         self.reference = Simulator(self.model, scheme, tolerance)
         self.window_ns = round(float(settings["filter.window_s"]) * 1e9)
+        self.setup = self.model.setup
         self.tracker = tracker_model(
-            robot,
+            self.setup,
             delay=float(settings["tracker.delay_s"]),
             lever=np.array(settings["tracker.lever_arm_m"]),
             rotation=np.array(settings["tracker.registration_rotation_rad"]),
@@ -115,7 +118,12 @@ class Estimator:
             for i in range(self.model.n)
             if f"encoder_offset.tube{i + 1}" in self.fusion.uncertainty.names
         ]
-        self._nominal_offset = robot.encoders.offset.value
+        self._load_delay_ns = round(self.setup.load_shift * 1e9)
+        # share of the rates of beta that the model's own velocities hold already
+        self._inserted = (
+            float(self.setup.block[self.model.layout["insertion"]][0]) if self.model.extended else 0.0
+        )
+        self.fusion.inserted = self._inserted
         self.step_times_s = array("d")
         self._reported: deque[Innovation] = deque(maxlen=200)
         self._clear()
@@ -126,7 +134,8 @@ class Estimator:
         n = self.model.n
         self.t0_ns: int | None = None
         self.k = -1
-        self._joints, self._load = Signal(2 * n), Signal(6)
+        self._joints = Drives(n, self.setup.backlash, round(self.setup.actuator_delay * 1e9))
+        self._load = Signal(6)
         self._samples: list[Sample] = []
         self._kept: deque[Kept] = deque()
         self._return_to: int | None = None  # ns: inputs from here on have changed
@@ -137,6 +146,7 @@ class Estimator:
         self._innovations: list[Innovation] = []
         self._failures = 0
         self._no_start: tuple[int, str] | None = None  # step and reason of a start that found no equilibrium
+        self._watch = StabilityWatch(self.model)
         self._modes = ModeTracker(self.model, MODES_EVERY)
         self._backwards = 0
         self._sampled_ns: int | None = None
@@ -170,6 +180,8 @@ class Estimator:
                 f"joint state at {stamp_ns} ns holds a value that is not finite; it was left out",
             )
             return
+        value[:n] = self.setup.gain * value[:n] + self.setup.offset
+        value[n:] += self.setup.beta_offset
         reason = self.robot.actuator_problem(value[n:], value[:n])
         if reason:
             self.health.note("joints", "out of range", f"{reason}; the joint state was left out")
@@ -209,7 +221,7 @@ class Estimator:
                 self._open_load()
             return
         i = self._joints.stamps.index(stamp_ns) if kind == "late" else len(self._joints.stamps) - 1
-        self._changed(self._joints.stamps[i - 1] if i else stamp_ns)
+        self._changed((self._joints.stamps[i - 1] if i else stamp_ns) + min(self._joints.delay_ns, 0))
 
     def add_tracker_pose(
         self, stamp_ns: int, position: Sequence[float], quaternion_xyzw: Sequence[float], frame_id: str = ""
@@ -297,6 +309,7 @@ class Estimator:
                 f"load at {stamp_ns} ns holds a value that is not finite; it was left out",
             )
             return
+        stamp_ns += self._load_delay_ns
         kind = self._load.add(stamp_ns, np.array([*force, *torque], dtype=float))
         if kind == "duplicate":
             self.health.note(
@@ -349,7 +362,7 @@ class Estimator:
         stamp = self._stamp(k)
         if stamp is None:
             return False
-        if stamp <= self._joints.stamps[-1]:
+        if stamp <= self._joints.known_until:
             return True
         if now_ns is None:
             return False
@@ -419,11 +432,11 @@ class Estimator:
         assert self.t0_ns is not None
         n = self.model.n
         shift = np.zeros(self.model.input_count)
-        shift[:n] = self._nominal_offset
+        shift[3 * n : 3 * n + 3] = self.setup.tip_force
         if corrected:
             for i, row in self._offset_rows:
                 shift[i] += self.fusion.theta[row]
-            shift[3 * n : 3 * n + 3] = self.fusion.force
+            shift[3 * n : 3 * n + 3] += self.fusion.force
         extrapolate = self._timeout_ns if self._predicting else 0
         return _Actuation(self.model, self.t0_ns, self._joints, self._load, extrapolate, shift, self._known)
 
@@ -522,7 +535,10 @@ class Estimator:
         assert self._alone is not None
         S = self._alone.nodes.shape[1]
         self._alone_tips.append(
-            t, self._alone.nodes[-1], np.zeros((S, 1)), float(self._alone.inputs.beta_rate[0])
+            t,
+            self._alone.nodes[-1],
+            np.zeros((S, 1)),
+            float(self._alone.inputs.beta_rate[0]) * (1.0 - self._inserted),
         )
 
     def _fuse(self, k: int, t: float) -> None:
@@ -531,15 +547,15 @@ class Estimator:
         for sample in self._samples:
             if sample.fused_k is not None:
                 continue
-            time_s = (sample.stamp_ns - self.t0_ns) * 1e-9
+            time_s, position = self.tracker.reading((sample.stamp_ns - self.t0_ns) * 1e-9, sample.position)
             if time_s - self.tracker.delay > t + 1e-9:
                 continue
             sample.fused_k = k
-            moment = self._compare(sample, time_s)
+            moment = self._compare(time_s, position, sample.quaternion)
             if self._fusing:
-                update = self.fusion.update(self._fused, time_s, sample.position, sample.quaternion)
+                update = self.fusion.update(self._fused, time_s, position, sample.quaternion)
             else:
-                update = self.fusion.compare(time_s, sample.position, sample.quaternion)
+                update = self.fusion.compare(time_s, position, sample.quaternion)
             if update.dof:
                 self._sampled_ns = max(self._sampled_ns or 0, sample.stamp_ns)
                 self.health.measured(
@@ -571,20 +587,21 @@ class Estimator:
             self._samples.pop(0)
         self.health.force_sigma = self.fusion.force_sigma
 
-    def _compare(self, sample: Sample, time_s: float) -> Moment | None:
-        """Residuals of the published outputs against a sample, before its update, and the moment of it."""
+    def _compare(self, time_s: float, position: Floats, quaternion: Floats) -> Moment | None:
+        """Residuals of the published outputs against a reading, before its update, and the moment of it."""
         dt, n = DT_NS * 1e-9, self.model.n
         fused = self.fusion.tips.at(time_s - self.tracker.delay, dt)
         alone = self._alone_tips.at(time_s - self.tracker.delay, dt)
         earlier = self._alone_tips.at(time_s - self.tracker.delay - 2 * dt, dt) or alone
         if fused is None or alone is None or earlier is None:
             return None
-        position, _ = self.tracker.to_base(sample.position, sample.quaternion)
+        position, _ = self.tracker.to_base(position, quaternion)
         estimate = registered(self.tracker, self.fusion.bias, fused)[:3]
         self._squares[0] += float(np.sum((position - alone.position) ** 2))
         self._squares[1] += float(np.sum((position - estimate) ** 2))
         self._residuals += 1
-        joints, rates = self._joints.at(sample.stamp_ns - self.tracker.delay * 1e9)
+        assert self.t0_ns is not None
+        joints, rates = self._joints.at(self.t0_ns + (time_s - self.tracker.delay) * 1e9)
         acceleration = (alone.velocity - earlier.velocity) / (2 * dt)
         return Moment(
             position - alone.position, alone.position.copy(), alone.quaternion.copy(), alone.velocity.copy(), acceleration,
@@ -755,6 +772,8 @@ class Estimator:
             return self._invalid(k, "the estimate is not finite; the model starts anew at rest")
         problem = self._problem(k)
         self.health.problem = problem
+        if k % STABILITY_EVERY == 0:
+            self._watch_stability(k)
         since = self._sampled_ns if self._sampled_ns is not None else self.t0_ns
         self.health.tracker_age_s = max(0.0, (stamp - (since or stamp)) * 1e-9)
         return StepOutput(
@@ -762,6 +781,14 @@ class Estimator:
             alone.position.copy(), predicted_q, self._backbone(), self._modes.measure(self._fused, self.simulator.parameters), self.fusion.force,
             np.sqrt(variance), self._take_innovations(), SolverStats(result.iterations, result.sweeps, result.reason),
         )  # fmt: skip
+
+    def _watch_stability(self, k: int) -> None:
+        """How far the equilibrium of the present actuators is from its fold, and when a snap is to be expected."""
+        assert self._fused is not None
+        now = self._fused.inputs
+        self.health.stability = self._watch.update(
+            k * DT_NS * 1e-9, now.beta, now.alpha, now.force, now.torque, guess=self._fused.unknowns[-1]
+        )
 
     def _backbone(self) -> NDArray[np.float32]:
         state = self._fused
@@ -780,9 +807,16 @@ class Estimator:
         c = self.fusion.columns
         r = c.theta.shape[1]
         backbone_rows(
-            s, state.nodes, state.fields, points, self.model.n, float(state.inputs.beta_rate[0]), turn, shift,
+            s, state.nodes, state.fields, points, self.model.n, float(state.inputs.beta_rate[0]) * (1.0 - self._inserted), turn, shift,
             c.position_deviation(self.fusion.pi[:r, :r]), rows,
         )  # fmt: skip
+        rates = state.inputs.beta_rate
+        if self._inserted and np.any(rates):
+            # the model's velocities are those of the grid, which lies still at the plate and follows tube 1 at the tip only
+            beta = state.inputs.beta
+            grid = (node_positions(state.mesh, beta + 1e-4 * rates) - s) / 1e-4
+            tangents = np.array([matrix(h)[:, 2] for h in state.nodes[:, 3:7]])
+            rows[:, 8:11] += self._inserted * (rates[0] - grid)[:, None] * tangents
         return rows
 
     def _registration(self) -> tuple[Floats, Floats]:

@@ -104,6 +104,7 @@ class Fusion:
         self.tips = TipWindow(math.ceil((options.window + max(0.0, tracker.delay)) / simulator.scheme.dt) + 5)
         self.pi = np.zeros((0, 0))
         self.steps = 0
+        self.inserted = 0.0  # share of beta's rate that the model's velocities hold already
         self.force_sigma = options.force_sigma
         self._refused = False
         self._filters: dict[tuple[int, int], ExtendedKalmanFilter] = {}
@@ -217,7 +218,7 @@ class Fusion:
         self.simulator.parameters[:] = self.nominal + self.uncertainty.effect @ self.theta
 
     def _keep_tip(self, state: State, stamp: float) -> None:
-        rate = float(state.inputs.beta_rate[0])
+        rate = float(state.inputs.beta_rate[0]) * (1.0 - self.inserted)
         S = state.nodes.shape[1]
         self.tips.append(stamp, state.nodes[-1], self.columns.dnodes[-S:], rate)
 

@@ -8,9 +8,12 @@ from dataclasses import dataclass, field
 
 from scipy.stats import chi2
 
+from ctr_dynamics.snap.stability import Stability
+
 from .misfit import MisfitMonitor
 from .outputs import ERROR, OK, WARN, Status
 
+SNAP_WARNING_S = 1.0  # a snap that is nearer than this is warned of
 TRACKER_LIMIT_S = 1.0  # without a usable sample for longer than this the status says so
 
 
@@ -33,7 +36,8 @@ class Health:
 
     ``joints``, ``tracker``, ``load``: input problems by kind. ``nis_sum``, ``nis_dof``, ``nis_count``: over all samples that reached the gate.
     ``tracker_age_s``: since the newest sample that reached the gate, or the start.
-    ``recent``: (nis / dof, within the gate) of the last samples. ``misfit``: watches the innovations.
+    ``recent``: (nis / dof, within the gate) of the last samples. ``misfit``: watches the innovations. ``stability``: of the
+    equilibrium that belongs to the present actuators.
     """
 
     joints: dict[str, Counter] = field(default_factory=dict)
@@ -59,6 +63,7 @@ class Health:
     force_sigma: float = 0.0
     tracker_age_s: float = 0.0
     misfit: MisfitMonitor = field(default_factory=MisfitMonitor)
+    stability: Stability | None = None
     _within: int = 0
 
     def note(self, group: str, kind: str, what: str) -> None:
@@ -111,6 +116,7 @@ class Health:
             self._inputs("load"),
             self._consistency(),
             self.misfit.status(),
+            self._stability(),
         ]
 
     def _output(self) -> Status:
@@ -165,6 +171,23 @@ class Health:
             )
             return Status("tracker", WARN, message, values)
         return Status("tracker", status.level, status.message, values)
+
+    def _stability(self) -> Status:
+        if self.stability is None:
+            return Status("stability", OK, "not yet known", {})
+        if self.stability.lost:
+            message = "no equilibrium near the last one: the robot has snapped or is about to; the outputs follow its dynamics"
+            return Status("stability", WARN, message, {})
+        values = {"det(d alpha / d psi_L)": f"{self.stability.measure:.4g}"}
+        ahead = self.stability.time_to_snap
+        if ahead is not None:
+            values["time to snap s"] = f"{ahead:.3f}"
+        if self.stability.measure <= 0.0:
+            return Status("stability", WARN, f"unstable equilibrium: measure {self.stability.measure:.4g}, limit 0", values)
+        if ahead is not None and ahead < SNAP_WARNING_S:
+            message = f"a snap is ahead in {ahead:.2f} s (warned of below {SNAP_WARNING_S:g} s) at the present actuator rates; stop or turn back"
+            return Status("stability", WARN, message, values)
+        return Status("stability", OK, f"stable: measure {self.stability.measure:.4g}, limit 0", values)
 
     def _consistency(self) -> Status:
         values = {"force deviation N": f"{self.force_sigma:.4g}"}

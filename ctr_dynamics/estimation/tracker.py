@@ -1,17 +1,18 @@
 """The tracker's measurement: registration, lever arm, delay and drift between the model's tip and a reported pose (docs/ekf.md).
 
-reading = R_reg (p + R lever) + t_reg + drift, R_reading = R_reg R, both of the time stamp - delay.
+reading = R_reg (p + R lever) + t_reg + drift, R_reading = R_reg R, both of the time stamp - delay. What effects add (a scale, a steady drift, a
+clock of another rate) is taken off the readings first, an average over a window counts as a delay by half of it.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ctr_dynamics.robot import Robot
+from ctr_dynamics.effects import Setup
 
 from .kernels import registered_rows, sensitivity_rows
 from .rotations import conjugate, from_vector, matrix, multiply, to_vector
@@ -31,6 +32,7 @@ class TrackerModel:
         rotation: (4,) wxyz of R_reg; translation: (3,) m; lever: (3,) m in the tip frame; delay: s, > 0 when a pose is older than its stamp.
         mask: (6,) measured axes: position x, y, z in the tracker's frame, then rotation about the sensor's x, y, z.
         variance: (6,) white noise.
+        scale: reported over true distance; drift: (3,) m/s; skew: s/s, stamp = true time (1 + skew).
     """
 
     rotation: Floats
@@ -39,6 +41,14 @@ class TrackerModel:
     delay: float
     mask: NDArray[np.bool_]
     variance: Floats
+    scale: float = 1.0
+    drift: Floats = field(default_factory=lambda: np.zeros(3))
+    skew: float = 0.0
+
+    def reading(self, time_s: float, position: Floats) -> tuple[float, Floats]:
+        """Time (s) and position (m) of a reading of stamp ``time_s`` without the clock's rate, the steady drift and the scale."""
+        shift = self.translation
+        return time_s / (1.0 + self.skew), (position - shift - self.drift * time_s) / self.scale + shift
 
     def to_base(self, position: Floats, quaternion: Floats) -> tuple[Floats, Floats]:
         """Reading as a tip pose in ``ctr_base`` with the nominal geometry."""
@@ -47,7 +57,7 @@ class TrackerModel:
 
 
 def tracker_model(
-    robot: Robot,
+    setup: Setup,
     *,
     delay: float = 0.0,
     lever: Floats | None = None,
@@ -55,24 +65,23 @@ def tracker_model(
     translation: Floats | None = None,
     mask: tuple[bool, ...] = (True,) * 6,
 ) -> TrackerModel:
-    """Tracker of ``robot`` with corrections.
+    """Tracker of a robot file and its extensions with corrections.
 
     ``delay`` (s) and ``lever`` (3,) m are added, ``rotation`` (3,) rad and ``translation`` (3,) m composed.
     """
-    t = robot.tracker
-    own_rotation, own_translation = (
-        from_vector(np.array(t.registration_rotation.value)),
-        np.array(t.registration_translation.value),
-    )
+    noise = setup.robot.tracker.noise
     extra = from_vector(np.zeros(3) if rotation is None else np.asarray(rotation, float))
     shift = np.zeros(3) if translation is None else np.asarray(translation, float)
     return TrackerModel(
-        rotation=multiply(extra, own_rotation),
-        translation=matrix(extra) @ own_translation + shift,
-        lever=np.array(t.lever_arm.value) + (np.zeros(3) if lever is None else np.asarray(lever, float)),
-        delay=t.delay.value + delay,
+        rotation=multiply(extra, setup.rotation),
+        translation=matrix(extra) @ setup.translation + shift,
+        lever=setup.lever + (np.zeros(3) if lever is None else np.asarray(lever, float)),
+        delay=setup.delay + 0.5 * setup.averaging + delay,
         mask=np.array(mask, dtype=bool),
-        variance=np.array([t.noise.position.value**2] * 3 + [t.noise.rotation.value**2] * 3),
+        variance=np.array([noise.position.value**2] * 3 + [noise.rotation.value**2] * 3),
+        scale=setup.tracker_scale,
+        drift=setup.drift,
+        skew=setup.skew,
     )
 
 

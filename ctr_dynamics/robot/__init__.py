@@ -1,6 +1,5 @@
 """Robots: tubes, bodies, friction, sensors and tolerances, read from validated YAML files."""
 
-from ctr_dynamics.robot.extensions import EXTENSIONS, Extension, register_extension
 from ctr_dynamics.robot.loader import (
     load_robot,
     quantities,
@@ -15,9 +14,7 @@ from ctr_dynamics.robot.schema import Robot, Tracker
 from ctr_dynamics.robot.tube import EndBody, Segment, Tube
 
 __all__ = [
-    "EXTENSIONS",
     "EndBody",
-    "Extension",
     "Quantity",
     "Robot",
     "Segment",
@@ -26,7 +23,6 @@ __all__ = [
     "VectorQuantity",
     "load_robot",
     "quantities",
-    "register_extension",
     "robot_from_dict",
     "robot_names",
     "robot_to_dict",

@@ -6,7 +6,7 @@ import math
 from typing import Annotated, Any
 
 import numpy as np
-from pydantic import Field, PrivateAttr, field_validator, model_validator
+from pydantic import Field, PrivateAttr, model_validator
 
 from ctr_dynamics.robot.extensions import check_extensions
 from ctr_dynamics.robot.quantity import Block, Floats, Number, Quantity, VectorQuantity, problem, rule
@@ -153,12 +153,6 @@ class Robot(Block):
     _source: str = PrivateAttr("")
     _sha256: str = PrivateAttr("")
 
-    @field_validator("extensions")
-    @classmethod
-    def _extensions(cls, extensions: dict[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
-        check_extensions(extensions)
-        return extensions
-
     @model_validator(mode="after")
     def _check(self) -> Robot:
         names = [tube.name for tube in self.tubes]
@@ -178,6 +172,7 @@ class Robot(Block):
         reason = self.actuator_problem(self.rest.beta.value, self.rest.alpha.value)
         if reason:
             raise problem(f"rest.{reason}")
+        check_extensions(self.extensions, self.n_tubes)
         return self
 
     def __eq__(self, other: object) -> bool:

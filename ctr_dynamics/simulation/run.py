@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from ctr_dynamics import __version__
 from ctr_dynamics.bagio.writer import write_bag
+from ctr_dynamics.effects import Setup, play
 from ctr_dynamics.errors import InputError
 from ctr_dynamics.estimation.rotations import from_vector, matrix, multiply
 from ctr_dynamics.messages import topics
@@ -28,6 +29,7 @@ from ctr_dynamics.simulation.scenario import Scenario
 Floats = NDArray[np.float64]
 Progress = Callable[[float], None]
 FRAME = "ctr_base"
+AVERAGED = 24  # instants in the window of a tracker that averages
 
 
 @dataclass
@@ -37,7 +39,7 @@ class Recording:
     Attributes:
         t: (k,) s; position: (k, 3) m; quaternion: (k, 4) wxyz of the tip.
         wrench: known wrench (6,) N, N m at a time (s).
-        alpha, beta: (N,) rad and m at a time.
+        joints: (N,) rad and (N,) m that the drives' encoders read at a time, without noise.
         failure: why the run ended before its time, else empty.
     """
 
@@ -62,7 +64,8 @@ def _wrenches(scenario: Scenario, model: Model, inputs: Inputs) -> list[Floats]:
     statics = Statics(model)
     for _ in range(200 if hung else 0):
         total = sum(
-            (load.factor(0.0) * w for load, w in zip(scenario.loads, wrenches, strict=True)), np.zeros(6)
+            (load.factor(0.0) * w for load, w in zip(scenario.loads, wrenches, strict=True)),
+            np.r_[model.setup.tip_force, 0.0, 0.0, 0.0],
         )
         found = statics.solve(inputs.beta, inputs.alpha, total[:3], total[3:])
         if not found.converged:
@@ -86,10 +89,29 @@ def _wrenches(scenario: Scenario, model: Model, inputs: Inputs) -> list[Floats]:
 
 
 Drive = Callable[[float], Inputs]
+Turning = Callable[[float], tuple[Floats, Floats]]  # angles and rates at a time in s
+
+
+def _behind_play(command: Turning, width: Floats, end: float, dt: float) -> Turning:
+    """(angles, rates) that the tubes follow to ``end`` s when play of ``width`` (N,) rad lies between them and the drives' ``command``."""
+    t = dt * np.arange(math.ceil(end / dt) + 2)
+    driven = np.array([command(x)[0] for x in t])
+    found = np.stack([play(np.ascontiguousarray(driven[:, i]), width[i]) for i in range(len(width))], axis=1)
+    slopes = np.diff(found, axis=0) / dt
+
+    def follow(time: float) -> tuple[Floats, Floats]:
+        i = min(max(math.ceil(time / dt) - 1, 0), len(slopes) - 1)
+        if time <= 0.0:
+            return found[0].copy(), np.zeros(len(width))
+        return found[i] + (time - t[i]) * slopes[i], slopes[i].copy()
+
+    return follow
 
 
 def drives(scenario: Scenario, robot: Robot, model: Model) -> tuple[Drive, Drive]:
-    """Actuators and load of ``scenario`` at a time in s: (all loads, the known loads only).
+    """Actuators and load of ``scenario`` at a time in s: (what the tubes do under all loads, what is read of both: encoders and known loads).
+
+    The scenario moves the drives; play and delay that the robot file names lie between them and the tubes.
 
     Raises:
         InputError: motions leave the actuators' range, are for more tubes than there are, or there is no
@@ -98,12 +120,41 @@ def drives(scenario: Scenario, robot: Robot, model: Model) -> tuple[Drive, Drive
     axes = scenario.axes(robot.n_tubes)
     rest_alpha, rest_beta = np.array(robot.rest.alpha.value), np.array(robot.rest.beta.value)
 
+    setup = model.setup
+
+    def turned(t: float) -> tuple[Floats, Floats]:
+        return (
+            rest_alpha + [rotation.value(t) for rotation, _ in axes],
+            np.array([rotation.rate(t) for rotation, _ in axes]),
+        )
+
+    follow: Turning = turned
+    if setup.backlash.any():
+        end = scenario.duration_s + max(-setup.actuator_delay, 0.0)
+        follow = _behind_play(turned, setup.backlash, end, 0.2 * scenario.solver.dt_s)
+
+    def late(t: float) -> tuple[Floats, Floats]:
+        if t > setup.actuator_delay or not setup.actuator_delay:
+            return follow(t - setup.actuator_delay)
+        return follow(0.0)[0], np.zeros(robot.n_tubes)
+
     def moving(t: float, wrench: Floats) -> Inputs:
-        alpha = rest_alpha + [rotation.value(t) for rotation, _ in axes]
+        alpha, alpha_rate = late(t)
         beta = rest_beta + [translation.value(t) for _, translation in axes]
-        alpha_rate = np.array([rotation.rate(t) for rotation, _ in axes])
         beta_rate = np.array([translation.rate(t) for _, translation in axes])
         return Inputs(alpha, alpha_rate, beta, beta_rate, wrench[:3], wrench[3:])
+
+    def read(t: float, wrench: Floats) -> Inputs:
+        alpha, alpha_rate = turned(t)
+        given = moving(t, wrench)
+        return Inputs(
+            (alpha - setup.offset) / setup.gain,
+            alpha_rate / setup.gain,
+            given.beta - setup.beta_offset,
+            given.beta_rate,
+            wrench[:3],
+            wrench[3:],
+        )
 
     dt = scenario.solver.dt_s
     for k in range(0, math.ceil(scenario.duration_s / dt - 1e-9) + 1, 5):
@@ -112,10 +163,17 @@ def drives(scenario: Scenario, robot: Robot, model: Model) -> tuple[Drive, Drive
             raise InputError(f"at {k * dt:.3f} s {problem}", do="mend the translations", where="tubes")
     pairs = list(zip(scenario.loads, _wrenches(scenario, model, moving(0.0, np.zeros(6))), strict=True))
 
-    def total(t: float, known_only: bool) -> Floats:
-        return sum((load.factor(t) * w for load, w in pairs if load.known or not known_only), np.zeros(6))
+    unseen = np.r_[setup.tip_force, 0.0, 0.0, 0.0]
 
-    return lambda t: moving(t, total(t, False)), lambda t: moving(t, total(t, True))
+    def acting(t: float) -> Floats:
+        return sum(
+            (load.factor(t - setup.load_shift if load.known else t) * w for load, w in pairs), unseen.copy()
+        )
+
+    def told(t: float) -> Floats:
+        return sum((load.factor(t) * w for load, w in pairs if load.known), np.zeros(6))
+
+    return lambda t: moving(t, acting(t)), lambda t: read(t, told(t))
 
 
 def simulate(scenario: Scenario, robot: Robot, progress: Progress | None = None) -> Recording:
@@ -150,7 +208,7 @@ def simulate(scenario: Scenario, robot: Robot, progress: Progress | None = None)
         rows[:, :3],
         quaternion,
         lambda t: np.concatenate([known(t).force, known(t).torque]),
-        lambda t: (at(t).alpha, at(t).beta),
+        lambda t: (known(t).alpha, known(t).beta),
         failure,
     )
 
@@ -164,10 +222,17 @@ def _stamps(rate: float, end: float) -> list[int]:
     return [round(k * 1e9 / rate) for k in range(math.floor(end * rate + 1e-9) + 1)]
 
 
+def _seen(recording: Recording, setup: Setup, time: float) -> tuple[Floats, Floats]:
+    """Tip position (3,) m and quaternion (4,) wxyz that a tracker sees, averaged over its window before ``time`` s."""
+    ages = (np.arange(AVERAGED) + 0.5) * setup.averaging / AVERAGED if setup.averaging > 0.0 else np.zeros(1)
+    times = np.clip(time - ages, 0.0, recording.t[-1])
+    p = np.array([np.interp(times, recording.t, x).mean() for x in recording.position.T])
+    h = np.array([np.interp(times, recording.t, x).mean() for x in recording.quaternion.T])
+    return p, h / np.linalg.norm(h)
+
+
 def messages(scenario: Scenario, robot: Robot, recording: Recording) -> list[tuple[int, str, bytes]]:
-    """(log time ns, topic, message) of a run in the order of log times, with noise, registration, lever arm
-    and delay as in files.
-    """
+    """(log time ns, topic, message) of a run in the order of log times, with noise and the tracker's chain as in files."""
     n = robot.n_tubes
     end = float(recording.t[-1])
     origin = scenario.start_stamp_s * 1_000_000_000
@@ -187,7 +252,7 @@ def messages(scenario: Scenario, robot: Robot, recording: Recording) -> list[tup
     names = [f"tube{i + 1}_{kind}" for kind in ("rotation", "translation") for i in range(n)]
     for ns in _stamps(scenario.rates.joints_hz, end):
         alpha, beta = recording.joints(ns * 1e-9)
-        reading = alpha - robot.encoders.offset.value + encoder * joint_noise.standard_normal(n)
+        reading = alpha + encoder * joint_noise.standard_normal(n)
         stamp = origin + ns
         found.append(
             (
@@ -197,21 +262,17 @@ def messages(scenario: Scenario, robot: Robot, recording: Recording) -> list[tup
             )
         )
 
-    registration = from_vector(np.array(robot.tracker.registration_rotation.value))
-    shift, lever = (
-        np.array(robot.tracker.registration_translation.value),
-        np.array(robot.tracker.lever_arm.value),
-    )
-    delay = robot.tracker.delay.value + scenario.tracker.delay_s
+    setup = Model(robot, nodes=scenario.solver.nodes).setup
+    registration, shift = setup.rotation, setup.translation
     keep = math.exp(-1.0 / (scenario.rates.tracker_hz * drift_time))
     wander = drift * tracker_noise.standard_normal(3)
     for ns in _stamps(scenario.rates.tracker_hz, end):
-        t = min(max(ns * 1e-9 - delay, 0.0), end)
-        p = np.array([np.interp(t, recording.t, recording.position[:, i]) for i in range(3)])
-        h = np.array([np.interp(t, recording.t, recording.quaternion[:, i]) for i in range(4)])
-        h /= np.linalg.norm(h)
+        p, h = _seen(
+            recording, setup, ns * 1e-9 / (1.0 + setup.skew) - setup.delay - scenario.tracker.delay_s
+        )
         wander = keep * wander + drift * math.sqrt(1.0 - keep * keep) * tracker_noise.standard_normal(3)
-        reported = matrix(registration) @ (p + matrix(h) @ lever) + shift + wander
+        seen = setup.tracker_scale * (p + matrix(h) @ setup.lever)
+        reported = matrix(registration) @ seen + shift + setup.drift * (ns * 1e-9) + wander
         reported += position * tracker_noise.standard_normal(3)
         turned = multiply(multiply(registration, h), from_vector(rotation * tracker_noise.standard_normal(3)))
         turned /= np.linalg.norm(turned)

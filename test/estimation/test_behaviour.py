@@ -9,6 +9,7 @@ from estimation_cases import BAGS, Message, check_outputs, play, rms, truth_erro
 from ctr_dynamics.estimation.rotations import conjugate, from_vector, matrix, multiply
 from ctr_dynamics.estimation.tip import Tip
 from ctr_dynamics.estimation.tracker import STATES, expected, tracker_model
+from ctr_dynamics.model.model import Model
 from ctr_dynamics.robot import load_robot, robot_from_dict, robot_to_dict
 
 
@@ -174,8 +175,9 @@ def test_parameters_compose_with_the_robot_file():
     rng = np.random.default_rng(5)
     q = rng.normal(size=4)
     tip = Tip(0.0, rng.normal(size=3), q / np.linalg.norm(q), np.zeros(3), np.zeros(3), np.zeros((12, 1)))
-    plain = expected(tracker_model(robot), np.zeros(STATES), tip)
-    both = tracker_model(robot, delay=0.002, lever=lever, rotation=turn, translation=shift)
+    setup = Model(robot, nodes=12).setup
+    plain = expected(tracker_model(setup), np.zeros(STATES), tip)
+    both = tracker_model(setup, delay=0.002, lever=lever, rotation=turn, translation=shift)
     assert both.delay == pytest.approx(0.006)
     position, quaternion = expected(both, np.zeros(STATES), tip)
     R = matrix(from_vector(turn))
