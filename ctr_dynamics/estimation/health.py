@@ -183,7 +183,12 @@ class Health:
         if ahead is not None:
             values["time to snap s"] = f"{ahead:.3f}"
         if self.stability.measure <= 0.0:
-            return Status("stability", WARN, f"unstable equilibrium: measure {self.stability.measure:.4g}, limit 0", values)
+            return Status(
+                "stability",
+                WARN,
+                f"unstable equilibrium: measure {self.stability.measure:.4g}, limit 0",
+                values,
+            )
         if ahead is not None and ahead < SNAP_WARNING_S:
             message = f"a snap is ahead in {ahead:.2f} s (warned of below {SNAP_WARNING_S:g} s) at the present actuator rates; stop or turn back"
             return Status("stability", WARN, message, values)
