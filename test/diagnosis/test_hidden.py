@@ -2,6 +2,8 @@
 
 import json
 import math
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -9,42 +11,51 @@ import pytest
 from joblib import Parallel, delayed
 from truth.cases import make_case
 
-from ctr_dynamics.diagnosis.command import Request, run
-from ctr_dynamics.robot import load_robot
-
 # (name, stratum, seed, what is hidden): one of each kind; None leaves the choice to the seed
 CASES = (
     ("clean", "none", 91001, None),
     ("payload", "single", 91003, ("payload_mass",)),
     ("latency", "single", 91004, ("tracker_latency",)),
-    ("pair", "pair", 91006, ("base_coulomb", "encoder_offset")),
+    ("pair", "pair", 91006, ("payload_mass", "encoder_offset")),
     ("outside", "outside", 91007, ("pulse",)),
     ("at_rest", "not_excited", 91008, None),
 )
 
 
-def _run(folder: str, stratum: str, seed: int, effects):
+def _run(folder: Path, stratum: str, seed: int, effects):
+    """Make a case, run the command on it in a process of its own, then open the answer."""
     case = make_case(seed, stratum, folder, effects=effects)
-    output = str(Path(folder) / "out")
-    request = Request(
-        load_robot(case.robot), [str(case.protocol)], [str(case.sweep)], output, "command", workers=1
+    arguments = [
+        str(case.protocol),
+        "--validate",
+        str(case.sweep),
+        "--robot",
+        case.robot,
+        "--output",
+        str(folder / "out"),
+        "--workers",
+        "1",
+    ]
+    done = subprocess.run(
+        [sys.executable, "-m", "ctr_dynamics.cli.main", "diagnose", *arguments, "--json"],
+        capture_output=True,
+        text=True,
+        check=False,
     )
-    return run(request), case.unseal()
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout), case.unseal(), folder / "out"
 
 
 @pytest.fixture(scope="module")
 def outcomes(tmp_path_factory):
     """Findings and answers of all cases, two at a time."""
-    folders = [str(tmp_path_factory.mktemp(name)) for name, *_ in CASES]
+    folders = [tmp_path_factory.mktemp(name) for name, *_ in CASES]
     jobs = (
         delayed(_run)(folder, stratum, seed, effects)
         for folder, (_, stratum, seed, effects) in zip(folders, CASES, strict=True)
     )
     found = Parallel(2, prefer="threads")(jobs)
-    return {
-        name: (*pair, Path(folder) / "out")
-        for (name, *_), pair, folder in zip(CASES, found, folders, strict=True)
-    }
+    return {name: outcome for (name, *_), outcome in zip(CASES, found, strict=True)}
 
 
 @pytest.mark.parametrize("name", ["payload", "latency", "pair"])
@@ -52,7 +63,7 @@ def test_hidden_causes_are_named_with_their_size(outcomes, name):
     findings, answer, _ = outcomes[name]
     truth = {h["effect"]: h["parameters"] for h in answer["hidden"]}
     assert {c["effect"] for c in findings["causes"]} == set(truth)
-    assert findings["verdict"] == "named"
+    assert findings["verdict"] in (("named", "ambiguous") if len(truth) > 1 else ("named",))
     assert sorted(truth) in [sorted(s) for s in findings["cause_set95"]]
     for cause in findings["causes"]:
         for parameter, value in truth[cause["effect"]].items():
