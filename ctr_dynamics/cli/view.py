@@ -102,7 +102,7 @@ def _replay(
 def _live(server: ViewServer) -> None:
     """Every topic of the table as it comes over DDS."""
     try:
-        from ctr_dynamics.view.live import LiveTopics
+        from ctr_dynamics.nodes.live_view import LiveTopics
     except ImportError as error:
         raise InputError(
             f"the live view needs rclpy ({error})",

@@ -50,8 +50,8 @@ class Moment:
 @dataclass(frozen=True)
 class Innovation:
     """A processed tracker sample: residual (6,) and its predicted variance (6,) (position m in the tracker's axes, rotation rad in the
-    sensor's), NIS, degrees of freedom, whether it was fused, how late it came (s), and why it was not fused; for the misfit monitor the
-    whitened residual (6,) and the moment, None where the model alone has no tip of that time."""
+    sensor's), NIS, degrees of freedom, whether it was fused, how late it came (s), and why it was not fused; for the misfit monitor
+    ``white``, the whitened residual (6,), and the ``moment``, None where the model alone has no tip of that time."""
 
     stamp_ns: int
     residual: Floats
