@@ -1,7 +1,7 @@
 """Which causes explain the data: screening along signatures, joint fits, evidence, several causes, separability.
 
-Explanations are sets of at most three candidates. Their probabilities follow from Laplace evidence with priors on causes and sizes, tempered by a
-factor that makes them calibrated on simulated cases (docs/diagnosis.md).
+Explanations are sets of at most three candidates. Their probabilities follow from Laplace evidence with priors on causes and sizes, tempered
+against overconfidence (docs/diagnosis.md).
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ Floats = NDArray[np.float64]
 
 LOG_PRIOR_CLEAN = math.log(0.5)
 PRIOR_SINGLE, PRIOR_PAIR, PRIOR_TRIPLE = 0.38, 0.1, 0.02
-TEMPERATURE = 1.6  # of the log evidence; tuned on simulated cases of other seeds than the tests'
+TEMPERATURE = 1.6  # of the log evidence: a judgement against overconfidence, not fitted to cases
 SHORTLIST = 8  # candidates that are fitted in full
 SECOND = 4  # second causes that are fitted beside a first
 HOPELESS = 0.3  # of the misfit: two causes that leave more are not made right by a third
