@@ -89,9 +89,8 @@ def _compliance(setup: Setup, values: Values) -> None:
     for i in range(setup.n):
         stiffness, inertia = values[f"tube{i + 1}.stiffness_Nm_per_rad"], values[f"tube{i + 1}.inertia_kgm2"]
         if math.isfinite(stiffness):
-            setup.put("drive_compliance", 1.0 / stiffness, i)
-            setup.put("drive_inertia", inertia, i)
-            setup.extended = True
+            setup.extend("drive_compliance", 1.0 / stiffness, i)
+            setup.extend("drive_inertia", inertia, i)
 
 
 register(
@@ -146,8 +145,7 @@ register(
 
 def _insertion(setup: Setup, values: Values) -> None:
     if values["scale"] != 0.0:
-        setup.put("insertion", values["scale"])
-        setup.extended = True
+        setup.extend("insertion", values["scale"])
 
 
 register(
@@ -164,8 +162,7 @@ register(
 
 def _clearance(setup: Setup, values: Values) -> None:
     if values["play_rad"] != 0.0:
-        setup.put("play", values["play_rad"])
-        setup.extended = True
+        setup.extend("play", values["play_rad"])
 
 
 register(

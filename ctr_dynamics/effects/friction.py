@@ -95,9 +95,8 @@ for _id, _name, _unit, _where, _kind, _factor, _floor, _text in (
 
 def _stribeck(setup: Setup, values: Values) -> None:
     if values["static_ratio"] != 1.0:
-        setup.put("stribeck_excess", values["static_ratio"] - 1.0)
-        setup.put("stribeck_inverse_speed", 1.0 / values["speed_rad_s"])
-        setup.extended = True
+        setup.extend("stribeck_excess", values["static_ratio"] - 1.0)
+        setup.extend("stribeck_inverse_speed", 1.0 / values["speed_rad_s"])
 
 
 register(
@@ -128,8 +127,7 @@ register(
 
 def _overlap(setup: Setup, values: Values) -> None:
     if values["torque_Nm_per_m"] != 0.0:
-        setup.put("overlap_friction", values["torque_Nm_per_m"])
-        setup.extended = True
+        setup.extend("overlap_friction", values["torque_Nm_per_m"])
 
 
 register(
@@ -155,9 +153,8 @@ register(
 
 def _drag(setup: Setup, values: Values) -> None:
     if values["linear_Ns_per_m2"] != 0.0 or values["quadratic_Ns2_per_m3"] != 0.0:
-        setup.put("drag_linear", values["linear_Ns_per_m2"])
-        setup.put("drag_quadratic", values["quadratic_Ns2_per_m3"])
-        setup.extended = True
+        setup.extend("drag_linear", values["linear_Ns_per_m2"])
+        setup.extend("drag_quadratic", values["quadratic_Ns2_per_m3"])
 
 
 register(

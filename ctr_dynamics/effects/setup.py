@@ -77,6 +77,11 @@ class Setup:
         start = self.layout[group].start + index
         self.block[start : start + np.size(value)] = value
 
+    def extend(self, group: str, value: float | Floats, index: int = 0) -> None:
+        """:meth:`put` rows that only the extended kernels read, and ask for these."""
+        self.put(group, value, index)
+        self.extended = True
+
     def copy(self) -> Setup:
         """An independent copy."""
         other = copy.copy(self)

@@ -213,9 +213,8 @@ def _ovality(setup: Setup, values: Values) -> None:
         ratio, axis = values[f"tube{i + 1}.ratio"], values[f"tube{i + 1}.axis_rad"]
         if ratio != 1.0:
             e = (ratio - 1.0) / (ratio + 1.0)  # the mean stiffness stays
-            setup.put("oval_cos", e * math.cos(2.0 * axis), i)
-            setup.put("oval_sin", e * math.sin(2.0 * axis), i)
-            setup.extended = True
+            setup.extend("oval_cos", e * math.cos(2.0 * axis), i)
+            setup.extend("oval_sin", e * math.sin(2.0 * axis), i)
 
 
 register(
@@ -252,8 +251,7 @@ def _softening(setup: Setup, values: Values) -> None:
     for i in range(setup.n):
         limit = values[f"tube{i + 1}.curvature_1_per_m"]
         if math.isfinite(limit):
-            setup.put("softening", limit**-2.0, i)
-            setup.extended = True
+            setup.extend("softening", limit**-2.0, i)
 
 
 register(

@@ -67,10 +67,9 @@ def _spring(setup: Setup, values: Values) -> None:
     k, c = values["stiffness_N_per_m"], values["damping_Ns_per_m"]
     if k != 0.0 or c != 0.0:
         anchor = np.array([values[f"anchor_{axis}_m"] for axis in "xyz"])
-        setup.put("spring_stiffness", k)
-        setup.put("spring_damping", c)
-        setup.put("spring_force", k * anchor)
-        setup.extended = True
+        setup.extend("spring_stiffness", k)
+        setup.extend("spring_damping", c)
+        setup.extend("spring_force", k * anchor)
 
 
 register(
@@ -98,10 +97,9 @@ def _contact(setup: Setup, values: Values) -> None:
     stiffness = values["stiffness_N_per_m"]
     if stiffness != 0.0:
         normal = np.array([values["nx"], values["ny"], values["nz"]])
-        setup.put("contact_stiffness", stiffness)
-        setup.put("contact_normal", normal / max(float(np.linalg.norm(normal)), 1e-12))
-        setup.put("contact_offset", values["offset_m"])
-        setup.extended = True
+        setup.extend("contact_stiffness", stiffness)
+        setup.extend("contact_normal", normal / max(float(np.linalg.norm(normal)), 1e-12))
+        setup.extend("contact_offset", values["offset_m"])
 
 
 register(

@@ -10,16 +10,12 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import rclpy
 from rclpy.clock import JumpThreshold, TimeJump
 from rclpy.duration import Duration
 from rclpy.event_handler import SubscriptionEventCallbacks
-from rclpy.exceptions import ParameterException
 from rclpy.logging import get_logging_directory
 from rclpy.node import Node
 from rclpy.parameter import Parameter as RosParameter
-from rclpy.signals import SignalHandlerOptions
-from rclpy.subscription import RCLError
 from std_srvs.srv import SetBool, Trigger
 
 from ctr_dynamics import __version__
@@ -36,7 +32,7 @@ from ctr_dynamics.nodes.outputs import Outputs
 from ctr_dynamics.nodes.recorder import Recorder
 from ctr_dynamics.nodes.rehearsal import rehearse
 from ctr_dynamics.nodes.rolling import RollingRecording
-from ctr_dynamics.nodes.spinning import spin_until, stop_on_signals
+from ctr_dynamics.nodes.spinning import run_node
 from ctr_dynamics.nodes.stepping import StepLoop
 from ctr_dynamics.nodes.timing import StepTiming
 from ctr_dynamics.parameters import Settings
@@ -349,24 +345,7 @@ class EstimatorNode(Node):
 def main(args: list[str] | None = None) -> int:
     """Run the node; returns 0 after SIGINT or SIGTERM, 2 when it cannot start with what it was given."""
     sys.setswitchinterval(SWITCH_INTERVAL_S)
-    with stop_on_signals() as stop:
-        try:
-            rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
-            node = EstimatorNode()
-            stop.starting = False
-        except KeyboardInterrupt:
-            rclpy.try_shutdown()
-            return 0
-        except (InputError, ParameterException, RCLError) as error:
-            print(f"estimator: {' '.join(str(error).split())}", file=sys.stderr)
-            rclpy.try_shutdown()
-            return 2
-        try:
-            spin_until(node, stop)
-        finally:
-            node.close()
-            rclpy.try_shutdown()
-    return 0
+    return run_node("estimator", EstimatorNode, EstimatorNode.close, args)
 
 
 if __name__ == "__main__":

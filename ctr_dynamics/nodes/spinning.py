@@ -4,15 +4,23 @@ from __future__ import annotations
 
 import contextlib
 import signal
+import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from types import FrameType
+from typing import TypeVar
 
 import rclpy
 from rclpy.context import Context
+from rclpy.exceptions import ParameterException
 from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
+from rclpy.subscription import RCLError
 
+from ctr_dynamics.errors import InputError
+
+AnyNode = TypeVar("AnyNode", bound=Node)
 POLL_S = 0.1
 
 
@@ -69,3 +77,27 @@ def spin_until(node: Node, stop: threading.Event) -> None:
     finally:
         executor.remove_node(node)
         executor.shutdown()
+
+
+def run_node(
+    name: str, make: Callable[[], AnyNode], close: Callable[[AnyNode], object], args: list[str] | None
+) -> int:
+    """Make a node, serve it until SIGINT or SIGTERM, close it; returns 0, or 2 when it cannot start with what it was given."""
+    with stop_on_signals() as stop:
+        try:
+            rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
+            node = make()
+            stop.starting = False
+        except KeyboardInterrupt:
+            rclpy.try_shutdown()
+            return 0
+        except (InputError, ParameterException, RCLError) as error:
+            print(f"{name}: {' '.join(str(error).split())}", file=sys.stderr)
+            rclpy.try_shutdown()
+            return 2
+        try:
+            spin_until(node, stop)
+        finally:
+            close(node)
+            rclpy.try_shutdown()
+    return 0

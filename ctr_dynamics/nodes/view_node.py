@@ -5,18 +5,14 @@ from __future__ import annotations
 import sys
 from typing import Any
 
-import rclpy
 from rcl_interfaces.msg import ParameterDescriptor
-from rclpy.exceptions import ParameterException
 from rclpy.node import Node
-from rclpy.signals import SignalHandlerOptions
-from rclpy.subscription import RCLError
 
 from ctr_dynamics.errors import InputError
 from ctr_dynamics.messages import topics
 from ctr_dynamics.nodes import qos
 from ctr_dynamics.nodes.naming import NAMESPACE, message_class
-from ctr_dynamics.nodes.spinning import spin_until, stop_on_signals
+from ctr_dynamics.nodes.spinning import run_node
 from ctr_dynamics.robot import load_robot
 from ctr_dynamics.view.markers import MARKER_ARRAY, TUBES_TOPIC
 from ctr_dynamics.view.scene import Scene
@@ -78,24 +74,7 @@ class ViewNode(Node):
 
 def main(args: list[str] | None = None) -> int:
     """Run the node; returns 0 after SIGINT or SIGTERM, 2 when it cannot start."""
-    with stop_on_signals() as stop:
-        try:
-            rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
-            node = ViewNode()
-            stop.starting = False
-        except KeyboardInterrupt:
-            rclpy.try_shutdown()
-            return 0
-        except (InputError, ParameterException, RCLError) as error:
-            print(f"view: {' '.join(str(error).split())}", file=sys.stderr)
-            rclpy.try_shutdown()
-            return 2
-        try:
-            spin_until(node, stop)
-        finally:
-            node.destroy_node()
-            rclpy.try_shutdown()
-    return 0
+    return run_node("view", ViewNode, ViewNode.destroy_node, args)
 
 
 if __name__ == "__main__":
