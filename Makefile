@@ -1,5 +1,5 @@
 # make demo   the estimator live on a shipped bag, over DDS
-# make test   format, lint, types and tests; PYTEST_ARGS="-k robot" passes options on
+# make test   format, lint, types and tests; PYTEST_ARGS="-k robot" passes options on, WORKERS=4 uses more cores
 # make lint   format, lint and types alone
 # make format writes the format
 # make clean  removes the environment and what was built
@@ -7,6 +7,7 @@
 
 VENV ?= .venv
 PYTEST_ARGS ?=
+WORKERS ?= 2
 BIN := $(VENV)/bin
 
 export NUMBA_CACHE_DIR := $(abspath $(VENV))/numba-cache
@@ -25,7 +26,8 @@ demo: install
 	$(BIN)/ctr-dynamics demo
 
 test: lint
-	$(BIN)/python -m pytest $(PYTEST_ARGS)
+	$(BIN)/ctr-dynamics warmup --robot till2020_tissue
+	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile $(PYTEST_ARGS)
 
 lint: install
 	$(BIN)/ruff format --check .

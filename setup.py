@@ -76,6 +76,7 @@ setup(
         "test": [
             "distributed>=2024.8",
             "pytest>=8",
+            "pytest-xdist>=3.5",
             "hypothesis>=6.100",
             "ruff",
             "mypy",

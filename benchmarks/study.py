@@ -73,23 +73,32 @@ def one(stratum: str, seed: int) -> dict[str, Any]:
 
 def separations(result: Any, answer: dict[str, Any]) -> dict[str, float]:
     """d_sep of every true cause, from the true effects fitted to the data, against the nearest rival."""
-    from ctr_dynamics.diagnosis.search import explain, linearise, separation
+    from ctr_dynamics.diagnosis.fit import fit
+    from ctr_dynamics.diagnosis.search import with_nuisances
+    from ctr_dynamics.diagnosis.signatures import linearise, separation
 
     problem, found = result.problem, result.search
-    members = []
+    members, start = [], {}
     for item in answer["hidden"]:
-        names = set(item.get("parameters", {}))
+        values = item.get("parameters", {})
         options = [
-            c for c in found.pool if c.effect == item["effect"] and {q.name for q in c.quantities} & names
+            c
+            for c in found.pool
+            if c.effect == item["effect"] and {q.name for q in c.quantities} & set(values)
         ]
         if not options:
             return {}
-        exact = [c for c in options if {q.name for q in c.quantities} <= names]
-        members.append((exact or options)[0])
+        member = next((c for c in options if {q.name for q in c.quantities} <= set(values)), options[0])
+        members.append(member)
+        start.update(dict(member.start))
+        for q in member.quantities + member.shapes:
+            if q.name in values:
+                start[q.key] = q.parameter.coordinate(values[q.name]["total"])
     if not members:
         return {}
-    best = explain(problem, tuple(members), found.clean.fit.point, None)
-    lin = linearise(problem, best.fit.point, found.pool, lambda text: None) if best else None
+    causes = tuple(q for c in members for q in c.quantities + c.shapes)
+    best = fit(with_nuisances(problem, members), causes, start)
+    lin = linearise(problem, best.point, found.pool, 1) if best else None
     if best is None or lin is None:
         return {}
     own = {m.effect for m in members}

@@ -7,9 +7,10 @@ import time
 from typing import Annotated
 
 import typer
+from joblib import Parallel, delayed
 
 from ctr_dynamics.diagnosis.rehearsal import rehearse as rehearse_diagnosis
-from ctr_dynamics.nodes.rehearsal import rehearse
+from ctr_dynamics.nodes.rehearsal import rehearse as rehearse_node
 from ctr_dynamics.parameters import Settings
 from ctr_dynamics.robot import load_robot
 
@@ -20,12 +21,24 @@ def warmup(
         typer.Option(help="Robot name or file; may be repeated. Without it: two and three tubes."),
     ] = None,
 ) -> None:
-    """Compile every kernel into the cache."""
-    for name in robot or ["till2020_tissue", "three_tube"]:
-        loaded = load_robot(name)
-        begin = time.perf_counter()
-        for policy in ("predict", "wait"):
-            steps = rehearse(loaded, Settings({"robot": name, "output.policy": policy}))
-        rehearse_diagnosis(loaded)
-        typer.echo(f"{name}: {loaded.n_tubes} tubes, {steps} steps, {time.perf_counter() - begin:.1f} s")
+    """Compile every kernel into the cache: estimator and diagnosis of every robot, two at a time."""
+    names = robot or ["till2020_tissue", "three_tube"]
+    for name in names:
+        load_robot(name)
+    tasks = [(name, part) for name in names for part in (_diagnosis, _estimator)]
+    for text in Parallel(2, return_as="generator")(delayed(part)(name) for name, part in tasks):
+        typer.echo(text)
     typer.echo(f"kernels are in {os.environ['NUMBA_CACHE_DIR']}")
+
+
+def _estimator(name: str) -> str:
+    begin, steps = time.perf_counter(), 0
+    for policy in ("predict", "wait"):
+        steps = rehearse_node(load_robot(name), Settings({"robot": name, "output.policy": policy}))
+    return f"{name}: estimator, {steps} steps, {time.perf_counter() - begin:.1f} s"
+
+
+def _diagnosis(name: str) -> str:
+    begin, robot = time.perf_counter(), load_robot(name)
+    rehearse_diagnosis(robot)
+    return f"{name}: diagnosis, {robot.n_tubes} tubes, {time.perf_counter() - begin:.1f} s"

@@ -13,11 +13,12 @@ from ctr_dynamics.bagio.writer import atomic_file
 from ctr_dynamics.robot import Robot
 from ctr_dynamics.simulation.scenario import Scenario
 
-from .diagnose import Diagnosis, diagnose
+from .diagnose import diagnose
 from .findings import findings, write
 from .planning import Plan, plan
 from .recording import read_recording
 from .rehearsal import rehearse
+from .report import write_report
 
 SCENARIO = "next_experiment.yaml"
 
@@ -62,7 +63,8 @@ def run(request: Request, note: Callable[[str], None] = _quiet) -> dict[str, Any
     content = findings(diagnosis, request.command, _experiment(planned, directory))
     write(directory, diagnosis, content)
     if request.report:
-        _report(diagnosis, content, directory, note)
+        note("report")
+        write_report(directory / "report.html", diagnosis, content)
     return content
 
 
@@ -81,14 +83,3 @@ def _experiment(planned: Plan | None, directory: Path) -> dict[str, Any] | None:
 
 def _yaml(scenario: Scenario) -> str:
     return yaml.safe_dump(scenario.model_dump(exclude_none=True, mode="json"), sort_keys=False)
-
-
-def _report(
-    diagnosis: Diagnosis, content: dict[str, Any], directory: Path, note: Callable[[str], None]
-) -> None:
-    try:
-        from ctr_dynamics.diagnosis.report import write_report
-    except ImportError:
-        return
-    note("report")
-    write_report(directory / "report.html", diagnosis, content)

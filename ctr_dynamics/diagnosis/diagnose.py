@@ -18,23 +18,13 @@ from ctr_dynamics.effects import EFFECTS, quantities
 from ctr_dynamics.errors import InputError
 from ctr_dynamics.robot import Robot
 
+from .candidates import Candidate, candidates
 from .checks import Whiteness, block_bootstrap, rms, whiteness
-from .experiment import Experiment
-from .fit import Fit, Problem, add_numerics, fit, make_problem
+from .fit import Fit, Local, Problem, add_numerics, fit, make_problem
 from .mistakes import find_mistake
-from .noise import noise_floor
 from .recording import Recording
-from .search import (
-    SEPARATION,
-    Candidate,
-    Explanation,
-    Linearisation,
-    Search,
-    candidates,
-    linearise,
-    search,
-    separation,
-)
+from .search import Explanation, Search, search
+from .signatures import Linearisation, linearise, observable, separation
 
 Floats = NDArray[np.float64]
 Note = Callable[[str], None]
@@ -42,8 +32,11 @@ NOT_NOISE = 1e-4  # p below which what is left is no noise
 LEFT_SHARE = 0.03  # of the misfit beyond noise that a named cause may leave before it is called unknown
 NAMED = 0.9  # probability from which a set of causes is named
 CLEAN_GAIN = 4.0  # log evidence, priors included, that a cause must gain over none
+SEPARATION = 5.0  # whitened units: linear signatures that are nearer cannot be told apart
+FITTED = 3.0  # the same between fits: the root of the difference of their costs, priors included
 OBSERVABLE = 3.0  # whitened size of a signature at its prior scale from which a bag can see it
-EXCITED = 0.45  # share of the catalogue that a bag must see
+STRONG = 8.0  # size from which it can be told from others
+EXCITED = 0.35  # share of the catalogue that a bag must show strongly
 
 
 @dataclass
@@ -72,7 +65,10 @@ class Member:
 
 @dataclass
 class Diagnosis:
-    """All that findings and report are made of; see docs/diagnosis.md for the verdicts."""
+    """All that findings and report are made of; see docs/diagnosis.md for the verdicts.
+
+    ``left``, ``rest``: of every recording, the residuals (s, 6) of the re-calibrated and of the extended model.
+    """
 
     robot: Robot
     recordings: list[Recording]
@@ -93,6 +89,8 @@ class Diagnosis:
     mistake: tuple[str, float, float] | None = None
     notes: list[str] = field(default_factory=list)
     seconds: float = 0.0
+    left: list[Floats] = field(default_factory=list)
+    rest: list[Floats] = field(default_factory=list)
     at_best: Linearisation | None = None
 
 
@@ -116,7 +114,8 @@ def diagnose(
     """
     begin = time.perf_counter()
     known = quantities(robot)
-    nuisances = [q for q in known if q.tolerance > 0.0 and q.effect != "play_kinematics"]
+    forms = {name for effect in EFFECTS.values() for name in effect.form}  # free beside their effect alone
+    nuisances = [q for q in known if q.tolerance > 0.0 and q.effect not in forms]
     notes = [text for r in (*recordings, *validation) for text in r.notes]
     if mask is None:
         mask = measured_axes(recordings, notes)
@@ -151,7 +150,7 @@ def diagnose(
         return result
     problem = make_problem(robot, recordings, nuisances, mask)
     result.problem = problem
-    result.nominal_rms = _rms(problem, {})
+    result.nominal_rms = rms(np.concatenate(_residuals(problem, None))[:, :3])
     if not math.isfinite(result.nominal_rms):
         raise InputError(
             "the nominal model cannot be simulated on this bag",
@@ -164,8 +163,8 @@ def diagnose(
             "the model cannot be simulated near the nominal robot", do="check the robot file and the bag"
         )
     note("numerics")
-    result.numerics = add_numerics(problem, clean.point)
-    clean = fit(problem, (), clean.point) or clean
+    result.numerics = add_numerics(problem, clean.point, workers)
+    clean = fit(problem, (), clean.point, Local(clean.whitened - problem.offset, clean.by_key)) or clean
     result.clean = result.best = clean
     result.tested += ["time_discretisation", "space_discretisation"]
     pool = candidates(
@@ -177,14 +176,13 @@ def diagnose(
     if found is None:
         raise InputError("the recalibrated model cannot be linearised", do="check the robot file and the bag")
     result.search = found
-    seen = observable(problem, found)
-    result.not_observable = sorted(
-        {c.effect for c in pool} - {c.effect for c, size in seen.items() if size >= OBSERVABLE}
-    )
-    excited = len({c.effect for c, s in seen.items() if s >= OBSERVABLE}) / max(
-        len({c.effect for c in pool}), 1
-    )
-    _decide(result, problem, found, excited, validation, note)
+    seen = observable(problem, found.linearised)
+    names = sorted({c.effect for c in pool})
+    result.not_observable = [name for name in names if seen.get(name, 0.0) < OBSERVABLE]
+    excited = sum(seen.get(name, 0.0) >= STRONG for name in names) >= EXCITED * len(names)
+    _decide(result, problem, found, excited, validation, note, workers)
+    assert result.best is not None
+    result.left, result.rest = _residuals(problem, clean), _residuals(problem, result.best)
     result.seconds = time.perf_counter() - begin
     return result
 
@@ -200,85 +198,64 @@ def measured_axes(recordings: Sequence[Recording], notes: list[str]) -> NDArray[
     return mask
 
 
-def observable(problem: Problem, found: Search) -> dict[Candidate, float]:
-    """Whitened size of every candidate's signature at its prior scale, nuisances projected out."""
-    lin = found.linearised
-    J = np.hstack(
-        [lin.columns_of(problem.nuisances) * [q.tolerance for q in problem.nuisances], problem.numerics]
-    )
-    factor = np.linalg.cholesky(np.eye(J.shape[1]) + J.T @ J)
-    sizes = {}
-    for c, signature in lin.signatures.items():
-        S = signature * [q.scale for q in c.quantities]
-        half = np.linalg.solve(factor, J.T @ S)
-        left = S.T @ S - half.T @ half
-        sizes[c] = math.sqrt(max(float(np.linalg.eigvalsh(left)[-1]), 0.0))
-    return sizes
-
-
-def _rms(problem: Problem, point: dict) -> float:
-    parts = [e.residual(e.predict(point))[:, :3] for e in problem.experiments]
-    return rms(np.concatenate(parts))
+def _residuals(problem: Problem, fit: Fit | None) -> list[Floats]:
+    """Residuals (s, 6) of every recording; ``fit`` None: of the nominal model."""
+    point = fit.point if fit else {}
+    return [e.residual(e.predict(point)) for e in problem.experiments]
 
 
 def _decide(
     result: Diagnosis,
     problem: Problem,
     found: Search,
-    excited: float,
+    excited: bool,
     validation: Sequence[Recording],
     note: Note,
+    workers: int,
 ) -> None:
     """Verdict, causes and their probabilities."""
-    assert result.clean is not None
-    clean_p = next(
-        (p for e, p in zip(found.explanations, found.probabilities, strict=True) if not e.members), 0.0
-    )
-    best = found.best
-    clean = next(e for e in found.explanations if not e.members)
+    clean, best = found.clean, found.best
     if best.members and best.score - clean.score < CLEAN_GAIN:
         best = clean
-    white = whiteness(problem, best.fit.whitened, len(best.fit.active))
-    result.white, result.best = white, best.fit
+    result.best = best.fit
+    result.white = whiteness(problem, best.fit.whitened, len(best.fit.active))
     dof = problem.size
-    beyond = result.clean.chi2 - dof
+    beyond = clean.fit.chi2 - dof
     left = (best.fit.chi2 - dof) / beyond if beyond > 3.0 * math.sqrt(2.0 * dof) else 0.0
-    noise = white.p >= NOT_NOISE
+    noise = result.white.p >= NOT_NOISE
     result.sets = cause_sets(found)
-    if best.members:
-        note("separability")
-        result.at_best = best.lin or linearise(problem, best.fit.point, found.pool, lambda text: None)
-        lin = result.at_best or found.linearised
-        for c in best.members:
-            result.members.append(_member(problem, found, best, c, lin))
     if validation:
         note("validation")
-        result.validation = validate(problem, result.clean, best.fit, validation)
-    if not best.members:
-        result.verdict = "clean" if noise else "unknown"
-        if noise and excited < EXCITED:
-            result.verdict = "not_excited"
-        if not noise:
-            result.members = [Member(None, "unknown", 0.95, None, [])]
-            result.sets = [(("unknown",), 0.95)]
-        elif clean_p < NAMED and result.verdict == "clean":
-            result.notes.append("small causes cannot be excluded; see the list of explanations")
-        return
-    if not noise and left > LEFT_SHARE:
+        result.validation = validate(problem, clean.fit, best.fit, validation)
+    if not noise and (not best.members or left > LEFT_SHARE):
         result.verdict = "unknown"
         result.members = [Member(None, "unknown", 0.95, None, [])]
-        result.sets = [(("unknown",), 0.95), *[(s, 0.05 * p) for s, p in result.sets[:2]]]
-        result.best = best.fit
+        rest = [(s, 0.05 * p) for s, p in result.sets[:2]] if best.members else []
+        result.sets = [(("unknown",), 0.95), *rest]
         return
-    worse = result.validation is not None and result.validation.interval[1] < 0.0
+    if best.members:
+        note("separability")
+        result.at_best = best.lin or linearise(problem, best.fit.point, found.pool, workers)
+        lin = result.at_best or found.linearised
+        result.members = [_member(problem, found, best, c, lin) for c in best.members]
+    apart = not any(m.rivals or m.separation < FITTED for m in result.members if m.separation is not None)
     probability = dict(result.sets).get(best.effects, 0.0)
-    apart = all(m.separation is None or m.separation >= SEPARATION for m in result.members)
-    result.verdict = "named" if probability >= NAMED and apart and not worse else "ambiguous"
-    if worse:
-        result.notes.append("the causes make the prediction of the validation bags worse: they are not named")
-    if not noise:
-        result.members.append(Member(None, "unknown", 0.6, None, []))
-        result.notes.append("something small is left that is not noise")
+    if not excited and not (best.members and apart and probability >= NAMED):
+        result.verdict, result.members = "not_excited", []
+    elif not best.members:
+        result.verdict = "clean"
+        if probability < NAMED:
+            result.notes.append("small causes cannot be excluded; see the list of explanations")
+    else:
+        worse = result.validation is not None and result.validation.interval[1] < 0.0
+        result.verdict = "named" if probability >= NAMED and apart and not worse else "ambiguous"
+        if worse:
+            result.notes.append(
+                "the causes make the prediction of the validation bags worse: they are not named"
+            )
+        if not noise:
+            result.members.append(Member(None, "unknown", 0.6, None, []))
+            result.notes.append("something small is left that is not noise")
 
 
 def _member(problem: Problem, found: Search, best: Explanation, c: Candidate, lin: Linearisation) -> Member:
@@ -286,26 +263,27 @@ def _member(problem: Problem, found: Search, best: Explanation, c: Candidate, li
 
     Where a rival has been fitted in its place, the difference of the costs counts; it knows what linear signatures do not.
     """
-    distances: dict[str, float] = {}
+    near: dict[str, tuple[float, float]] = {}  # effect: distance and the one that is needed
     own = {m.effect for m in best.members}
     for rival in lin.signatures:
         if rival.effect not in own:
-            d = separation(problem, best, c, rival, lin)
-            distances[rival.effect] = min(d, distances.get(rival.effect, math.inf))
+            d = separation(problem, best.fit, c, rival, lin)
+            near[rival.effect] = min((d, SEPARATION), near.get(rival.effect, (math.inf, SEPARATION)))
     rest = best.keys - c.keys
-    swaps: dict[str, float] = {}
+    fitted: dict[str, tuple[float, float]] = {}
     for e in found.explanations:
         others = [m for m in e.members if not m.keys <= rest]
         if len(others) == 1 and e.keys - others[0].keys == rest and others[0].effect not in own:
             d = math.sqrt(max(e.fit.cost - best.fit.cost, 0.0))
-            swaps[others[0].effect] = min(d, swaps.get(others[0].effect, math.inf))
-    distances.update(swaps)
+            fitted[others[0].effect] = min((d, FITTED), fitted.get(others[0].effect, (math.inf, FITTED)))
+    near.update(fitted)
     probability = float(
         sum(p for e, p in zip(found.explanations, found.probabilities, strict=True) if c.effect in e.effects)
     )
-    nearest = min(distances.values(), default=separation(problem, best, c, None, lin))
-    rivals = sorted((d, name) for name, d in distances.items() if d < SEPARATION)
-    return Member(c, c.effect, probability, nearest, [name for _, name in rivals])
+    rivals = sorted((d, name) for name, (d, needed) in near.items() if d < needed)
+    nearest = min((d for d, _ in near.values()), default=math.inf)
+    alone = separation(problem, best.fit, c, None, lin)
+    return Member(c, c.effect, probability, min(nearest, alone), [name for _, name in rivals])
 
 
 def cause_sets(found: Search) -> list[tuple[tuple[str, ...], float]]:
@@ -359,16 +337,3 @@ def validate(problem: Problem, clean: Fit, best: Fit, recordings: Sequence[Recor
         nis[1] / nis[2] if nis[2] else math.nan,
         bags,
     )
-
-
-def floor(robot: Robot) -> float:
-    """3-D rms of the tracker's own noise, m."""
-    return noise_floor(robot)
-
-
-def texts(effect: str) -> str:
-    """What an effect says, in one sentence."""
-    return EFFECTS[effect].text if effect in EFFECTS else ""
-
-
-__all__ = ["Diagnosis", "Experiment", "Member", "Validation", "diagnose", "floor", "texts"]

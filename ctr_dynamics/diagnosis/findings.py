@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ctr_dynamics import __version__
 from ctr_dynamics.bagio.replay import plain
@@ -15,11 +16,13 @@ from ctr_dynamics.bagio.writer import atomic_file
 from ctr_dynamics.effects import EFFECTS, Quantity
 from ctr_dynamics.robot import robot_to_yaml
 
+from .checks import rms
 from .diagnose import Diagnosis, Member
 from .fit import Fit
 from .noise import noise_floor
 from .robots import robot_of
 
+Floats = NDArray[np.float64]
 SCHEMA = "ctr_dynamics/findings/1"
 RECALIBRATED, EXTENDED = "recalibrated_robot.yaml", "extended_robot.yaml"
 NUMERICS_LIMIT = 0.2  # of the noise floor
@@ -87,8 +90,8 @@ def findings(diagnosis: Diagnosis, command: str, experiment: dict[str, Any] | No
         causes = []
     residual = {
         "nominal_rms_m": d.nominal_rms,
-        "recalibrated_rms_m": _rms(d, d.clean),
-        "extended_rms_m": _rms(d, d.best),
+        "recalibrated_rms_m": _rms(d.left),
+        "extended_rms_m": _rms(d.rest),
         "noise_floor_m": noise_floor(d.robot),
         "whiteness_p": d.white.p if d.white else None,
     }
@@ -137,16 +140,8 @@ def findings(diagnosis: Diagnosis, command: str, experiment: dict[str, Any] | No
     )
 
 
-def _rms(d: Diagnosis, fit: Fit | None) -> float | None:
-    if fit is None or d.problem is None:
-        return None
-    squares, count = 0.0, 0
-    for experiment in d.problem.experiments:
-        residual = experiment.residual(experiment.predict(fit.point))[:, :3]
-        good = np.isfinite(residual).all(axis=1)
-        squares += float(np.sum(residual[good] ** 2))
-        count += int(good.sum())
-    return math.sqrt(squares / count) if count else None
+def _rms(residuals: list[Floats]) -> float | None:
+    return rms(np.concatenate(residuals)[:, :3]) if residuals else None
 
 
 def write(directory: Path, diagnosis: Diagnosis, content: dict[str, Any]) -> None:

@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
+from joblib import Parallel, delayed
 from numpy.typing import NDArray
 from scipy.special import log_ndtr
 
-from ctr_dynamics.effects import EFFECTS, Quantity
+from ctr_dynamics.effects import Quantity
 from ctr_dynamics.errors import InputError
 from ctr_dynamics.robot import Robot
 
@@ -25,6 +26,7 @@ from .recording import Recording
 Floats = NDArray[np.float64]
 Key = tuple[str, str]
 INSIDE = 2.9  # tolerances: an error beyond is not one of tolerance, and needs a cause
+DIFFERENCE = 0.02  # of the scale, for columns by differences
 NUMERICS_SIGMA = 0.6  # of the difference to a finer solution, which the prediction includes
 
 LOG_INSIDE = float(log_ndtr(INSIDE))
@@ -62,6 +64,19 @@ class Fit:
         """Coordinates by quantity."""
         return {q.key: float(v) for q, v in zip(self.active, self.values, strict=True)}
 
+    @property
+    def by_key(self) -> dict[Key, Floats]:
+        """Columns by quantity."""
+        return {q.key: self.columns[:, i] for i, q in enumerate(self.active)}
+
+
+@dataclass(frozen=True)
+class Local:
+    """The model around one point: whitened residual (m,), and derivatives (m,) of the prediction by coordinates."""
+
+    residual: Floats
+    columns: Mapping[Key, Floats]
+
 
 @dataclass
 class Problem:
@@ -77,9 +92,8 @@ class Problem:
     experiments: list[Experiment]
     whiteners: list[Whitener]
     nuisances: tuple[Quantity, ...]
-    numerics: Floats = field(default_factory=lambda: np.zeros((0, 0)))
-    offset: Floats = field(default_factory=lambda: np.zeros(0))
-    weights: Floats = field(default_factory=lambda: np.zeros(0))
+    numerics: Floats
+    offset: Floats
 
     @property
     def size(self) -> int:
@@ -97,7 +111,7 @@ class Problem:
             if prediction.failure:
                 return None
             parts.append(whiten(experiment.residual(prediction)))
-        return np.concatenate(parts) - self.offset if len(self.offset) else np.concatenate(parts)
+        return np.concatenate(parts) - self.offset
 
     def linearise(
         self, point: Mapping[Key, float], wanted: Sequence[Quantity]
@@ -114,8 +128,7 @@ class Problem:
             residuals.append(whiten(experiment.residual(prediction)))
             columns.append(whiten(jacobian))
         scale = np.array([q.scale for q in wanted])
-        residual = np.concatenate(residuals)
-        return (residual - self.offset if len(self.offset) else residual), np.concatenate(columns) / scale
+        return np.concatenate(residuals) - self.offset, np.concatenate(columns) / scale
 
 
 def make_problem(
@@ -127,7 +140,13 @@ def make_problem(
     for r in recordings:
         used = np.isfinite(r.position).all(axis=1) & (r.stamps >= 0.0)
         whiteners.append(Whitener(robot, r.stamps, mask, used))
-    return Problem(robot, experiments, whiteners, tuple(nuisances))
+    size = sum(w.size for w in whiteners)
+    return Problem(robot, experiments, whiteners, tuple(nuisances), np.zeros((size, 0)), np.zeros(size))
+
+
+def prior_variance(quantity: Quantity, cause: bool) -> float:
+    """Of a coordinate: tolerance^2, plus scale^2 where it may be a cause."""
+    return quantity.tolerance**2 + (quantity.scale**2 if cause else 0.0)
 
 
 def variances(
@@ -138,7 +157,7 @@ def variances(
     names = {q.key for q in nuisances}
     active += [q for q in causes if q.key not in names]
     wide = {q.key for q in causes}
-    return tuple(active), np.array([q.tolerance**2 + (q.scale**2 if q.key in wide else 0.0) for q in active])
+    return tuple(active), np.array([prior_variance(q, q.key in wide) for q in active])
 
 
 def posterior(
@@ -149,7 +168,7 @@ def posterior(
     ``residual`` (m,) at the present ``departure`` (a,); ``columns`` (m, a); ``numerics`` (m, d) with prior deviations of one.
     """
     count = len(variance)
-    J = np.hstack([columns, numerics]) if numerics.size else columns
+    J = np.hstack([columns, numerics])
     prior = np.concatenate([variance, np.ones(J.shape[1] - count)])
     target = residual + columns @ departure
     root = np.sqrt(prior)
@@ -166,125 +185,188 @@ def posterior(
 
 def cost(residual: Floats, departure: Floats, variance: Floats, numerics: Floats) -> float:
     """Twice the negative log posterior, with the numerics directions at their best."""
-    value = float(residual @ residual)
-    if numerics.size:
-        rhs = numerics.T @ residual
-        value -= float(rhs @ np.linalg.solve(np.eye(numerics.shape[1]) + numerics.T @ numerics, rhs))
-    return value + float(np.sum(departure**2 / variance))
+    rhs = numerics.T @ residual
+    free = float(rhs @ np.linalg.solve(np.eye(numerics.shape[1]) + numerics.T @ numerics, rhs))
+    return float(residual @ residual) - free + float(np.sum(departure**2 / variance))
 
 
 def fit(
     problem: Problem,
     causes: Sequence[Quantity],
     start: Mapping[Key, float],
-    known: tuple[Floats, Floats, Sequence[Quantity]] | None = None,
+    known: Local | None = None,
     *,
-    iterations: int = 6,
-    exact: bool = True,
+    iterations: int = 10,
+    renewals: int = 2,
+    limit: float = math.inf,
 ) -> Fit | None:
     """Best values of nuisances and ``causes`` from ``start``.
 
     Args:
-        known: residual, columns and their quantities at ``start``, where they have been computed already.
-        exact: compute the columns anew at the end when the way there was long.
+        known: the model at ``start``, where it has been computed already; columns that it lacks are zero until the fit has moved.
+        renewals: how often columns may be computed exactly on the way.
+        limit: cost beyond which the fit is given up early.
     Returns:
         None where no simulation succeeds.
     """
-    active, variance = variances(problem.nuisances, causes)
-    off = np.array([q.off for q in active])
-    low = np.array([q.low for q in active])
-    high = np.array([q.high for q in active])
-    values = np.array([start.get(q.key, q.off) for q in active])
-    if known is not None and {q.key for q in active} <= {q.key for q in known[2]}:
-        residual = known[0]
-        where = {q.key: i for i, q in enumerate(known[2])}
-        columns = known[1][:, [where[q.key] for q in active]]
-    else:
-        found = problem.linearise({q.key: float(v) for q, v in zip(active, values, strict=True)}, active)
-        if found is None:
-            return None
-        residual, columns = found
-    numerics = problem.numerics
-    here = cost(residual, values - off, variance, numerics)
-    travelled, fresh = 0.0, True
-    for _ in range(iterations):
-        wanted, covariance, _ = posterior(residual, columns, values - off, variance, numerics)
-        step = np.clip(off + wanted, low, high) - values
-        bound = (off + wanted < low) | (off + wanted > high)
-        if bound.any():  # move the others with the bounded ones held
-            free = ~bound
-            moved = residual - columns[:, bound] @ step[bound]
-            wanted_free, _, _ = posterior(
-                moved, columns[:, free], (values - off)[free], variance[free], numerics
-            )
-            step[free] = np.clip((off[free] + wanted_free), low[free], high[free]) - values[free]
-        size = float(np.linalg.norm(columns @ step))
+    descent = _Descent(problem, causes, start)
+    if not descent.begin(known):
+        return None
+    for number in range(iterations):
+        step = descent.step()
+        size = float(np.linalg.norm(descent.columns @ step))
         if size < 0.05:
             break
-        factor, accepted = 1.0, False
-        for _halving in range(4):
-            trial = values + factor * step
-            new = problem.residual({q.key: float(v) for q, v in zip(active, trial, strict=True)})
-            if new is not None:
-                there = cost(new, trial - off, variance, numerics)
-                if there < here + 1e-9:
-                    accepted = True
-                    break
-            factor *= 0.35
-        if not accepted or new is None:
-            if fresh:
-                break
-            found = problem.linearise({q.key: float(v) for q, v in zip(active, values, strict=True)}, active)
-            if found is None:
-                return None
-            residual, columns = found
-            fresh, travelled = True, 0.0
-            continue
-        change = trial - values
-        predicted = residual - columns @ change
-        error = float(np.linalg.norm(new - predicted))
-        travelled += error
-        # Broyden, in coordinates scaled by the prior
-        weight = change / variance
-        columns = columns + np.outer(predicted - new, weight) / float(change @ weight)
-        gain = here - there
-        values, residual, here, fresh = trial, new, there, False
-        if error > 0.3 * max(size, 1e-9) * factor and travelled > 3.0:
-            found = problem.linearise({q.key: float(v) for q, v in zip(active, values, strict=True)}, active)
-            if found is None:
-                return None
-            residual, columns = found
-            fresh, travelled = True, 0.0
-        elif gain < 0.02 and factor == 1.0:
+        promise = descent.cost - descent.promised(step)
+        if number > 1 and descent.cost - 3.0 * promise > limit:
             break
-    if exact and travelled > 3.0:
-        found = problem.linearise({q.key: float(v) for q, v in zip(active, values, strict=True)}, active)
-        if found is not None:
-            residual, columns = found
-            wanted, _, _ = posterior(residual, columns, values - off, variance, numerics)
-            trial = np.clip(off + wanted, low, high)
-            new = problem.residual({q.key: float(v) for q, v in zip(active, trial, strict=True)})
-            if new is not None and cost(new, trial - off, variance, numerics) < here:
-                values, residual = trial, new
-                here = cost(residual, values - off, variance, numerics)
-    _, covariance, _ = posterior(residual, columns, values - off, variance, numerics)
-    evidence = _laplace(here, columns, variance, numerics)
-    one_sided = {q.key for q in causes if (math.isfinite(q.low) and q.low == q.off)}
-    evidence += math.log(2.0) * len(one_sided)
-    within = inside(active, {q.key for q in causes}, values - off, covariance)
-    evidence += within
-    left = residual - _numerics_part(residual, numerics)
-    return Fit(
-        tuple(causes),
-        active,
-        values,
-        covariance,
-        float(left @ left),
-        evidence,
-        left,
-        columns,
-        here - 2.0 * within,
-    )
+        moved = descent.move(step)
+        if moved is None:  # not even a small part of the step is good: the columns are not
+            if descent.exact or not renewals or not descent.renew():
+                break
+            renewals -= 1
+            continue
+        error, gain, factor = moved
+        blind = descent.see()
+        hopeless = number > 1 and descent.cost - promise > limit
+        if (
+            error > 0.3 * size * factor
+            and descent.travelled > 3.0
+            and renewals
+            and not blind
+            and not hopeless
+        ):
+            if not descent.renew():
+                return None
+            renewals -= 1
+        elif gain < 0.02 and factor == 1.0 and not blind:
+            break
+    if renewals and descent.travelled > 3.0 and descent.renew():
+        step = descent.step()
+        if np.linalg.norm(descent.columns @ step) > 0.02:
+            descent.move(step, parts=1, learn=False)
+    return descent.result()
+
+
+class _Descent:
+    """Gauss-Newton with Broyden's updates on one set of quantities; the arrays are those of :class:`Fit`.
+
+    Attributes:
+        exact: whether the columns were computed where the fit stands. travelled: whitened error of predictions since they were.
+        unseen: causes without a column, as shapes of an effect that is off.
+    """
+
+    def __init__(self, problem: Problem, causes: Sequence[Quantity], start: Mapping[Key, float]) -> None:
+        self.problem, self.causes = problem, tuple(causes)
+        self.active, self.variance = variances(problem.nuisances, causes)
+        self.off = np.array([q.off for q in self.active])
+        self.low = np.array([q.low for q in self.active])
+        self.high = np.array([q.high for q in self.active])
+        self.values = np.array([start.get(q.key, q.off) for q in self.active])
+        self.residual, self.columns = np.zeros(0), np.zeros((0, 0))
+        self.cost, self.travelled, self.exact = math.inf, 0.0, False
+        self.unseen: list[int] = []
+
+    def point(self, values: Floats) -> dict[Key, float]:
+        return {q.key: float(v) for q, v in zip(self.active, values, strict=True)}
+
+    def begin(self, known: Local | None) -> bool:
+        if known is None:
+            return self.renew()
+        nothing = np.zeros(len(known.residual))
+        self.residual = known.residual
+        self.columns = np.stack([known.columns.get(q.key, nothing) for q in self.active], axis=1)
+        self.unseen = [i for i, q in enumerate(self.active) if q.key not in known.columns]
+        self.exact = not self.unseen
+        self.cost = self.cost_at(self.residual, self.values)
+        return True
+
+    def cost_at(self, residual: Floats, values: Floats) -> float:
+        return cost(residual, values - self.off, self.variance, self.problem.numerics)
+
+    def renew(self) -> bool:
+        """Exact columns where the fit stands."""
+        found = self.problem.linearise(self.point(self.values), self.active)
+        if found is None:
+            return False
+        self.residual, self.columns = found
+        self.cost, self.travelled, self.exact = self.cost_at(self.residual, self.values), 0.0, True
+        return True
+
+    def see(self) -> bool:
+        """Columns of the unseen by differences; whether there were any."""
+        for i in self.unseen:
+            q, trial = self.active[i], self.values.copy()
+            trial[i] += DIFFERENCE * q.scale * (1.0 if trial[i] + DIFFERENCE * q.scale <= q.high else -1.0)
+            new = self.problem.residual(self.point(trial))
+            if new is not None:
+                self.columns[:, i] = (self.residual - new) / (trial[i] - self.values[i])
+        seen, self.unseen = bool(self.unseen), []
+        return seen
+
+    def step(self) -> Floats:
+        """Gauss-Newton step inside the bounds; the unseen stay."""
+        departure, numerics = self.values - self.off, self.problem.numerics
+        wanted, _, _ = posterior(self.residual, self.columns, departure, self.variance, numerics)
+        wanted += self.off
+        wanted[self.unseen] = self.values[self.unseen]
+        step = np.clip(wanted, self.low, self.high) - self.values
+        free = (wanted >= self.low) & (wanted <= self.high)
+        free[self.unseen] = False
+        if not free.all():  # the others move with these held
+            left = self.residual - self.columns[:, ~free] @ step[~free]
+            others, _, _ = posterior(
+                left, self.columns[:, free], departure[free], self.variance[free], numerics
+            )
+            step[free] = np.clip(self.off[free] + others, self.low[free], self.high[free]) - self.values[free]
+        return step
+
+    def promised(self, step: Floats) -> float:
+        """Cost after ``step`` if the columns are right."""
+        return self.cost_at(self.residual - self.columns @ step, self.values + step)
+
+    def move(self, step: Floats, parts: int = 4, learn: bool = True) -> tuple[float, float, float] | None:
+        """Go by ``step`` or a part of it that lowers the cost: (error of the prediction, gain, part); None where none does."""
+        factor = 1.0
+        for _ in range(parts):
+            trial = self.values + factor * step
+            new = self.problem.residual(self.point(trial))
+            if new is not None and (there := self.cost_at(new, trial)) < self.cost + 1e-9:
+                break
+            factor *= 0.35
+        else:
+            return None
+        change = trial - self.values
+        missed = self.residual - self.columns @ change - new
+        error, gain = float(np.linalg.norm(missed)), self.cost - there
+        if learn:  # Broyden, in coordinates scaled by the prior
+            weight = change / self.variance
+            self.columns = self.columns + np.outer(missed, weight) / float(change @ weight)
+            self.travelled += error
+            self.exact = False
+        self.values, self.residual, self.cost = trial, new, there
+        return error, gain, factor
+
+    def result(self) -> Fit:
+        """What was reached."""
+        departure, numerics = self.values - self.off, self.problem.numerics
+        _, covariance, _ = posterior(self.residual, self.columns, departure, self.variance, numerics)
+        J = np.hstack([self.columns * np.sqrt(self.variance), numerics])
+        evidence = -0.5 * self.cost - 0.5 * float(np.linalg.slogdet(np.eye(J.shape[1]) + J.T @ J)[1])
+        evidence += math.log(2.0) * sum(q.one_sided for q in self.causes)
+        within = inside(self.active, {q.key for q in self.causes}, departure, covariance)
+        left = self.residual - _numerics_part(self.residual, numerics)
+        return Fit(
+            self.causes,
+            self.active,
+            self.values,
+            covariance,
+            float(left @ left),
+            evidence + within,
+            left,
+            self.columns,
+            self.cost - 2.0 * within,
+        )
 
 
 def inside(active: Sequence[Quantity], causes: set[Key], departure: Floats, covariance: Floats) -> float:
@@ -303,48 +385,40 @@ def inside(active: Sequence[Quantity], causes: set[Key], departure: Floats, cova
     return total
 
 
-def _laplace(here: float, columns: Floats, variance: Floats, numerics: Floats) -> float:
-    J = np.hstack([columns * np.sqrt(variance), numerics]) if numerics.size else columns * np.sqrt(variance)
-    _, log_det = np.linalg.slogdet(np.eye(J.shape[1]) + J.T @ J)
-    return -0.5 * here - 0.5 * float(log_det)
-
-
 def _numerics_part(residual: Floats, numerics: Floats) -> Floats:
-    if not numerics.size:
-        return np.zeros_like(residual)
     return numerics @ np.linalg.solve(
         np.eye(numerics.shape[1]) + numerics.T @ numerics, numerics.T @ residual
     )
 
 
-def add_numerics(problem: Problem, point: Mapping[Key, float]) -> dict[str, float]:
+def add_numerics(problem: Problem, point: Mapping[Key, float], workers: int) -> dict[str, float]:
     """Compare with a finer solution at ``point``: correct the residual by the difference, and let it vary.
 
     Returns rms differences in m: ``time_error_m`` (half the step), ``space_error_m`` (twice the nodes).
     """
+
+    def residual(experiment: Experiment, nodes: int, dt: float) -> Floats | None:
+        finer = Experiment(experiment.recording, experiment.robot, nodes, dt)
+        prediction = finer.predict(point)
+        return None if prediction.failure else finer.residual(prediction)
+
+    jobs = []
+    for e in problem.experiments:
+        nodes, dt = e.nodes, e.scheme.dt
+        jobs += [delayed(residual)(e, *finer) for finer in ((nodes, dt), (nodes, 0.5 * dt), (2 * nodes, dt))]
+    done = Parallel(workers, prefer="threads")(jobs)
     directions: list[list[Floats]] = [[], []]
     squares = np.zeros(2)
-    count = 0
-    for experiment, whiten in zip(problem.experiments, problem.whiteners, strict=True):
-        base = experiment.predict(point)
-        for i, (nodes, dt) in enumerate(
-            ((experiment.nodes, 0.5 * experiment.scheme.dt), (2 * experiment.nodes, experiment.scheme.dt))
-        ):
-            finer = Experiment(experiment.recording, experiment.robot, nodes, dt).predict(point)
-            if finer.failure or base.failure:
-                difference = np.zeros((len(base.position), 6))
-            else:
-                difference = experiment.residual(base) - experiment.residual(finer)
+    for number, whiten in enumerate(problem.whiteners):
+        base, *others = done[3 * number : 3 * number + 3]
+        for i, finer in enumerate(others):
+            failed = base is None or finer is None
+            difference = np.zeros((len(whiten.used), 6)) if failed else base - finer
             directions[i].append(whiten(difference))
             squares[i] += float(np.sum(difference[:, :3] ** 2))
-        count += len(base.position)
+    count = sum(len(w.used) for w in problem.whiteners)
     D = np.stack([np.concatenate(parts) for parts in directions], axis=1)
     problem.offset = D.sum(axis=1)
     problem.numerics = NUMERICS_SIGMA * D
     rms = np.sqrt(squares / max(count, 1))
     return {"time_error_m": float(rms[0]), "space_error_m": float(rms[1])}
-
-
-def is_nuisance(quantity: Quantity) -> bool:
-    """Whether the quantity belongs to an effect that is no cause by itself."""
-    return EFFECTS[quantity.effect].nuisance

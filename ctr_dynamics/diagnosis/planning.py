@@ -14,11 +14,13 @@ from ctr_dynamics.robot import Robot
 from ctr_dynamics.simulation.run import drives
 from ctr_dynamics.simulation.scenario import Scenario, load_scenario
 
+from .candidates import Candidate
 from .diagnose import Diagnosis
 from .experiment import Experiment
+from .fit import prior_variance
 from .noise import Whitener
 from .recording import Recording
-from .search import Candidate
+from .signatures import left_over, separation
 
 Floats = NDArray[np.float64]
 LIBRARY = ("release", "light_release", "reversals", "turns")
@@ -75,6 +77,7 @@ def plan(diagnosis: Diagnosis) -> Plan | None:
     if not rivals:
         return None
     rival = rivals[0]
+    before = separation(d.problem, d.best, member.candidate, rival, d.at_best)
     best: Plan | None = None
     for name in LIBRARY:
         scenario = load_scenario(name)
@@ -84,7 +87,7 @@ def plan(diagnosis: Diagnosis) -> Plan | None:
             continue
         if after is not None and (best is None or best.after is None or after > best.after):
             text = f"{scenario.description}; tells {member.effect} from {rival.effect}"
-            best = Plan(text, scenario, member.separation, after)
+            best = Plan(text, scenario, before, after)
     return best
 
 
@@ -105,7 +108,7 @@ def _separation(d: Diagnosis, scenario: Scenario, own: Candidate, rival: Candida
     whiten = Whitener(d.robot, recording.stamps, mask, np.ones(len(recording.stamps), bool))
     columns = whiten(jacobian)
     a = len(fit.active)
-    old = np.hstack([fit.columns * [q.scale for q in fit.active]])
+    old = fit.columns * [q.scale for q in fit.active]
     old_rival = d.at_best.signatures[rival]
     chosen = [i for i, q in enumerate(rival.quantities) if q.key in {x.key for x in rivals}]
     old_rival = old_rival[:, chosen] * [rival.quantities[i].scale for i in chosen]
@@ -116,10 +119,6 @@ def _separation(d: Diagnosis, scenario: Scenario, own: Candidate, rival: Candida
         [(v - q.off) / q.scale if q.key in keys else 0.0 for q, v in zip(fit.active, fit.values, strict=True)]
     )
     signature = everything @ departure
-    widths = np.array(
-        [q.tolerance / q.scale if q.key in keys else max(q.tolerance / q.scale, 0.0) for q in fit.active]
-    )
-    J = np.hstack([everything * widths, against])
-    rhs = J.T @ signature
-    left = float(signature @ signature - rhs @ np.linalg.solve(np.eye(J.shape[1]) + J.T @ J, rhs))
-    return math.sqrt(max(left, 0.0))
+    wide = {q.key for q in fit.causes} - keys
+    widths = np.array([math.sqrt(prior_variance(q, q.key in wide)) / q.scale for q in fit.active])
+    return float(left_over(np.hstack([everything * widths, against]), signature[:, None])[0])

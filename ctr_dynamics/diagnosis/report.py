@@ -17,11 +17,10 @@ from ctr_dynamics.report.page import Page
 
 from .checks import by_axis
 from .diagnose import Diagnosis
-from .experiment import Experiment
 from .fit import Fit
 from .noise import noise_floor
-from .search import separation
 from .sentences import summary
+from .signatures import separation
 
 Floats = NDArray[np.float64]
 AXES = "xyz"
@@ -38,7 +37,7 @@ def write_report(path: Path, diagnosis: Diagnosis, content: dict[str, Any]) -> N
     for text in content["notes"]:
         page.paragraph(text, "warning")
     if diagnosis.problem is not None and diagnosis.clean is not None and diagnosis.best is not None:
-        _traces(page, diagnosis, diagnosis.clean, diagnosis.best)
+        _traces(page, diagnosis)
         _evidence(page, diagnosis)
         _rivals(page, diagnosis)
         _validation(page, diagnosis)
@@ -49,18 +48,10 @@ def write_report(path: Path, diagnosis: Diagnosis, content: dict[str, Any]) -> N
         part.write_text(page.text(), encoding="utf-8")
 
 
-def _residuals(experiment: Experiment, fit: Fit) -> tuple[Floats, Floats]:
-    prediction = experiment.predict(fit.point)
-    return prediction.position, experiment.residual(prediction)
-
-
-def _traces(page: Page, d: Diagnosis, clean: Fit, best: Fit) -> None:
-    assert d.problem is not None
-    for experiment in d.problem.experiments:
-        recording = experiment.recording
+def _traces(page: Page, d: Diagnosis) -> None:
+    for recording, left, rest in zip(d.recordings, d.left, d.rest, strict=True):
         t = recording.stamps
-        before, left = _residuals(experiment, clean)
-        after, rest = _residuals(experiment, best)
+        before, after = (recording.position - r[:, :3] for r in (left, rest))
         band = np.full(len(t), 2e3 * noise_floor(d.robot) / np.sqrt(3.0))
         page.heading(f"Measured and simulated: {recording.name}")
         panels, errors = [], []
@@ -148,7 +139,7 @@ def _evidence(page: Page, d: Diagnosis) -> None:
         for label, p, e in zip(labels, d.search.probabilities, shown, strict=False)
     ]
     page.table(rows, ("explanation", "probability", "squares over noise"))
-    linear = [(c.label, float(gain)) for gain, c in d.search.screened[:SHOWN_CAUSES] if np.isfinite(gain)]
+    linear = [(s.candidate.label, s.gain) for s in d.search.screened[:SHOWN_CAUSES] if np.isfinite(s.gain)]
     page.paragraph(
         "Log evidence that each single cause gains by the linear estimate at the re-calibrated model:"
     )
@@ -168,7 +159,7 @@ def _rivals(page: Page, d: Diagnosis) -> None:
         for rival in d.at_best.signatures:
             if rival.effect != member.effect:
                 k = names.index(rival.effect)
-                value = separation(d.problem, best, member, rival, d.at_best)
+                value = separation(d.problem, best.fit, member, rival, d.at_best)
                 table[i, k] = np.nanmin([table[i, k], value])
     figure = Figure(figsize=(10, 1.8 + 0.3 * len(members)), layout="constrained")
     ax = figure.subplots()

@@ -80,7 +80,7 @@ register(
         _backlash,
         "A tube follows its drive only after the dead zone of a reversal.",
         "Nordin and Gutman (2002): the play operator",
-        smooth=False,
+        probes=(0.7, 2.0),
     )
 )
 
@@ -182,6 +182,9 @@ register(
         "Tubes tilt within their clearance at the end of the outer one, about the moment that passes.",
         "smooth saturation of the tilt, play * m / sqrt(m^2 + m0^2) with m0 = 0.01 N m; clearance: Ha, Fritzler, Park and Dupont (2016)",
         extended=True,
+        presets=({"share": 0.0}, {"share": 1.0}),
+        probes=(0.6, 1.6),
+        form=("play_kinematics",),
     )
 )
 

@@ -76,10 +76,11 @@ class Effect:
         apply: changes a setup by values by name (all names present, ``tubeN`` expanded).
         text: what it models, one sentence. source: where the physics comes from.
         extended: whether it needs the extended kernels.
-        smooth: whether the prediction has a derivative at the off-value; others need finite probes.
+        probes: sizes, in scales, at which it is tried where its derivative at the off-value says little; empty where that serves.
         joint: parameters that are only tried together (a vector); else each is a variant of its own.
         presets: values of the shape parameters from which a search starts, by name; several are tried.
         nuisance: not a cause by itself: it widens what others may explain, and is not in the catalogue of findings.
+        form: nuisances that are free only beside this effect, for what is uncertain in its form; presets may name their parameters.
     """
 
     name: str
@@ -88,10 +89,11 @@ class Effect:
     text: str
     source: str
     extended: bool = False
-    smooth: bool = True
+    probes: tuple[float, ...] = ()
     joint: bool = False
     presets: tuple[Mapping[str, float], ...] = ({},)
     nuisance: bool = False
+    form: tuple[str, ...] = ()
 
     def accepts(self, name: str) -> bool:
         """Whether ``name`` is one of its parameters."""
@@ -146,6 +148,11 @@ class Quantity:
     def extended(self) -> bool:
         """Whether it needs the extended kernels."""
         return EFFECTS[self.effect].extended
+
+    @property
+    def one_sided(self) -> bool:
+        """Whether it departs from its off-value to one side only."""
+        return math.isfinite(self.low) and self.low == self.off
 
 
 def _number(x: float | Nominal, robot: Robot, tube: int) -> float:

@@ -118,7 +118,7 @@ register(
         "The tip touches a wall and is pushed back in proportion to the depth.",
         "penalty contact: Johnson, Contact Mechanics (1985)",
         extended=True,
-        smooth=False,
+        probes=(0.7,),
         joint=True,
     )
 )

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from ctr_dynamics.cli.main import spread
+from ctr_dynamics.diagnosis.candidates import candidates
 from ctr_dynamics.diagnosis.checks import block_bootstrap
 from ctr_dynamics.diagnosis.experiment import at_times, play, product, rotate, to_vectors
 from ctr_dynamics.diagnosis.fit import posterior
 from ctr_dynamics.diagnosis.noise import Whitener
-from ctr_dynamics.diagnosis.search import candidates
 from ctr_dynamics.effects import EFFECTS, quantities
 from ctr_dynamics.robot import load_robot
 

@@ -1,0 +1,100 @@
+"""Candidates: the ways in which a model may be wrong, and how likely each is before the data."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ctr_dynamics.effects import EFFECTS, Quantity
+
+from .fit import Key
+
+Floats = NDArray[np.float64]
+LOG_PRIOR_CLEAN = math.log(0.5)
+PRIOR_SINGLE, PRIOR_PAIR, PRIOR_TRIPLE = 0.38, 0.1, 0.02
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """One way in which the model may be wrong.
+
+    Attributes:
+        effect: ID. quantities: free parameters that have an effect from zero on. shapes: parameters that are free once there is one.
+        start: coordinates of the shape parameters, and of the nuisances of its form, to begin with.
+    """
+
+    effect: str
+    quantities: tuple[Quantity, ...]
+    shapes: tuple[Quantity, ...] = ()
+    start: tuple[tuple[Key, float], ...] = ()
+
+    @property
+    def label(self) -> str:
+        """Effect, and the parameter where there is a choice."""
+        names = ",".join(q.name for q in self.quantities)
+        return f"{self.effect}({names})"
+
+    @property
+    def keys(self) -> frozenset[Key]:
+        """Its free parameters."""
+        return frozenset(q.key for q in self.quantities + self.shapes)
+
+
+def candidates(known: Sequence[Quantity], positions: Floats) -> list[Candidate]:
+    """Every candidate of the catalogue.
+
+    ``positions`` (s, 3) m of the tip say where springs are anchored to begin with, and where planes of contact may lie: on each of six sides,
+    so that a tenth of the samples is behind.
+    """
+    anchor = positions.mean(axis=0)
+    planes: list[Mapping[str, float]] = []
+    for axis in range(3):
+        for sign in (1.0, -1.0):
+            normal = dict.fromkeys(("nx", "ny", "nz"), 0.0)
+            normal["n" + "xyz"[axis]] = sign
+            planes.append({**normal, "offset_m": float(np.quantile(sign * positions[:, axis], 0.1))})
+    found: list[Candidate] = []
+    for name, effect in EFFECTS.items():
+        if effect.nuisance:
+            continue
+        own = [q for q in known if q.effect == name]
+        amplitudes = [q for q in own if not q.parameter.shape]
+        shapes = [q for q in own if q.parameter.shape]
+        groups: list[tuple[list[Quantity], list[Quantity]]]
+        if effect.joint:
+            groups = [(amplitudes, shapes)]
+        else:
+            groups = [([q], [s for s in shapes if tube_of(s) == tube_of(q)]) for q in amplitudes]
+        for group, extra in groups:
+            presets = effect.presets if name != "contact" else planes
+            for preset in presets:
+                form = [q for q in known if q.effect in effect.form]
+                start = {q.key: preset.get(q.parameter.name.split(".")[-1], q.off) for q in (*extra, *form)}
+                for i, letter in enumerate("xyz"):
+                    key = (name, f"anchor_{letter}_m")
+                    if key in start:
+                        start[key] = float(anchor[i])
+                if all(math.isfinite(v) for v in start.values()):
+                    shapes_here = tuple(replace(q, off=start[q.key]) for q in extra)
+                    found.append(Candidate(name, tuple(group), shapes_here, tuple(start.items())))
+    return found
+
+
+def tube_of(q: Quantity) -> str:
+    """Tube of a quantity, empty where it belongs to none."""
+    return q.name.split(".")[0] if q.name.startswith("tube") else ""
+
+
+def log_prior(members: Sequence[Candidate], every: Sequence[Candidate]) -> float:
+    """Log prior probability of an explanation; variants of an effect share its part."""
+    if not members:
+        return LOG_PRIOR_CLEAN
+    effects = len({c.effect for c in every})
+    mass = {1: PRIOR_SINGLE, 2: PRIOR_PAIR}.get(len(members), PRIOR_TRIPLE)
+    count = math.comb(effects, len(members))
+    variants = sum(math.log(max(1, sum(c.effect == m.effect for c in every))) for m in members)
+    return math.log(mass / count) - variants

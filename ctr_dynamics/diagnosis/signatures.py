@@ -1,0 +1,225 @@
+"""What every candidate would do to the residual at one point: signatures, what they would explain, and which are alike."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from joblib import Parallel, delayed
+from numpy.typing import NDArray
+
+from ctr_dynamics.effects import EFFECTS, Quantity
+
+from .candidates import Candidate, tube_of
+from .fit import INSIDE, Fit, Key, Problem, inside, posterior, prior_variance, variances
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Probe:
+    """A candidate at a finite size: coordinates beside the base point, and the residual (m,) there."""
+
+    shift: dict[Key, float]
+    residual: Floats
+
+
+@dataclass(frozen=True)
+class Scored:
+    """A candidate and the linear log evidence that it gains; ``probe``: from where it does, None for the base point."""
+
+    gain: float
+    candidate: Candidate
+    probe: Probe | None
+
+
+@dataclass
+class Linearisation:
+    """Residual and columns of every candidate at one point.
+
+    Attributes:
+        columns: of quantities that have a derivative there. signatures: (m, quantities) of each candidate. probes: of those that were
+            tried at finite sizes; their signatures are the secants to the first.
+    """
+
+    point: dict[Key, float]
+    residual: Floats
+    columns: dict[Key, Floats]
+    signatures: dict[Candidate, Floats] = field(default_factory=dict)
+    probes: dict[Candidate, list[Probe]] = field(default_factory=dict)
+
+    def own(self, c: Candidate) -> dict[Key, Floats]:
+        """Columns of a candidate's quantities; empty where it has none."""
+        signature = self.signatures.get(c)
+        return {} if signature is None else {q.key: signature[:, i] for i, q in enumerate(c.quantities)}
+
+
+def linearise(
+    problem: Problem, point: Mapping[Key, float], pool: Sequence[Candidate], workers: int
+) -> Linearisation | None:
+    """Columns of nuisances and all candidates at ``point``; those without a derivative by finite probes.
+
+    Returns:
+        None where the model cannot be simulated at ``point``.
+    """
+    plain: dict[Key, Quantity] = {q.key: q for q in problem.nuisances}
+    shaped: list[Candidate] = []
+    rough: list[Candidate] = []
+    for c in pool:
+        if EFFECTS[c.effect].probes:
+            rough.append(c)
+        elif c.shapes or c.quantities[0].extended:
+            shaped.append(c)
+        else:
+            plain.update({q.key: q for q in c.quantities})
+    wanted = tuple(plain.values())
+    groups = _compatible(shaped)
+
+    def columns(at: Mapping[Key, float], quantities: Sequence[Quantity]) -> tuple[Floats, Floats] | None:
+        return problem.linearise({**at, **point}, quantities)
+
+    def probe(c: Candidate, size: float, back: Mapping[Key, float]) -> Probe | None:
+        shift = {**back, **dict(c.start), **{q.key: q.off + size * q.scale for q in c.quantities}}
+        found = problem.residual({**point, **shift})
+        return None if found is None else Probe(shift, found)
+
+    # nuisances that have left their tolerances imitate a cause: then it is tried beside nominal ones too
+    strayed = any(abs(point.get(q.key, q.off) - q.off) > INSIDE * q.tolerance for q in problem.nuisances)
+    places = [{}, {q.key: q.off for q in problem.nuisances}] if strayed else [{}]
+    probes = [(c, size, back) for back in places for c in rough for size in EFFECTS[c.effect].probes]
+    jobs = [delayed(columns)(at, tuple(q for c in members for q in c.quantities)) for at, members in groups]
+    jobs += [delayed(columns)({}, wanted), *(delayed(probe)(*arguments) for arguments in probes)]
+    done = Parallel(workers, prefer="threads")(jobs)
+    found = done[len(groups)]
+    if found is None:
+        return None
+    residual = found[0]
+    result = Linearisation(dict(point), residual, {q.key: found[1][:, i] for i, q in enumerate(wanted)})
+    for (_, members), outcome in zip(groups, done, strict=False):
+        if outcome is None:
+            continue
+        first = 0
+        for c in members:
+            result.signatures[c] = outcome[1][:, first : first + len(c.quantities)]
+            first += len(c.quantities)
+    for (c, _, _), new in zip(probes, done[len(groups) + 1 :], strict=True):
+        if new is not None:
+            result.probes.setdefault(c, []).append(new)
+    for c in pool:
+        if c in result.probes:
+            (q,), first_probe = c.quantities, result.probes[c][0]
+            secant = (residual - first_probe.residual) / (first_probe.shift[q.key] - q.off)
+            result.signatures[c] = secant[:, None]
+        elif c not in shaped and c not in rough:
+            result.signatures[c] = np.stack([result.columns[q.key] for q in c.quantities], axis=1)
+    return result
+
+
+def _compatible(shaped: Sequence[Candidate]) -> list[tuple[dict[Key, float], list[Candidate]]]:
+    """Candidates in groups whose shape parameters can be set at the same time: (shapes, members)."""
+    groups: list[tuple[dict[Key, float], list[Candidate]]] = []
+    for c in shaped:
+        start = dict(c.start)
+        for at, members in groups:
+            if all(at.get(key, value) == value for key, value in start.items()):
+                at.update(start)
+                members.append(c)
+                break
+        else:
+            groups.append((start, [c]))
+    return groups
+
+
+def screen(
+    problem: Problem, lin: Linearisation, base: Fit, members: Sequence[Candidate], pool: Sequence[Candidate]
+) -> list[Scored]:
+    """Linear log evidence gained by each candidate beside ``members``, best first; one-sided causes of the wrong sign gain nothing.
+
+    ``base`` is the fit of ``members``, where ``lin`` stands.
+    """
+    fixed = tuple(q for c in members for q in c.quantities + c.shapes)
+    active, variance = variances(problem.nuisances, fixed)
+    known = {**base.by_key, **lin.columns}
+    columns = np.stack([known[q.key] for q in active], axis=1)
+    values = np.array([lin.point.get(q.key, q.off) - q.off for q in active])
+    before, spread, reference = posterior(lin.residual, columns, values, variance, problem.numerics)
+    reference += inside(active, {q.key for q in fixed}, before, spread)
+
+    def evidence_at(probe: Probe, c: Candidate) -> float:
+        there = np.array([{**lin.point, **probe.shift}.get(q.key, q.off) - q.off for q in active])
+        departure, spread, evidence = posterior(probe.residual, columns, there, variance, problem.numerics)
+        (q,) = c.quantities
+        evidence -= 0.5 * ((probe.shift[q.key] - q.off) / q.scale) ** 2
+        evidence -= math.log1p(q.scale * float(np.linalg.norm(lin.signatures[c])))  # the size is free
+        return evidence + inside(active, {x.key for x in fixed}, departure, spread)
+
+    taken = {c.effect + tube_of(c.quantities[0]) for c in members}
+    place = {q.key: i for i, q in enumerate(active)}
+    scored = []
+    for c in pool:
+        if c.effect + tube_of(c.quantities[0]) in taken or c not in lin.signatures:
+            continue
+        wide, J, start = variance.copy(), columns, values
+        where = []
+        for i, q in enumerate(c.quantities):
+            if q.key in place:
+                wide[place[q.key]] += q.scale**2
+                where.append(place[q.key])
+            else:
+                where.append(J.shape[1])
+                J = np.hstack([J, lin.signatures[c][:, [i]]])
+                wide, start = np.append(wide, q.scale**2), np.append(start, 0.0)
+        departure, spread, evidence = posterior(lin.residual, J, start, wide, problem.numerics)
+        evidence += inside(active, {q.key for q in (*fixed, *c.quantities)}, departure, spread)
+        gain = evidence - reference
+        if len(where) == 1 and c.quantities[0].one_sided and departure[where[0]] < 0.0:
+            gain = -math.inf
+        best = Scored(gain, c, None)
+        for probe in lin.probes.get(c, ()):
+            best = max(best, Scored(evidence_at(probe, c) - reference, c, probe), key=lambda item: item.gain)
+        scored.append(best)
+    return sorted(scored, key=lambda item: -item.gain)
+
+
+def separation(
+    problem: Problem, fit: Fit, member: Candidate, rival: Candidate | None, lin: Linearisation
+) -> float:
+    """d_sep of one cause: the size of its signature, whitened, with nuisances, other causes and the rival projected out."""
+    own = {q.key for q in member.quantities}
+    departure = np.array(
+        [v - q.off if q.key in own else 0.0 for q, v in zip(fit.active, fit.values, strict=True)]
+    )
+    wide = {q.key for q in fit.causes}
+    parts = [
+        fit.columns[:, i] * math.sqrt(prior_variance(q, q.key in wide))
+        for i, q in enumerate(fit.active)
+        if q.key not in member.keys
+    ]
+    if rival is not None and rival in lin.signatures:
+        parts += [lin.signatures[rival][:, k] * q.scale for k, q in enumerate(rival.quantities)]
+    J = np.hstack([np.stack(parts, axis=1), problem.numerics])
+    return float(left_over(J, (fit.columns @ departure)[:, None])[0])
+
+
+def observable(problem: Problem, lin: Linearisation) -> dict[str, float]:
+    """Whitened size of every effect's strongest signature at its prior scale, nuisances projected out."""
+    J = np.hstack(
+        [
+            np.stack([lin.columns[q.key] * q.tolerance for q in problem.nuisances], axis=1),
+            problem.numerics,
+        ]
+    )
+    sizes: dict[str, float] = {}
+    for c, signature in lin.signatures.items():
+        size = left_over(J, signature * [q.scale for q in c.quantities])[0]
+        sizes[c.effect] = max(float(size), sizes.get(c.effect, 0.0))
+    return sizes
+
+
+def left_over(J: Floats, signature: Floats) -> Floats:
+    """Sizes, largest first, of signatures (m, k) that columns J (m, a) with coefficients of unit prior deviation do not explain."""
+    half = np.linalg.solve(np.linalg.cholesky(np.eye(J.shape[1]) + J.T @ J), J.T @ signature)
+    squares = np.linalg.eigvalsh(signature.T @ signature - half.T @ half)[::-1]
+    return np.sqrt(np.maximum(squares, 0.0))
