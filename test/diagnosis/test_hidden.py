@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from joblib import Parallel, delayed
 from truth.cases import make_case
 
 # (name, stratum, seed, what is hidden): one of each kind; None leaves the choice to the seed
@@ -48,15 +47,11 @@ def _run(folder: Path, stratum: str, seed: int, effects):
 
 @pytest.fixture(scope="module")
 def outcomes(tmp_path_factory):
-    """Findings and answers of all cases, two at a time."""
-    folders = [tmp_path_factory.mktemp(name) for name, *_ in CASES]
-    given = [
-        (folder, stratum, seed, effects)
-        for folder, (_, stratum, seed, effects) in zip(folders, CASES, strict=True)
-    ]
-    first = _run(*given[0])  # alone: it compiles what the others find in the cache
-    found = [first, *Parallel(2, prefer="threads")(delayed(_run)(*arguments) for arguments in given[1:])]
-    return {name: outcome for (name, *_), outcome in zip(CASES, found, strict=True)}
+    """Findings and answers of all cases, one after another: other tests use the other core."""
+    return {
+        name: _run(tmp_path_factory.mktemp(name), stratum, seed, effects)
+        for name, stratum, seed, effects in CASES
+    }
 
 
 @pytest.mark.parametrize("name", ["payload", "latency", "pair"])

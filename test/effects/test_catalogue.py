@@ -112,7 +112,10 @@ def test_bounds_priors_and_descriptions_are_sane(name):
                 assert p.coordinate(p.value(coordinate)) == pytest.approx(coordinate, rel=1e-12)
     for preset in effect.presets:
         for parameter in preset:
-            assert any(p.shape and p.name.replace("tubeN.", "") == parameter for p in effect.parameters)
+            shapes = [p for p in effect.parameters if p.shape]
+            forms = [p for form in effect.form for p in EFFECTS[form].parameters]
+            assert any(p.name.replace("tubeN.", "") == parameter for p in shapes + forms)
+    assert not effect.probes or sum(not p.shape for p in effect.parameters) == 1  # a size of one number
 
 
 @pytest.mark.parametrize("name", sorted(EFFECTS))
