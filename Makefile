@@ -27,7 +27,7 @@ demo: install
 
 test: lint
 	$(BIN)/ctr-dynamics warmup --robot till2020_tissue
-	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile $(PYTEST_ARGS)
+	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder $(PYTEST_ARGS)
 
 lint: install
 	$(BIN)/ruff format --check .

@@ -46,11 +46,11 @@ def run(request: Request, note: Callable[[str], None] = _quiet) -> dict[str, Any
     Raises:
         InputError: a bag that cannot be used.
     """
-    note("kernels: compiled at the first use")
-    rehearse(request.robot)
     note("reading")
     recordings = [read_recording(path, request.robot) for path in request.bags]
     others = [read_recording(path, request.robot) for path in request.validation]
+    note("kernels: compiled at the first use")
+    rehearse(request.robot)
     diagnosis = diagnose(request.robot, recordings, others, note=note, workers=request.workers)
     if not others:
         diagnosis.notes.append(

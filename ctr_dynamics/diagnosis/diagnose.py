@@ -25,6 +25,7 @@ from .mistakes import find_mistake
 from .recording import Recording
 from .search import Explanation, Search, search
 from .signatures import Linearisation, linearise, observable, separation
+from .unexplained import Unexplained, unexplained
 
 Floats = NDArray[np.float64]
 Note = Callable[[str], None]
@@ -92,6 +93,7 @@ class Diagnosis:
     left: list[Floats] = field(default_factory=list)
     rest: list[Floats] = field(default_factory=list)
     at_best: Linearisation | None = None
+    unexplained: Unexplained | None = None
 
 
 def diagnose(
@@ -164,7 +166,7 @@ def diagnose(
         )
     note("numerics")
     result.numerics = add_numerics(problem, clean.point, workers)
-    clean = fit(problem, (), clean.point, Local(clean.whitened - problem.offset, clean.by_key)) or clean
+    clean = fit(problem, (), clean.point, Local(clean.residual - problem.offset, clean.by_key)) or clean
     result.clean = result.best = clean
     result.tested += ["time_discretisation", "space_discretisation"]
     pool = candidates(
@@ -230,12 +232,15 @@ def _decide(
     if not noise and (not best.members or left > LEFT_SHARE):
         result.verdict = "unknown"
         result.members = [Member(None, "unknown", 0.95, None, [])]
+        result.unexplained = unexplained(problem.experiments[0], clean.fit.point)
+        if result.unexplained is not None:
+            result.notes.append(result.unexplained.text)
         rest = [(s, 0.05 * p) for s, p in result.sets[:2]] if best.members else []
         result.sets = [(("unknown",), 0.95), *rest]
         return
     if best.members:
         note("separability")
-        result.at_best = best.lin or linearise(problem, best.fit.point, found.pool, workers)
+        result.at_best = linearise(problem, best.fit.point, found.pool, workers)
         lin = result.at_best or found.linearised
         result.members = [_member(problem, found, best, c, lin) for c in best.members]
     apart = not any(m.rivals or m.separation < FITTED for m in result.members if m.separation is not None)

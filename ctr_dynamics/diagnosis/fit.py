@@ -41,7 +41,8 @@ class Fit:
         values: (a,) coordinates. sigma: (a,) posterior deviations. covariance: (a, a).
         chi2: whitened squares of the residual. cost: twice the negative log posterior density, tolerances ended.
         log_evidence: relative to no model at all; only differences count.
-        whitened: residuals at the best point. columns: (m, a) their derivatives, in coordinates.
+        residual, whitened: (m,) residuals at the best point, with the solver's own error and without.
+        columns: (m, a) their derivatives, in coordinates.
     """
 
     causes: tuple[Quantity, ...]
@@ -50,6 +51,7 @@ class Fit:
     covariance: Floats
     chi2: float
     log_evidence: float
+    residual: Floats
     whitened: Floats
     columns: Floats
     cost: float
@@ -218,7 +220,7 @@ def fit(
         if size < 0.05:
             break
         promise = descent.cost - descent.promised(step)
-        if number > 1 and descent.cost - 3.0 * promise > limit:
+        if number > 2 and descent.cost - 5.0 * promise > limit:
             break
         moved = descent.move(step)
         if moved is None:  # not even a small part of the step is good: the columns are not
@@ -228,7 +230,7 @@ def fit(
             continue
         error, gain, factor = moved
         blind = descent.see()
-        hopeless = number > 1 and descent.cost - promise > limit
+        hopeless = number > 2 and descent.cost - 2.0 * promise > limit
         if (
             error > 0.3 * size * factor
             and descent.travelled > 3.0
@@ -363,6 +365,7 @@ class _Descent:
             covariance,
             float(left @ left),
             evidence + within,
+            self.residual,
             left,
             self.columns,
             self.cost - 2.0 * within,

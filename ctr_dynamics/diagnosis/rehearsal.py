@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from ctr_dynamics.effects import quantities
@@ -13,8 +15,8 @@ from .recording import Recording
 MOMENT = 0.02  # s
 
 
-def rehearse(robot: Robot) -> None:
-    """Compile everything that a diagnosis of ``robot`` needs, or load it from the cache."""
+def rehearse(robot: Robot, models: Sequence[str] = ("plain", "extended")) -> None:
+    """Compile everything that a diagnosis of ``robot`` needs, or load it from the cache; ``models``: which kernels."""
     t = np.array([0.0, 0.5 * MOMENT, MOMENT])
     rest = np.concatenate([robot.rest.alpha.value, robot.rest.beta.value])
     still = Recording(
@@ -29,7 +31,11 @@ def rehearse(robot: Robot) -> None:
         (),
     )
     known = {q.key: q for q in quantities(robot)}
-    wanted = [known["youngs_modulus", "tube1.scale"], known["air_drag", "linear_Ns_per_m2"]]
     experiment = Experiment(still, robot)
-    experiment.jacobian({}, wanted)
-    experiment.predict({("air_drag", "linear_Ns_per_m2"): 0.01})
+    if "plain" in models:
+        experiment.predict({})
+        experiment.jacobian({}, [known["youngs_modulus", "tube1.scale"]])
+    if "extended" in models:
+        air = known["air_drag", "linear_Ns_per_m2"]
+        experiment.predict({air.key: 0.01})
+        experiment.jacobian({air.key: 0.01}, [air])

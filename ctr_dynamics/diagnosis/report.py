@@ -38,6 +38,7 @@ def write_report(path: Path, diagnosis: Diagnosis, content: dict[str, Any]) -> N
         page.paragraph(text, "warning")
     if diagnosis.problem is not None and diagnosis.clean is not None and diagnosis.best is not None:
         _traces(page, diagnosis)
+        _unexplained(page, diagnosis)
         _evidence(page, diagnosis)
         _rivals(page, diagnosis)
         _validation(page, diagnosis)
@@ -79,6 +80,19 @@ def _traces(page: Page, d: Diagnosis) -> None:
             "Residual length over each tube's angle: loops point to friction and play.",
         )
         page.figure(_envelope(t, left, rest), "Residual length, averaged over half a second.")
+
+
+def _unexplained(page: Page, d: Diagnosis) -> None:
+    if d.unexplained is None:
+        return
+    page.heading("The unexplained force")
+    panels = [
+        Panel(f"force {axis} (mN)").line(
+            d.unexplained.stamps, 1e3 * d.unexplained.force[:, i], "at the tip", "fused"
+        )
+        for i, axis in enumerate(AXES)
+    ]
+    page.figure(figure_svg(panels), f"In the first bag, {d.unexplained.text}.")
 
 
 def _loops(joints: Floats, t: Floats, left: Floats, rest: Floats):  # type: ignore[no-untyped-def]

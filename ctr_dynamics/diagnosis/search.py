@@ -39,7 +39,6 @@ class Explanation:
     members: tuple[Candidate, ...]
     fit: Fit
     score: float = 0.0  # log posterior, up to a constant
-    lin: Linearisation | None = None  # of everything else at its best point, where that was needed
     finished: bool = False  # with exact columns
 
     @property
@@ -95,10 +94,12 @@ def search(
         found += _fits(problem, jobs, _limit(problem, found), workers)
         _score(found, pool)
     if found[0].members:
-        found += _further(problem, pool, found, clean, note, workers)
+        found += _further(problem, pool, found, clean, lin, note, workers)
+        _score(found, pool)
+        found += _fewer(problem, found, note, workers)
         _score(found, pool)
         for _ in range(2):  # finishing one may put another first
-            if found[0].members and not found[0].finished:
+            if found[0].members and not found[0].finished and found[0].fit.cost < _hopeless(problem, clean):
                 finish(problem, found[0])
                 _score(found, pool)
     return Search(found, _probabilities(found, problem), base, lin, screened, pool)
@@ -123,7 +124,7 @@ def explain(problem: Problem, job: Job, limit: float = math.inf) -> Explanation 
     if job.new.probe is not None:
         point.update(job.new.probe.shift)
         residual = job.new.probe.residual
-    known = Local(residual, {**job.start.by_key, **job.lin.columns, **job.lin.own(job.new.candidate)})
+    known = Local(residual, {**job.lin.own(job.new.candidate), **job.start.by_key, **job.lin.columns})
     result = fit(with_nuisances(problem, members), causes, point, known, renewals=1, limit=limit)
     return None if result is None else Explanation(members, result)
 
@@ -137,19 +138,9 @@ def with_nuisances(problem: Problem, members: Sequence[Candidate]) -> Problem:
     return replace(problem, nuisances=problem.nuisances + form)
 
 
-def finish(problem: Problem, found: Explanation, lin: Linearisation | None = None) -> None:
-    """Fit again with exact columns: those of ``lin``, which stands at the fit's point, or new ones."""
-    own, known, point = with_nuisances(problem, found.members), None, found.fit.point
-    if lin is not None:
-        missing = [q for q in found.fit.active if q.key not in lin.columns]
-        exact = own.linearise(point, missing) if missing else None
-        if exact is not None:
-            known = Local(
-                lin.residual, {**lin.columns, **{q.key: exact[1][:, i] for i, q in enumerate(missing)}}
-            )
-        elif not missing:
-            known = Local(lin.residual, lin.columns)
-    better = fit(own, found.fit.causes, point, known)
+def finish(problem: Problem, found: Explanation) -> None:
+    """Fit again with exact columns."""
+    better = fit(with_nuisances(problem, found.members), found.fit.causes, found.fit.point)
     if better is not None and better.cost <= found.fit.cost + 1e-6:
         found.fit = better
     found.finished = True
@@ -160,38 +151,38 @@ def _further(
     pool: list[Candidate],
     found: list[Explanation],
     clean: Fit,
+    lin: Linearisation,
     note: Callable[[str], None],
     workers: int,
 ) -> list[Explanation]:
     """Two causes, and three where that pays: what each of the best leaves is screened again."""
     out: list[Explanation] = []
+    hopeless = _hopeless(problem, clean)
     tried: set[frozenset[str]] = set()
     leaders = [e for e in found if e.members][:2]
     much = _leftover(problem, leaders[0].fit) > 4.0
-    leaders = [e for e in leaders if e.score > leaders[0].score - (60.0 if much else 3.0)]
+    leaders = [e for e in leaders if e.score > leaders[0].score - (20.0 if much else 3.0)]
     for _ in range(2):
         new: list[Explanation] = []
         for leader in leaders:
             note(f"what {', '.join(leader.effects)} leaves")
-            leader.lin = linearise(problem, leader.fit.point, pool, workers)
-            if leader.lin is None:
-                continue
-            finish(problem, leader, leader.lin)
-            scored = screen(problem, leader.lin, leader.fit, leader.members, pool)
+            finish(problem, leader)
+            here = lin.carried(leader.fit)
+            scored = screen(problem, here, leader.fit, leader.members, pool)
             jobs = []
             for s in _distinct([s for s in scored if s.gain > SECOND_EVIDENCE - 2.0])[:SECOND]:
                 names = frozenset(x.label for x in (*leader.members, s.candidate))
                 if names not in tried:
                     tried.add(names)
-                    jobs.append(Job(leader.members, s, leader.fit, leader.lin))
+                    jobs.append(Job(leader.members, s, leader.fit, here))
             enough = leader.fit.log_evidence + SECOND_EVIDENCE
-            new += [e for e in _fits(problem, jobs, math.inf, workers) if e.fit.log_evidence > enough]
+            new += [e for e in _fits(problem, jobs, hopeless, workers) if e.fit.log_evidence > enough]
         if not new:
             break
         out += new
         _score(new, pool)
         leaders = new[:1]
-        if _leftover(problem, new[0].fit) > HOPELESS * _leftover(problem, clean):
+        if new[0].fit.cost > hopeless:
             break  # a third cause would not save it: it is outside the catalogue
     return out
 
@@ -200,6 +191,38 @@ def _limit(problem: Problem, found: Sequence[Explanation]) -> float:
     """Cost from which a fit has no chance against what was found."""
     best = min(e.fit.cost for e in found)
     return best + CONTENDER**2 * max(1.0, best / problem.size)
+
+
+def _fewer(
+    problem: Problem, found: Sequence[Explanation], note: Callable[[str], None], workers: int
+) -> list[Explanation]:
+    """The best explanation without each of its causes: what was found on the way to others may not be needed beside them."""
+    best, out = found[0], []
+    while len(best.members) > 1:
+        note(f"whether each of {', '.join(best.effects)} is needed")
+        sets = [tuple(m for m in best.members if m is not c) for c in best.members]
+        fits = Parallel(workers, prefer="threads")(delayed(_from)(problem, rest, best.fit) for rest in sets)
+        smaller = [e for e in fits if e is not None]
+        out += smaller
+        better = max(smaller, key=lambda e: e.fit.log_evidence, default=None)
+        if better is None or better.fit.log_evidence < best.fit.log_evidence - SECOND_EVIDENCE:
+            break
+        best = better
+    return out
+
+
+def _from(problem: Problem, members: tuple[Candidate, ...], start: Fit) -> Explanation | None:
+    """Fit of ``members`` from that of a larger set."""
+    causes = tuple(q for c in members for q in c.quantities + c.shapes)
+    own = with_nuisances(problem, members)
+    free = {q.key for q in (*own.nuisances, *causes)}
+    result = fit(own, causes, {key: value for key, value in start.point.items() if key in free}, renewals=1)
+    return None if result is None else Explanation(members, result)
+
+
+def _hopeless(problem: Problem, clean: Fit) -> float:
+    """Cost that two causes must reach for a third, or for more care, to be worth it."""
+    return problem.size + HOPELESS * max(clean.cost - problem.size, problem.size)
 
 
 def _leftover(problem: Problem, result: Fit) -> float:

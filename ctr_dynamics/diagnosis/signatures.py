@@ -50,6 +50,10 @@ class Linearisation:
     signatures: dict[Candidate, Floats] = field(default_factory=dict)
     probes: dict[Candidate, list[Probe]] = field(default_factory=dict)
 
+    def carried(self, fit: Fit) -> Linearisation:
+        """The same at a fit not far away: its residual and columns, and the signatures of here."""
+        return Linearisation(fit.point, fit.residual, {**self.columns, **fit.by_key}, self.signatures)
+
     def own(self, c: Candidate) -> dict[Key, Floats]:
         """Columns of a candidate's quantities; empty where it has none."""
         signature = self.signatures.get(c)

@@ -22,7 +22,7 @@ def _exposed(setup: Setup, values: Values) -> None:
 register(
     Effect(
         "exposed_length",
-        (Parameter("tubeN.beta_offset_m", "m", 0.0, 1.5e-3, text="true beta minus reading"),),
+        (Parameter("tubeN.beta_offset_m", "m", 0.0, 2.5e-3, text="true beta minus reading"),),
         _exposed,
         "A tube stands further out or in than its translation reads.",
         "Till et al. (2020), fig. 2: beta",
@@ -50,7 +50,7 @@ register(
                 "tubeN.offset_rad",
                 "rad",
                 0.0,
-                0.02,
+                0.03,
                 lambda robot, i: robot.encoders.offset.tolerance,
                 text="true angle minus gain times reading",
             ),
@@ -74,7 +74,7 @@ register(
         "backlash",
         (
             Parameter(
-                "tubeN.width_rad", "rad", 0.0, 0.02, low=0.0, text="whole dead zone between the directions"
+                "tubeN.width_rad", "rad", 0.0, 0.03, low=0.0, text="whole dead zone between the directions"
             ),
         ),
         _backlash,
@@ -101,7 +101,7 @@ register(
                 "tubeN.stiffness_Nm_per_rad",
                 "N m/rad",
                 math.inf,
-                0.3,
+                4.0,
                 low=0.0,
                 power=-1,
                 text="of the shaft between actuator and tube",
@@ -110,7 +110,7 @@ register(
                 "tubeN.inertia_kgm2",
                 "kg m^2",
                 0.0,
-                1e-7,
+                1e-6,
                 low=0.0,
                 shape=True,
                 text="of what turns with the tube's base",

@@ -1,4 +1,8 @@
-"""Effects of friction: at the base plate, between the tubes, along their overlap, against the air."""
+"""Effects of friction: at the base plate, between the tubes, along their overlap, against the air.
+
+Prior scales are sizes at which an effect would be noticed on a robot of this size, such as a viscous torque that damps the first torsional
+mode by some per cent; a robot file's own value widens them where it is larger.
+"""
 
 from __future__ import annotations
 
@@ -37,7 +41,7 @@ for _id, _name, _unit, _where, _kind, _factor, _floor, _text in (
         "1",
         "base",
         "coulomb",
-        0.4,
+        0.6,
         0.05,
         "Smoothed Coulomb friction of the outermost tube in the base plate.",
     ),
@@ -48,7 +52,7 @@ for _id, _name, _unit, _where, _kind, _factor, _floor, _text in (
         "base",
         "viscous",
         1.0,
-        1e-6,
+        2e-4,
         "Viscous friction of the outermost tube in the base plate.",
     ),
     (
@@ -58,7 +62,7 @@ for _id, _name, _unit, _where, _kind, _factor, _floor, _text in (
         "tubes",
         "coulomb",
         4.0,
-        0.01,
+        0.15,
         "Smoothed Coulomb friction between neighbouring tubes.",
     ),
     (
@@ -68,7 +72,7 @@ for _id, _name, _unit, _where, _kind, _factor, _floor, _text in (
         "tubes",
         "viscous",
         4.0,
-        1e-7,
+        1e-4,
         "Viscous friction between neighbouring tubes.",
     ),
 ):
@@ -104,7 +108,7 @@ register(
         "stribeck",
         (
             Parameter(
-                "static_ratio", "1", 1.0, 0.5, low=0.0, text="Coulomb friction at rest over that at speed"
+                "static_ratio", "1", 1.0, 1.0, low=0.0, text="Coulomb friction at rest over that at speed"
             ),
             Parameter(
                 "speed_rad_s",
@@ -138,7 +142,7 @@ register(
                 "torque_Nm_per_m",
                 "N m/m",
                 0.0,
-                5e-3,
+                0.03,
                 low=0.0,
                 text="torque per length of overlap beyond the plate",
             ),
@@ -161,12 +165,12 @@ register(
     Effect(
         "air_drag",
         (
-            Parameter("linear_Ns_per_m2", "N s/m^2", 0.0, 0.03, low=0.0, text="drag per length and speed"),
+            Parameter("linear_Ns_per_m2", "N s/m^2", 0.0, 0.15, low=0.0, text="drag per length and speed"),
             Parameter(
                 "quadratic_Ns2_per_m3",
                 "N s^2/m^3",
                 0.0,
-                0.1,
+                0.5,
                 low=0.0,
                 text="drag per length and speed squared",
             ),

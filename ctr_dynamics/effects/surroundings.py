@@ -30,7 +30,7 @@ register(
                 f"r{axis}_rad",
                 "rad",
                 0.0,
-                0.03,
+                0.05,
                 lambda robot, i: robot.gravity.direction_tolerance,
                 text=f"turn of gravity about base {axis}",
             )
@@ -52,7 +52,7 @@ register(
     Effect(
         "tip_force",
         tuple(
-            Parameter(f"F{axis}_N", "N", 0.0, 0.02, text=f"force on the tip along base {axis}")
+            Parameter(f"F{axis}_N", "N", 0.0, 0.03, text=f"force on the tip along base {axis}")
             for axis in "xyz"
         ),
         _force,
@@ -77,7 +77,7 @@ register(
         "tip_spring",
         (
             Parameter(
-                "stiffness_N_per_m", "N/m", 0.0, 1.5, low=0.0, text="of a spring from the tip to the anchor"
+                "stiffness_N_per_m", "N/m", 0.0, 3.0, low=0.0, text="of a spring from the tip to the anchor"
             ),
             Parameter("damping_Ns_per_m", "N s/m", 0.0, 0.02, low=0.0, text="of a damper beside it"),
             Parameter("anchor_x_m", "m", 0.0, 0.05, shape=True, text="anchor in base axes"),
@@ -107,7 +107,7 @@ register(
         "contact",
         (
             Parameter(
-                "stiffness_N_per_m", "N/m", 0.0, 100.0, low=0.0, text="force per depth behind the plane"
+                "stiffness_N_per_m", "N/m", 0.0, 250.0, low=0.0, text="force per depth behind the plane"
             ),
             Parameter("nx", "1", 0.0, 0.5, shape=True, text="normal of the plane, pointing to the free side"),
             Parameter("ny", "1", 1.0, 0.5, shape=True, text="normal of the plane"),

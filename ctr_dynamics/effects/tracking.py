@@ -42,7 +42,7 @@ register(
                 f"r{a}_rad",
                 "rad",
                 0.0,
-                0.015,
+                0.03,
                 lambda robot, i: float(np.max(robot.tracker.registration_rotation.tolerance)),
                 text=f"turn about {a}",
             )
@@ -62,7 +62,7 @@ register(
                 f"t{a}_m",
                 "m",
                 0.0,
-                0.002,
+                0.004,
                 lambda robot, i: float(np.max(robot.tracker.registration_translation.tolerance)),
                 text=f"shift along {a}",
             )
@@ -82,7 +82,7 @@ register(
                 f"{a}_m",
                 "m",
                 0.0,
-                0.002,
+                0.004,
                 lambda robot, i: float(np.max(robot.tracker.lever_arm.tolerance)),
                 text=f"sensor position in the tip frame, {a}",
             )
@@ -133,7 +133,7 @@ register(
 register(
     Effect(
         "tracker_averaging",
-        (Parameter("window_s", "s", 0.0, 0.03, low=0.0, text="length of the average before the stamp"),),
+        (Parameter("window_s", "s", 0.0, 0.04, low=0.0, text="length of the average before the stamp"),),
         _averaging,
         "The tracker averages over a time before its stamp: delay and loss of amplitude.",
         "moving average",
@@ -142,7 +142,7 @@ register(
 register(
     Effect(
         "clock_skew",
-        (Parameter("rate", "s/s", 0.0, 1e-3, text="tracker stamp = true time * (1 + rate)"),),
+        (Parameter("rate", "s/s", 0.0, 2e-3, text="tracker stamp = true time * (1 + rate)"),),
         _skew,
         "The tracker's clock runs at another rate.",
         "linear clock model",
@@ -169,7 +169,7 @@ register(
 register(
     Effect(
         "drift",
-        tuple(Parameter(f"{a}_m_per_s", "m/s", 0.0, 1e-4, text=f"speed along {a}") for a in "xyz"),
+        tuple(Parameter(f"{a}_m_per_s", "m/s", 0.0, 2e-4, text=f"speed along {a}") for a in "xyz"),
         _drift,
         "The tracker's readings wander off steadily, whatever the robot does.",
         "reading = p + drift * t",

@@ -38,7 +38,6 @@ class Trajectory:
 
     Attributes:
         t: (K,) s. tip: (K, 13) p m, quaternion h (not unit), q m/s and omega rad/s in the tip frame, at every step.
-        beta_rate: (K,) m/s of tube 1.
         columns: (K, 13, r) derivatives of ``tip``; None when not asked for.
         failure: why the run ended before its time; empty when it did not.
         sweeps: plain sweeps of the arc length, counted over all steps.
@@ -46,7 +45,6 @@ class Trajectory:
 
     t: Floats
     tip: Floats
-    beta_rate: Floats
     columns: Floats | None
     failure: str = ""
     sweeps: int = 0
@@ -261,21 +259,17 @@ def run(
         out = np.empty((steps + 1, TIP_ROWS, r))
         out[0] = columns.start(state, parameters, first, give(np.zeros(1))[0], RATES + stages)
     k, sweeps, failure, hard = 0, 0, "", 0
-    beta_rate = np.zeros(steps + 1)
     while k < steps:
         count = min(CHUNK, steps - k)
         times = (np.arange(k, k + count)[:, None] + scheme.times) * dt
         rows_now = inputs(times.ravel()).reshape(count, stages, -1)
         beta = rows_now[:, -1, 2 * n : 3 * n]
         still = bool(np.all(beta == state.inputs.beta))
-        if not still:
-            previous = np.concatenate([[state.inputs.beta[0]], beta[:-1, 0]])
-            beta_rate[k + 1 : k + 1 + count] = (beta[:, 0] - previous) / dt
         usable = count
         if model.moving_precurvature and not still:
             usable = 0
         elif not still:
-            usable = _while_fitting(model, state.key, beta)
+            usable = while_fitting(model, state.key, beta)
         taken, reason = 0, ""
         if usable:
             taken, spent, outcome = _fast(model, simulator, state, rows_now[:usable], times[:usable], columns, tip[k + 1 :],
@@ -318,7 +312,6 @@ def run(
     return Trajectory(
         dt * np.arange(done, dtype=np.float64),
         tip[:done],
-        beta_rate[:done],
         None if out is None else out[:done],
         failure,
         sweeps,
@@ -329,7 +322,7 @@ def _some(input_effect: Callable[[Floats], Floats], chosen: slice) -> Callable[[
     return lambda times: input_effect(times)[:, :, chosen]
 
 
-def _while_fitting(model: Model, key: Key, beta: Floats) -> int:
+def while_fitting(model: Model, key: Key, beta: Floats) -> int:
     """Number of rows of ``beta`` (k, N) for which the sections ``key`` serve."""
     for i, row in enumerate(beta):
         try:

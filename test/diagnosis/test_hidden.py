@@ -10,20 +10,20 @@ import numpy as np
 import pytest
 from truth.cases import make_case
 
-# (name, stratum, seed, what is hidden): one of each kind; None leaves the choice to the seed
+# (name, stratum, seed, what is hidden, s of the bags): one of each kind; None leaves the choice to the seed
 CASES = (
-    ("clean", "none", 91001, None),
-    ("payload", "single", 91003, ("payload_mass",)),
-    ("latency", "single", 91004, ("tracker_latency",)),
-    ("pair", "pair", 91006, ("payload_mass", "encoder_offset")),
-    ("outside", "outside", 91007, ("pulse",)),
-    ("at_rest", "not_excited", 91008, None),
+    ("clean", "none", 91001, None, 8.0),
+    ("payload", "single", 91003, ("payload_mass",), 14.0),
+    ("latency", "single", 91004, ("tracker_latency",), 8.0),
+    ("pair", "pair", 91006, ("payload_mass", "encoder_offset"), 14.0),
+    ("outside", "outside", 91007, ("pulse",), 8.0),
+    ("at_rest", "not_excited", 91008, None, 8.0),
 )
 
 
-def _run(folder: Path, stratum: str, seed: int, effects):
+def _run(folder: Path, stratum: str, seed: int, effects, duration: float):
     """Make a case, run the command on it in a process of its own, then open the answer."""
-    case = make_case(seed, stratum, folder, effects=effects)
+    case = make_case(seed, stratum, folder, effects=effects, duration_s=duration)
     arguments = [
         str(case.protocol),
         "--validate",
@@ -48,10 +48,7 @@ def _run(folder: Path, stratum: str, seed: int, effects):
 @pytest.fixture(scope="module")
 def outcomes(tmp_path_factory):
     """Findings and answers of all cases, one after another: other tests use the other core."""
-    return {
-        name: _run(tmp_path_factory.mktemp(name), stratum, seed, effects)
-        for name, stratum, seed, effects in CASES
-    }
+    return {name: _run(tmp_path_factory.mktemp(name), *given) for name, *given in CASES}
 
 
 @pytest.mark.parametrize("name", ["payload", "latency", "pair"])
@@ -83,6 +80,7 @@ def test_what_is_outside_the_catalogue_is_unknown(outcomes):
     assert findings["verdict"] == "unknown"
     assert findings["causes"][0]["effect"] == "unknown"
     assert findings["causes"][0]["separation"] is None
+    assert any("like a force at the tip" in note for note in findings["notes"])
 
 
 def test_a_robot_at_rest_cannot_be_diagnosed(outcomes):

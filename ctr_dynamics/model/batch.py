@@ -1,0 +1,350 @@
+"""Many simulations at once: one case in every lane of the same sweeps, for ensembles and studies.
+
+Cases share the robot's tubes, the mesh's sections and the time scheme; parameters, actuators, loads and histories are their own. Lanes iterate
+together until the last one has converged. A case that meets a hard step, or whose sections change, leaves the batch and is simulated alone.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from ctr_dynamics.errors import InputError
+from ctr_dynamics.model.kernels import sweep
+from ctr_dynamics.model.mesh import section_lengths
+from ctr_dynamics.model.model import Model
+from ctr_dynamics.model.newton import jacobian, lanes_for
+from ctr_dynamics.model.scheme import RATE_NOW, RATES, Y_BEFORE, Y_NOW, Scheme
+from ctr_dynamics.model.simulator import Inputs, Simulator, State
+from ctr_dynamics.model.step import EARLIER, RENEW, extrapolate, history
+from ctr_dynamics.model.trajectory import (
+    CHUNK,
+    TIP_ROWS,
+    InputRows,
+    Trajectory,
+    run,
+    to_inputs,
+    while_fitting,
+)
+from ctr_dynamics.model.workspace import input_row, lane_count
+
+Floats = NDArray[np.float64]
+LANES = 16  # cases in one batch
+LIMIT = 40  # iterations of a stage
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _norms(res, scale, lanes, alive, norm):
+    """Largest scaled imbalance of every lane into ``norm`` (L,); lanes that are not finite die."""
+    L = lane_count(lanes)
+    for j in range(L):
+        worst = 0.0
+        for i in range(len(scale)):
+            value = abs(res[i * L + j]) / scale[i]
+            if not math.isfinite(value):
+                alive[j] = False
+                value = 0.0
+            worst = max(worst, value)
+        norm[j] = worst
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _pick(values, lanes, j, one):
+    """Lane ``j`` of ``values`` (rows * L,) into ``one`` (rows,)."""
+    L = lane_count(lanes)
+    for r in range(len(one)):
+        one[r] = values[r * L + j]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _renew(tubes, lanes, few, mesh, c0, big, one, eight, x, j, perturb, inverse, scale, norm):
+    """New inverse Jacobian of lane ``j`` at its ``x``, with its imbalance and norm; False if it is singular or not finite."""
+    W, par, seclen, trial, hist, histb, out, outb, nodes, res = big
+    par1, seclen1, x1, hist1, histb1 = one
+    L, lanes8 = lane_count(lanes), lane_count(few)
+    _pick(par, lanes, j, par1)
+    _pick(seclen, lanes, j, seclen1)
+    _pick(x, lanes, j, x1)
+    _pick(hist, lanes, j, hist1)
+    _pick(histb, lanes, j, histb1)
+    if not jacobian(tubes, few, mesh, c0, par1, seclen1, x1, hist1, histb1, eight, perturb, inverse[j]):
+        return False
+    norm[j] = 0.0
+    for i in range(len(scale)):
+        res[i * L + j] = eight[9][i * lanes8]
+        norm[j] = max(norm[j], abs(res[i * L + j]) / scale[i])
+        trial[i * L + j] = x1[i]
+    return True
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _broyden(inverse, dx, dr):
+    """Broyden's update of one inverse Jacobian (m, m), in place."""
+    m = len(dx)
+    product, left = np.zeros(m), np.zeros(m)
+    for i in range(m):
+        for k in range(m):
+            product[i] += inverse[i, k] * dr[k]
+            left[k] += dx[i] * inverse[i, k]
+    denominator = 0.0
+    for i in range(m):
+        denominator += dx[i] * product[i]
+    if abs(denominator) > 1e-300:
+        for i in range(m):
+            g = (dx[i] - product[i]) / denominator
+            for k in range(m):
+                inverse[i, k] += g * left[k]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _solve(
+    tubes,
+    lanes,
+    few,
+    mesh,
+    c0,
+    big,
+    one,
+    eight,
+    x,
+    inverse,
+    fresh,
+    alive,
+    scale,
+    perturb,
+    tolerance,
+    limit,
+    spent,
+):
+    """Unknowns ``x`` (m * L,) of all living lanes, in place; returns sweeps. Lanes that cannot be solved die.
+
+    ``fresh`` (L,): lanes whose ``inverse`` is not usable. ``spent`` (L,): sweeps of each lane, counted on.
+    """
+    W, par, seclen, trial, hist, histb, out, outb, nodes, res = big
+    L, m = lane_count(lanes), len(scale)
+    norm, new = np.empty(L), np.empty(L)
+    newest = np.zeros(L, np.bool_)
+    dx, dr = np.empty(m), np.empty(m)
+    before = np.empty(m * L)
+    for j in range(L):
+        if fresh[j] and alive[j]:
+            alive[j] = _renew(
+                tubes, lanes, few, mesh, c0, big, one, eight, x, j, perturb, inverse, scale, norm
+            )
+            newest[j] = True
+            fresh[j] = False
+    trial[:] = x
+    sweep(tubes, lanes, W, c0, mesh, par, seclen, trial, hist, histb, out, outb, nodes, res)
+    sweeps = 1
+    _norms(res, scale, lanes, alive, norm)
+    for _ in range(limit):
+        waiting = False
+        before[:] = res
+        for j in range(L):
+            if alive[j] and norm[j] > tolerance:
+                waiting = True
+                spent[j] += 1
+                for i in range(m):
+                    step = 0.0
+                    for k in range(m):
+                        step -= inverse[j, i, k] * res[k * L + j]
+                    trial[i * L + j] = x[i * L + j] + step
+        if not waiting:
+            return sweeps
+        sweep(tubes, lanes, W, c0, mesh, par, seclen, trial, hist, histb, out, outb, nodes, res)
+        sweeps += 1
+        _norms(res, scale, lanes, alive, new)
+        for j in range(L):
+            if not alive[j] or norm[j] <= tolerance:
+                continue
+            better = new[j] < norm[j]
+            slow = new[j] > tolerance and new[j] > 0.6 * norm[j]
+            if better:
+                for i in range(m):
+                    dx[i] = trial[i * L + j] - x[i * L + j]
+                    dr[i] = res[i * L + j] - before[i * L + j]
+                    x[i * L + j] = trial[i * L + j]
+                _broyden(inverse[j], dx, dr)
+                norm[j] = new[j]
+            if not better and newest[j]:
+                alive[j] = False
+            elif not better or slow:
+                alive[j] = _renew(
+                    tubes, lanes, few, mesh, c0, big, one, eight, x, j, perturb, inverse, scale, norm
+                )
+                newest[j] = True
+            else:
+                newest[j] = False
+    for j in range(L):
+        alive[j] &= norm[j] <= tolerance
+    return sweeps
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _advance(tubes, lanes, few, mesh, c0, weights, inputs, bank, unknowns, earlier, inverse, fresh, alive, big, one, eight, scale, perturb,
+             unit, tolerance, limit, tips):  # fmt: skip
+    """Steps of all lanes with ``inputs`` (K, stages, rows, L); ``tips`` (K, 13, L). Returns the number of sweeps of all lanes together."""
+    par, seclen, hist, histb, out, outb, nodes = big[1], big[2], big[4], big[5], big[6], big[7], big[8]
+    n, L, stages, m = len(tubes), lane_count(lanes), len(c0), len(scale)
+    main = len(hist)
+    S = len(nodes) - (16 + 3 * n) * L
+    sections = len(mesh.sec_cells)
+    beta, lengths, x = np.empty(n), np.empty(sections), np.empty(m * L)
+    guess, found = np.empty_like(unknowns), np.empty_like(unknowns)
+    spent = np.zeros(L, np.int64)
+    total = 0
+    for k in range(len(inputs)):
+        extrapolate(unknowns, earlier, unit, guess)
+        spent[:] = stages
+        for stage in range(stages):
+            history(weights[stage], bank, hist, histb)
+            for i in range(inputs.shape[2]):
+                row = input_row(tubes, i) * L
+                for j in range(L):
+                    par[row + j] = inputs[k, stage, i, j]
+            for j in range(L):
+                for i in range(n):
+                    beta[i] = par[(13 * n + i) * L + j]
+                section_lengths(mesh.bp_tube, mesh.bp_offset, beta, lengths)
+                for i in range(sections):
+                    seclen[i * L + j] = lengths[i]
+            for i in range(m * L):
+                x[i] = guess[stage, i] + (found[stage - 1, i] - guess[stage - 1, i] if stage else 0.0)
+            total += _solve(tubes, lanes, few, mesh, c0[stage], big, one, eight, x, inverse, fresh, alive, scale, perturb, tolerance, limit,
+                            spent)  # fmt: skip
+            found[stage] = x
+            rate = bank[RATES + stage]
+            for i in range(main):
+                rate[i] = c0[stage] * out[i] + hist[i]
+            for i in range(len(histb)):
+                rate[main + i] = c0[stage] * outb[i] + histb[i]
+        bank[Y_BEFORE] = bank[Y_NOW]
+        bank[RATE_NOW] = bank[RATES + stages - 1]
+        bank[Y_NOW, :main] = out
+        bank[Y_NOW, main:] = outb
+        for j in range(L):
+            fresh[j] = spent[j] > RENEW * stages
+        for i in range(EARLIER - 1, 0, -1):
+            earlier[i] = earlier[i - 1]
+        earlier[0] = unknowns
+        unknowns[:] = found
+        for i in range(TIP_ROWS):
+            for j in range(L):
+                tips[k, i, j] = nodes[S + i * L + j]
+        if not alive.any():
+            break
+    return total
+
+
+def run_many(
+    model: Model,
+    scheme: Scheme,
+    parameters: Floats,
+    inputs: Sequence[InputRows],
+    duration: float,
+    *,
+    tolerance: float = 1e-7,
+    lanes: int = LANES,
+) -> list[Trajectory]:
+    """Simulate many cases from rest, ``lanes`` at once.
+
+    Args:
+        parameters: (B, NP) blocks of the cases. inputs: of each case, rows at times (k,) s as for :func:`ctr_dynamics.model.trajectory.run`.
+        tolerance: largest scaled imbalance at the tip.
+    Returns:
+        What :func:`~ctr_dynamics.model.trajectory.run` would return for each case, to within ``tolerance``; a case without an equilibrium to
+        start from has a failure and no steps.
+    """
+    results: list[Trajectory | None] = [None] * len(inputs)
+    for first in range(0, len(inputs), lanes):
+        cases = list(range(first, min(first + lanes, len(inputs))))
+        for case, found in zip(
+            cases,
+            _batch(model, scheme, parameters[cases], [inputs[c] for c in cases], duration, tolerance, lanes),
+            strict=True,
+        ):
+            results[case] = found or _alone(
+                model, scheme, parameters[case], inputs[case], duration, tolerance
+            )
+    return [r for r in results if r is not None]
+
+
+def _alone(
+    model: Model, scheme: Scheme, parameters: Floats, inputs: InputRows, duration: float, tolerance: float
+) -> Trajectory:
+    try:
+        return run(model, scheme, parameters, inputs, duration, tolerance=tolerance)
+    except InputError as error:
+        return Trajectory(np.zeros(0), np.zeros((0, TIP_ROWS)), None, str(error))
+
+
+def _batch(
+    model: Model,
+    scheme: Scheme,
+    parameters: Floats,
+    inputs: Sequence[InputRows],
+    duration: float,
+    tolerance: float,
+    width: int,
+) -> list[Trajectory | None]:
+    """Trajectories of at most ``width`` cases; None for those that have to be simulated alone."""
+    n, m, stages, dt = model.n, 5 + model.n, scheme.stages, scheme.dt
+    lanes = lanes_for(width) if width > 1 else ()
+    L = max(1, 8 * len(lanes))
+    starts: list[State | None] = []
+    for block, rows in zip(parameters, inputs, strict=True):
+        first = to_inputs(n, rows(np.zeros(1))[0])
+        rest = Inputs(first.alpha, np.zeros(n), first.beta, np.zeros(n), first.force, first.torque)
+        try:
+            starts.append(Simulator(model, scheme, tolerance, block).rest(rest))
+        except InputError:
+            starts.append(None)
+    leader = next((s for s in starts if s is not None), None)
+    if leader is None or len(inputs) == 1:
+        return [None] * len(inputs)
+    usable = np.array([s is not None and s.key == leader.key for s in starts] + [False] * (L - len(inputs)))
+    # lanes without a case of their own repeat the leader
+    own = [s if s is not None and ok else leader for s, ok in zip(starts, usable, strict=False)]
+    own += [leader] * (L - len(own))
+    number = starts.index(leader)
+    source = [j if usable[j] else number for j in range(L)]
+    mesh = leader.mesh
+    big = model.buffers(mesh, L)
+    big[1][:] = np.stack([parameters[j] for j in source], axis=1).ravel()
+    bank = np.stack([s.bank for s in own], axis=2).reshape(RATES + stages, -1)
+    unknowns = np.stack([s.unknowns for s in own], axis=2).reshape(stages, -1)
+    earlier = np.stack([unknowns] * EARLIER)
+    inverse, alive, fresh = np.zeros((L, m, m)), usable.copy(), np.ones(L, bool)
+    one = tuple(model.buffers(mesh, 1)[i] for i in (1, 2, 3, 4, 5))
+    few = model.jacobian_lanes
+    eight = model.buffers(mesh, 8 * len(few))
+    unit = np.repeat(model.step, L)
+    steps = int(np.floor(duration / dt + 1e-9))
+    tips = np.zeros((steps + 1, TIP_ROWS, L))
+    tips[0] = np.stack([s.nodes[-1, :TIP_ROWS] for s in own], axis=1)
+    sweeps = 0
+    for k in range(0, steps, CHUNK):
+        count = min(CHUNK, steps - k)
+        times = (np.arange(k, k + count)[:, None] + scheme.times) * dt
+        given = [rows(times.ravel()).reshape(count, stages, -1) for rows in inputs]
+        for j in range(len(inputs)):
+            beta = given[j][:, -1, 2 * n : 3 * n]
+            moves = not np.all(beta == own[j].inputs.beta)
+            if moves and (model.moving_precurvature or while_fitting(model, leader.key, beta) < count):
+                alive[j] = False
+        rows_now = np.stack([given[j] for j in source], axis=3)
+        sweeps += _advance(
+            model.tubes, lanes, few, mesh, scheme.c0, scheme.weights, rows_now, bank, unknowns, earlier, inverse, fresh, alive, big, one, eight,
+            model.scale, model.step, unit, tolerance, LIMIT, tips[k + 1 : k + 1 + count],
+        )  # fmt: skip
+        if not alive.any():
+            break
+    t = dt * np.arange(steps + 1, dtype=np.float64)
+    return [
+        Trajectory(t, tips[:, :, j].copy(), None, sweeps=sweeps) if alive[j] else None
+        for j in range(len(inputs))
+    ]
