@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from ctr_dynamics.bagio.replay import plain
+from ctr_dynamics.bench.ensemble import ensemble, sensitivity_cost
 from ctr_dynamics.bench.fused import fused_replay
 from ctr_dynamics.bench.machine import machine
 from ctr_dynamics.bench.release import Release, grid, space_error, time_error, work
@@ -37,6 +38,8 @@ class Size:
     space_s: float
     space_nodes: tuple[int, ...]
     fine_nodes: int
+    cases: int
+    cases_s: float
 
 
 LONG = Size(
@@ -57,6 +60,8 @@ LONG = Size(
     space_s=3.0,
     space_nodes=(10, 14, 20, 24, 32, 50, 75, 100, 150, 200),
     fine_nodes=400,
+    cases=64,
+    cases_s=2.0,
 )
 QUICK = Size(
     cut=0.06,
@@ -76,6 +81,8 @@ QUICK = Size(
     space_s=0.15,
     space_nodes=(12, 24, 48),
     fine_nodes=100,
+    cases=16,
+    cases_s=0.15,
 )
 
 
@@ -95,6 +102,13 @@ def measure(bag: Path, quick: bool, say: Callable[[str], None]) -> dict[str, Any
     say("release test: sweeps a solve, cost of a step")
     tolerance = float(Settings()["model.tolerance"])
     result["simulate"] = work(test, size.work_nodes, size.work_s, tolerance)
+    say("many simulations at once, and sensitivities")
+    result["ensemble"] = [
+        ensemble(test, nodes, size.cases, size.cases_s, tolerance) for nodes in size.work_nodes[:2]
+    ]
+    result["sensitivities"] = [
+        sensitivity_cost(test, nodes, size.cases_s, tolerance) for nodes in size.work_nodes[:2]
+    ]
     say("replay with fusion")
     result["replay"] = [
         fused_replay(bag, "till2020_tissue", nodes, size.replay_s) for nodes in size.replay_nodes
