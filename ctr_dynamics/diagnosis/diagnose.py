@@ -36,8 +36,8 @@ CLEAN_GAIN = 4.0  # log evidence, priors included, that a cause must gain over n
 SEPARATION = 5.0  # whitened units: linear signatures that are nearer cannot be told apart
 FITTED = 3.0  # the same between fits: the root of the difference of their costs, priors included
 OBSERVABLE = 3.0  # whitened size of a signature at its prior scale from which a bag can see it
-STRONG = 8.0  # size from which it can be told from others
-EXCITED = 0.35  # share of the catalogue that a bag must show strongly
+STRONG = 24.0  # size from which it can be told from most others
+EXCITED = 0.2  # share of the catalogue that a bag must show strongly
 
 
 @dataclass
