@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from ctr_dynamics.estimation.outputs import ERROR, OK, WARN, Status
-from ctr_dynamics.nodes.stepping import StampClock
+from ctr_dynamics.nodes.stepping import INBOX_LIMIT, StampClock
 from ctr_dynamics.nodes.timing import GOES_BACK_NS, LATE_NS, VERY_LATE_NS, StepTiming
 
 
@@ -75,14 +75,24 @@ def clock_status(clock: StampClock, now_ns: int, use_sim_time: bool) -> Status:
     return Status("clock", OK, "joint stamps and the node's clock agree", values)
 
 
-def topics_status(qos_faults: Mapping[str, str], undecodable: Mapping[str, tuple[int, str]]) -> Status:
-    """Topics whose endpoints do not fit, and messages that could not be decoded."""
+def topics_status(
+    qos_faults: Mapping[str, str], undecodable: Mapping[str, tuple[int, str]], refused: int = 0
+) -> Status:
+    """Topics whose endpoints do not fit, messages that could not be decoded, and those for which there was no room."""
     values = {
         **qos_faults,
         **{topic: f"{count} undecodable, {why}" for topic, (count, why) in undecodable.items()},
     }
     if qos_faults:
         return Status("topics", ERROR, "; ".join(qos_faults.values()), values)
+    if refused:
+        values["refused"] = str(refused)
+        return Status(
+            "topics",
+            ERROR,
+            f"{refused} messages were refused: {INBOX_LIMIT} were waiting already; send fewer, or give the node more of a core",
+            values,
+        )
     if undecodable:
         topic, (count, why) = next(iter(undecodable.items()))
         return Status(

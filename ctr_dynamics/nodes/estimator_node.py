@@ -153,7 +153,7 @@ class EstimatorNode(Node):
 
         def arrived(data: bytes) -> None:
             arrival_ns = now_ns()
-            loop.put(partial(take, data, arrival_ns))
+            loop.offer(partial(take, data, arrival_ns))
             if record is not None:
                 record.put(topic.name, arrival_ns, data)
             if rolling is not None:
@@ -233,7 +233,7 @@ class EstimatorNode(Node):
                 self.timing, self.loop.faults, self.loop.last_fault, self.outputs.withheld_behind_ns
             ),
             diagnostics.clock_status(self.loop.stamp_clock, now_ns, self._use_sim_time),
-            diagnostics.topics_status(self._qos_faults.by_topic, self._undecodable),
+            diagnostics.topics_status(self._qos_faults.by_topic, self._undecodable, self.loop.refused),
         ]
 
     # In the executor.

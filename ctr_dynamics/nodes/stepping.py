@@ -24,6 +24,8 @@ CATCH_UP_NS = 5_000_000_000
 """A backlog longer than this is given up: the estimator starts anew."""
 SLICE_STEPS = 8
 """Steps of a backlog that are taken between two looks at the inbox."""
+INBOX_LIMIT = 20_000
+"""Messages that may wait: minutes of a robot's, and what keeps a flood from filling the memory."""
 IDLE_NS = 50_000_000
 RETRY_NS = 1_000_000
 COLLECT_NS = 1_000_000_000
@@ -120,6 +122,7 @@ class StepLoop(threading.Thread):
         self.timing = timing
         self.stamp_clock = StampClock()
         self.inbox: deque[Callable[[], None]] = deque()
+        self.refused = 0
         self.faults = 0
         self.last_fault = ""
         self._publish = publish
@@ -140,6 +143,13 @@ class StepLoop(threading.Thread):
         """Have `item` run by the stepping thread before its next step; returns at once."""
         self.inbox.append(item)
         self._wake.set()
+
+    def offer(self, item: Callable[[], None]) -> None:
+        """The same for a message: beyond ``INBOX_LIMIT`` that wait it is refused, and counted."""
+        if len(self.inbox) < INBOX_LIMIT:
+            self.put(item)
+        else:
+            self.refused += 1
 
     def call(self, function: Callable[[], Any], timeout_s: float = 5.0) -> Any:
         """Run `function` in the stepping thread and return its result.

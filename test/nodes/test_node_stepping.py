@@ -1,11 +1,14 @@
 """The stepping thread and its account, against scripted estimators and clocks."""
 
 import threading
+from functools import partial
 from types import SimpleNamespace
 
 import pytest
 
-from ctr_dynamics.nodes.stepping import CATCH_UP_NS, STEP_NS, StampClock, StepLoop
+from ctr_dynamics.estimation.outputs import ERROR
+from ctr_dynamics.nodes.diagnostics import topics_status
+from ctr_dynamics.nodes.stepping import CATCH_UP_NS, INBOX_LIMIT, STEP_NS, StampClock, StepLoop
 from ctr_dynamics.nodes.timing import Histogram, StepTiming
 
 MS = 1_000_000
@@ -71,6 +74,19 @@ def test_inputs_are_taken_in_together_before_the_step(clock):
     loop._round()
     assert order == ["joints", "tracker"]
     assert published == [clock.now]
+
+
+def test_a_flood_of_messages_is_refused_beyond_a_limit_and_counted(clock):
+    loop, _, _ = make_loop(Scripted(), clock)
+    taken = []
+    for k in range(INBOX_LIMIT + 3):
+        loop.offer(partial(taken.append, k))
+    assert loop.refused == 3
+    assert topics_status({}, {}, loop.refused).level == ERROR
+    loop._round()
+    assert taken == list(range(INBOX_LIMIT))
+    loop.offer(partial(taken.append, -1))
+    assert loop.refused == 3
 
 
 def test_a_backlog_is_published_step_by_step_and_nothing_is_skipped(clock):
