@@ -13,9 +13,9 @@ from truth.cases import make_case
 # (name, stratum, seed, what is hidden, s of the bags): one of each kind; None leaves the choice to the seed
 CASES = (
     ("clean", "none", 91001, None, 8.0),
-    ("payload", "single", 91003, ("payload_mass",), 14.0),
+    ("payload", "single", 91003, ("payload_mass",), 9.0),
     ("latency", "single", 91004, ("tracker_latency",), 8.0),
-    ("pair", "pair", 91006, ("payload_mass", "encoder_offset"), 14.0),
+    ("pair", "pair", 91006, ("payload_mass", "encoder_offset"), 9.0),
     ("outside", "outside", 91007, ("pulse",), 8.0),
     ("at_rest", "not_excited", 91008, None, 8.0),
 )
