@@ -13,7 +13,7 @@ from ctr_dynamics.effects import apply_effects, make_setup
 from ctr_dynamics.model.batch import LANES, run_many
 from ctr_dynamics.model.model import Model
 from ctr_dynamics.model.scheme import make_scheme
-from ctr_dynamics.model.trajectory import InputRows, run
+from ctr_dynamics.model.trajectory import CHUNK, InputRows, run
 
 Floats = NDArray[np.float64]
 COLUMNS = 40
@@ -30,6 +30,11 @@ def ensemble(test: Release, nodes: int, cases: int, duration: float, tolerance: 
         apply_effects(setup, {"youngs_modulus": {"all.scale": 1.0 + SPREAD * rng.standard_normal()}})
         blocks.append(setup.block)
         inputs.append(_rows(test, SPREAD * rng.standard_normal(2)))
+        for k in range(
+            0, round(duration / DT), CHUNK
+        ):  # sampled before the clock starts, as those of a bag are
+            steps = np.arange(k, min(k + CHUNK, round(duration / DT)))
+            inputs[-1](((steps[:, None] + scheme.times) * DT).ravel())
     parameters = np.stack(blocks)
     run_many(model, scheme, parameters[:LANES], inputs[:LANES], 4 * DT, tolerance=tolerance)
     begin = time.perf_counter()
