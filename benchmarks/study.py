@@ -46,7 +46,7 @@ def one(stratum: str, seed: int) -> dict[str, Any]:
         content = findings(result, "", None)
         answer = case.unseal()
         sizes = separations(result, answer) if result.search is not None else {}
-        removable = removed(result, case, answer)
+        removable = removed(result, answer)
     kept = (
         "verdict",
         "causes",
@@ -73,6 +73,7 @@ def one(stratum: str, seed: int) -> dict[str, Any]:
 
 def separations(result: Any, answer: dict[str, Any]) -> dict[str, float]:
     """d_sep of every true cause, from the true effects fitted to the data, against the nearest rival."""
+    from ctr_dynamics.diagnosis.candidates import causes_of
     from ctr_dynamics.diagnosis.fit import fit
     from ctr_dynamics.diagnosis.search import with_nuisances
     from ctr_dynamics.diagnosis.signatures import linearise, separation
@@ -96,7 +97,7 @@ def separations(result: Any, answer: dict[str, Any]) -> dict[str, float]:
                 start[q.key] = q.parameter.coordinate(values[q.name]["total"])
     if not members:
         return {}
-    causes = tuple(q for c in members for q in c.quantities + c.shapes)
+    causes = causes_of(members)
     best = fit(with_nuisances(problem, members), causes, start)
     lin = linearise(problem, best.point, found.pool, 1) if best else None
     if best is None or lin is None:
@@ -109,7 +110,7 @@ def separations(result: Any, answer: dict[str, Any]) -> dict[str, float]:
     return out
 
 
-def removed(result: Any, case: Any, answer: dict[str, Any]) -> float | None:
+def removed(result: Any, answer: dict[str, Any]) -> float | None:
     """Share of the removable held-out error that the extension removes: 1 - (ext^2 - floor^2) / (rec^2 - floor^2)."""
     from ctr_dynamics.diagnosis.noise import noise_floor
 

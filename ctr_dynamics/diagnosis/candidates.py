@@ -84,6 +84,11 @@ def candidates(known: Sequence[Quantity], positions: Floats) -> list[Candidate]:
     return found
 
 
+def causes_of(members: Sequence[Candidate]) -> tuple[Quantity, ...]:
+    """Every free parameter of ``members``, shapes included."""
+    return tuple(q for c in members for q in c.quantities + c.shapes)
+
+
 def tube_of(q: Quantity) -> str:
     """Tube of a quantity, empty where it belongs to none."""
     return q.name.split(".")[0] if q.name.startswith("tube") else ""

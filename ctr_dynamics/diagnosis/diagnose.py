@@ -184,7 +184,8 @@ def diagnose(
     excited = sum(seen.get(name, 0.0) >= STRONG for name in names) >= EXCITED * len(names)
     _decide(result, problem, found, excited, validation, note, workers)
     assert result.best is not None
-    result.left, result.rest = _residuals(problem, clean), _residuals(problem, result.best)
+    result.left = _residuals(problem, clean)
+    result.rest = result.left if result.best is clean else _residuals(problem, result.best)
     result.seconds = time.perf_counter() - begin
     return result
 

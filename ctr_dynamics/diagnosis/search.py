@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from ctr_dynamics.effects import EFFECTS, quantities
 
-from .candidates import Candidate, log_prior
+from .candidates import Candidate, causes_of, log_prior
 from .fit import Fit, Key, Local, Problem, fit
 from .signatures import Linearisation, Scored, linearise, screen
 
@@ -118,7 +118,7 @@ class Job:
 def explain(problem: Problem, job: Job, limit: float = math.inf) -> Explanation | None:
     """Fit of a set of candidates; ``limit``: cost beyond which it is given up. None where no simulation succeeds."""
     members = (*job.members, job.new.candidate)
-    causes = tuple(q for c in members for q in c.quantities + c.shapes)
+    causes = causes_of(members)
     point = {**dict(job.new.candidate.start), **job.start.point}
     residual = job.lin.residual
     if job.new.probe is not None:
@@ -213,7 +213,7 @@ def _fewer(
 
 def _from(problem: Problem, members: tuple[Candidate, ...], start: Fit) -> Explanation | None:
     """Fit of ``members`` from that of a larger set."""
-    causes = tuple(q for c in members for q in c.quantities + c.shapes)
+    causes = causes_of(members)
     own = with_nuisances(problem, members)
     free = {q.key for q in (*own.nuisances, *causes)}
     result = fit(own, causes, {key: value for key, value in start.point.items() if key in free}, renewals=1)

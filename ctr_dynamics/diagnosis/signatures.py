@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ctr_dynamics.effects import EFFECTS, Quantity
 
-from .candidates import Candidate, tube_of
+from .candidates import Candidate, causes_of, tube_of
 from .fit import INSIDE, Fit, Key, Problem, inside, posterior, prior_variance, variances
 
 Floats = NDArray[np.float64]
@@ -143,7 +143,7 @@ def screen(
 
     ``base`` is the fit of ``members``, where ``lin`` stands.
     """
-    fixed = tuple(q for c in members for q in c.quantities + c.shapes)
+    fixed = causes_of(members)
     active, variance = variances(problem.nuisances, fixed)
     known = {**base.by_key, **lin.columns}
     columns = np.stack([known[q.key] for q in active], axis=1)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from ctr_dynamics.model.mesh import Key, Mesh, build_mesh, section_lengths
 from ctr_dynamics.model.model import Model
 from ctr_dynamics.model.newton import lanes_for
-from ctr_dynamics.model.simulator import Record, remap_fields
+from ctr_dynamics.model.simulator import Record, remap_columns
 from ctr_dynamics.model.tangent import linearise, theta_tangent
 from ctr_dynamics.model.transfer import Transfer, coarse_key, transfer
 
@@ -146,10 +146,7 @@ class Columns:
     def _remap(self, key: Key, mesh: Mesh, beta: Floats) -> None:
         """Carry the columns to another set of sections."""
         assert self.mesh is not None
-        slots, _, r = self.stored.shape
-        rows = np.ascontiguousarray(self.stored.transpose(0, 2, 1)).reshape(slots * r, -1)
-        moved = remap_fields(self.model.n, rows, self.mesh, self.beta, mesh, beta)
-        self.stored = np.ascontiguousarray(moved.reshape(slots, r, -1).transpose(0, 2, 1))
+        self.stored = remap_columns(self.model.n, self.stored, self.mesh, self.beta, mesh, beta)
 
     def propagate(self, records: tuple[Record, ...], par: Floats) -> bool:
         """Move the columns over the solved (sub)steps in ``records``; False where a stage cannot be linearised (columns then stay)."""

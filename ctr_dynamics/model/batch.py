@@ -15,12 +15,11 @@ from numpy.typing import NDArray
 
 from ctr_dynamics.errors import InputError
 from ctr_dynamics.model.kernels import sweep
-from ctr_dynamics.model.mesh import section_lengths
 from ctr_dynamics.model.model import Model
-from ctr_dynamics.model.newton import jacobian, lanes_for
+from ctr_dynamics.model.newton import broyden, jacobian, lane_lengths, lanes_for
 from ctr_dynamics.model.scheme import RATE_NOW, RATES, Y_BEFORE, Y_NOW, Scheme
 from ctr_dynamics.model.simulator import Inputs, Simulator, State
-from ctr_dynamics.model.step import EARLIER, RENEW, extrapolate, history
+from ctr_dynamics.model.step import EARLIER, RENEW, extrapolate, history, remember
 from ctr_dynamics.model.trajectory import (
     CHUNK,
     TIP_ROWS,
@@ -79,25 +78,6 @@ def _renew(tubes, lanes, few, mesh, c0, big, one, eight, x, j, perturb, inverse,
         norm[j] = max(norm[j], abs(res[i * L + j]) / scale[i])
         trial[i * L + j] = x1[i]
     return True
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _broyden(inverse, dx, dr):
-    """Broyden's update of one inverse Jacobian (m, m), in place."""
-    m = len(dx)
-    product, left = np.zeros(m), np.zeros(m)
-    for i in range(m):
-        for k in range(m):
-            product[i] += inverse[i, k] * dr[k]
-            left[k] += dx[i] * inverse[i, k]
-    denominator = 0.0
-    for i in range(m):
-        denominator += dx[i] * product[i]
-    if abs(denominator) > 1e-300:
-        for i in range(m):
-            g = (dx[i] - product[i]) / denominator
-            for k in range(m):
-                inverse[i, k] += g * left[k]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -168,7 +148,7 @@ def _solve(
                     dx[i] = trial[i * L + j] - x[i * L + j]
                     dr[i] = res[i * L + j] - before[i * L + j]
                     x[i * L + j] = trial[i * L + j]
-                _broyden(inverse[j], dx, dr)
+                broyden(inverse[j], dx, dr)
                 norm[j] = new[j]
             if not better and newest[j]:
                 alive[j] = False
@@ -192,8 +172,7 @@ def _advance(tubes, lanes, few, mesh, c0, weights, inputs, bank, unknowns, earli
     n, L, stages, m = len(tubes), lane_count(lanes), len(c0), len(scale)
     main = len(hist)
     S = len(nodes) - (16 + 3 * n) * L
-    sections = len(mesh.sec_cells)
-    beta, lengths, x = np.empty(n), np.empty(sections), np.empty(m * L)
+    x = np.empty(m * L)
     guess, found = np.empty_like(unknowns), np.empty_like(unknowns)
     spent = np.zeros(L, np.int64)
     total = 0
@@ -206,12 +185,7 @@ def _advance(tubes, lanes, few, mesh, c0, weights, inputs, bank, unknowns, earli
                 row = input_row(tubes, i) * L
                 for j in range(L):
                     par[row + j] = inputs[k, stage, i, j]
-            for j in range(L):
-                for i in range(n):
-                    beta[i] = par[(13 * n + i) * L + j]
-                section_lengths(mesh.bp_tube, mesh.bp_offset, beta, lengths)
-                for i in range(sections):
-                    seclen[i * L + j] = lengths[i]
+            lane_lengths(tubes, lanes, mesh, par, seclen)
             for i in range(m * L):
                 x[i] = guess[stage, i] + (found[stage - 1, i] - guess[stage - 1, i] if stage else 0.0)
             total += _solve(tubes, lanes, few, mesh, c0[stage], big, one, eight, x, inverse, fresh, alive, scale, perturb, tolerance, limit,
@@ -228,10 +202,7 @@ def _advance(tubes, lanes, few, mesh, c0, weights, inputs, bank, unknowns, earli
         bank[Y_NOW, main:] = outb
         for j in range(L):
             fresh[j] = spent[j] > RENEW * stages
-        for i in range(EARLIER - 1, 0, -1):
-            earlier[i] = earlier[i - 1]
-        earlier[0] = unknowns
-        unknowns[:] = found
+        remember(unknowns, earlier, found)
         for i in range(TIP_ROWS):
             for j in range(L):
                 tips[k, i, j] = nodes[S + i * L + j]

@@ -6,6 +6,7 @@ import numpy as np
 from numba import njit
 
 from ctr_dynamics.model.kernels import sweep
+from ctr_dynamics.model.mesh import section_lengths
 from ctr_dynamics.model.workspace import base_rows, field_rows, lane_count, parameter_rows, state_rows
 
 CONVERGED, STALLED, NOT_FINITE = 0, 1, 2
@@ -31,6 +32,20 @@ def broadcast(lanes, source, target):
         value, start = source[r], r * L
         for j in range(L):
             target[start + j] = value
+
+
+@njit(cache=True, nogil=True)
+def lane_lengths(tubes, lanes, mesh, par, seclen):
+    """Section lengths of every lane at the translations in its parameters ``par`` (rows * L,), into ``seclen`` (sections * L,)."""
+    n, L = len(tubes), lane_count(lanes)
+    sections = len(mesh.sec_cells)
+    beta, lengths = np.empty(n), np.empty(sections)
+    for j in range(L):
+        for i in range(n):
+            beta[i] = par[(13 * n + i) * L + j]
+        section_lengths(mesh.bp_tube, mesh.bp_offset, beta, lengths)
+        for k in range(sections):
+            seclen[k * L + j] = lengths[k]
 
 
 @njit(cache=True, nogil=True)
@@ -99,6 +114,26 @@ def invert(matrix, inverse):
                         matrix[i, k] -= f * matrix[col, k]
                         inverse[i, k] -= f * inverse[col, k]
     return True
+
+
+@njit(cache=True, nogil=True)
+def broyden(inverse, dx, dr):
+    """Broyden's update of the inverse Jacobian (m, m) in place, (dx - inv dr) dx^T inv / (dx^T inv dr), after x moved by ``dx`` and the
+    imbalance by ``dr`` (m,)."""
+    m = len(dx)
+    product, left = np.zeros(m), np.zeros(m)
+    for i in range(m):
+        for k in range(m):
+            product[i] += inverse[i, k] * dr[k]
+            left[k] += dx[i] * inverse[i, k]
+    denominator = 0.0
+    for i in range(m):
+        denominator += dx[i] * product[i]
+    if abs(denominator) > 1e-300:
+        for i in range(m):
+            g = (dx[i] - product[i]) / denominator
+            for k in range(m):
+                inverse[i, k] += g * left[k]
 
 
 @njit(cache=True, nogil=True)
@@ -176,25 +211,11 @@ def solve(
         if best >= norm and newest:
             return STALLED, iteration, sweeps, jacobians
         if best < norm:
-            # Broyden's update of the inverse: (dx - inv dr) dx^T inv / (dx^T inv dr)
-            denominator = 0.0
             for i in range(m):
                 previous[i] = res[i] - previous[i]
                 dx[i] = trial[i] - x[i]
                 x[i] = trial[i]
-            product = np.zeros(m)
-            left = np.zeros(m)
-            for i in range(m):
-                for k in range(m):
-                    product[i] += inverse[i, k] * previous[k]
-                    left[k] += dx[i] * inverse[i, k]
-            for i in range(m):
-                denominator += dx[i] * product[i]
-            if abs(denominator) > 1e-300:
-                for i in range(m):
-                    g = (dx[i] - product[i]) / denominator
-                    for k in range(m):
-                        inverse[i, k] += g * left[k]
+            broyden(inverse, dx, previous)
             slow = best > 0.6 * norm
             norm = best
             newest = False

@@ -355,3 +355,13 @@ def _quadratic(x: np.ndarray, values: np.ndarray, at: np.ndarray) -> np.ndarray:
     w1 = (at - x[0]) * (at - x[2]) / ((x[1] - x[0]) * (x[1] - x[2]))
     w2 = (at - x[0]) * (at - x[1]) / ((x[2] - x[0]) * (x[2] - x[1]))
     return np.tensordot(np.stack([w0, w1, w2], axis=1), values, axes=1)
+
+
+def remap_columns(
+    n: int, columns: np.ndarray, old: Mesh, old_beta: np.ndarray, new: Mesh, new_beta: np.ndarray
+) -> np.ndarray:
+    """Columns (slots, fields, r) of stored fields carried over like the fields themselves."""
+    slots, _, r = columns.shape
+    rows = np.ascontiguousarray(columns.transpose(0, 2, 1)).reshape(slots * r, -1)
+    moved = remap_fields(n, rows, old, old_beta, new, new_beta)
+    return np.ascontiguousarray(moved.reshape(slots, r, -1).transpose(0, 2, 1))

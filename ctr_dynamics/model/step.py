@@ -47,6 +47,15 @@ def extrapolate(unknowns, earlier, unit, guess):
 
 
 @njit(cache=True, nogil=True)
+def remember(unknowns, earlier, found):
+    """After a step: ``found`` become the ``unknowns``, and those the newest of the ``earlier``."""
+    for i in range(EARLIER - 1, 0, -1):
+        earlier[i] = earlier[i - 1]
+    earlier[0] = unknowns
+    unknowns[:] = found
+
+
+@njit(cache=True, nogil=True)
 def history(weights, bank, hist, histb):
     """h = sum of weights (slots,) times the stored fields ``bank`` (slots, fields), into the main and the base part."""
     main = len(hist)

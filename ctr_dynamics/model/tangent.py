@@ -8,8 +8,7 @@ import numpy as np
 from numba import njit
 
 from ctr_dynamics.model.kernels import sweep
-from ctr_dynamics.model.mesh import section_lengths
-from ctr_dynamics.model.newton import broadcast, invert
+from ctr_dynamics.model.newton import broadcast, invert, lane_lengths
 from ctr_dynamics.model.scheme import RATE_NOW, RATES, Y_BEFORE, Y_NOW
 from ctr_dynamics.model.step import history
 from ctr_dynamics.model.workspace import input_row, lane_count
@@ -89,15 +88,7 @@ def linearise(
     main = len(hist)
     _perturb(lanes, histL, main, m, columns, epsilon, dhist)
     _perturb(lanes, histbL, len(histb), m, columns, epsilon, dhist[main:])
-    sections = len(mesh.sec_cells)
-    beta = np.empty(n)
-    lengths = np.empty(sections)
-    for j in range(L):
-        for i in range(n):
-            beta[i] = parL[(13 * n + i) * L + j]
-        section_lengths(mesh.bp_tube, mesh.bp_offset, beta, lengths)
-        for k in range(sections):
-            seclenL[k * L + j] = lengths[k]
+    lane_lengths(tubes, lanes, mesh, parL, seclenL)
     sweep(tubes, lanes, W, c0, mesh,
           parL, seclenL, xL, histL, histbL, outL, outbL, nodesL, resL)  # fmt: skip
     jacobian = np.empty((m, m))

@@ -19,9 +19,10 @@ from ctr_dynamics.model.mesh import Key, Mesh, fits
 from ctr_dynamics.model.model import Model
 from ctr_dynamics.model.newton import CONVERGED
 from ctr_dynamics.model.scheme import RATES, Scheme
-from ctr_dynamics.model.simulator import Inputs, Record, Simulator, State, remap_fields
-from ctr_dynamics.model.step import EARLIER, RENEW, extrapolate, step
+from ctr_dynamics.model.simulator import Inputs, Record, Simulator, State, remap_columns
+from ctr_dynamics.model.step import RENEW, extrapolate, remember, step
 from ctr_dynamics.model.tangent import linearise, step_tangent
+from ctr_dynamics.model.workspace import input_row
 
 Floats = NDArray[np.float64]
 InputRows = Callable[[Floats], Floats]
@@ -66,10 +67,7 @@ def _advance(tubes, lane, lanes, mesh, c0, weights, par, inputs, bank, unknowns,
         if outcome != CONVERGED:
             return k, total, outcome
         fresh = sweeps > RENEW * len(c0)
-        for i in range(EARLIER - 1, 0, -1):
-            earlier[i] = earlier[i - 1]
-        earlier[0] = unknowns
-        unknowns[:] = found
+        remember(unknowns, earlier, found)
         for i in range(tips.shape[1]):
             tips[k, i] = nodes[S + i]
     return len(inputs), total, CONVERGED
@@ -94,10 +92,7 @@ def _advance_tangent(tubes, lane, lanes, wide, mesh, c0, weights, par, inputs, b
         if outcome != CONVERGED:
             return k, total, outcome
         fresh = sweeps > RENEW * len(c0)
-        for i in range(EARLIER - 1, 0, -1):
-            earlier[i] = earlier[i - 1]
-        earlier[0] = unknowns
-        unknowns[:] = found
+        remember(unknowns, earlier, found)
         for i in range(tips.shape[1]):
             tips[k, i] = nodes[S + i]
         if not step_tangent(tubes, wide, mesh, c0, weights, par, inputs[k], found, before, bank[RATES : RATES + stages], dpar, dinputs[k],
@@ -158,10 +153,7 @@ class _Columns:
 
     def remap(self, old: Mesh, old_beta: Floats, new: Mesh, new_beta: Floats) -> None:
         """Carry the columns to another set of sections."""
-        slots, _, r = self.bank.shape
-        rows = np.ascontiguousarray(self.bank.transpose(0, 2, 1)).reshape(slots * r, -1)
-        moved = remap_fields(self.model.n, rows, old, old_beta, new, new_beta)
-        self.bank = np.ascontiguousarray(moved.reshape(slots, r, -1).transpose(0, 2, 1))
+        self.bank = remap_columns(self.model.n, self.bank, old, old_beta, new, new_beta)
 
     def follow(self, record: Record, par: Floats) -> bool:
         """Move the columns over one recorded (sub)step."""
@@ -177,9 +169,7 @@ class _Columns:
 
 def input_rows(n: int) -> NDArray[np.int64]:
     """Rows of the parameter block that hold the inputs of ``n`` tubes, in their order."""
-    return np.concatenate(
-        [np.arange(11 * n, 14 * n), np.arange(14 * n + 3, 14 * n + 9), np.arange(19 * n + 33, 20 * n + 33)]
-    )
+    return np.array([input_row.py_func((0,) * n, i) for i in range(4 * n + 6)])
 
 
 def to_inputs(n: int, row: Floats) -> Inputs:
