@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csr_array
 
 from ctr_dynamics.model.mesh import Key, Mesh, build_mesh, section_lengths
 from ctr_dynamics.model.model import Model
@@ -25,10 +26,9 @@ COLUMN_NODES = 12
 EPSILON = 1e-6  # of one standard deviation: small against the curvature of the step, large against rounding
 
 
-def restrict(moved: Transfer, *fields: Floats) -> list[Floats]:
-    """Fields (fine fields,) on the coarse sections of a transfer."""
-    matrix = moved.restrict
-    return [sparse_product(matrix.indptr, matrix.indices, matrix.data, x) for x in fields]
+def carried(matrix: csr_array, vector: Floats) -> Floats:
+    """Product (rows,) of one of a transfer's matrices with ``vector`` (columns,)."""
+    return sparse_product(matrix.indptr, matrix.indices, matrix.data, vector)
 
 
 def field_weights(model: Model, mesh: Mesh, beta: Floats) -> Floats:
@@ -148,8 +148,9 @@ class Columns:
         assert self.mesh is not None
         self.stored = remap_columns(self.model.n, self.stored, self.mesh, self.beta, mesh, beta)
 
-    def propagate(self, records: tuple[Record, ...], par: Floats) -> bool:
-        """Move the columns over the solved (sub)steps in ``records``; False where a stage cannot be linearised (columns then stay)."""
+    def propagate(self, records: tuple[Record, ...], par: Floats, behind: float = 0.0) -> bool:
+        """Move the columns over the solved (sub)steps in ``records`` and ``behind`` (s) of steps before that they have not followed yet; False
+        where a stage cannot be linearised (columns then stay)."""
         model = self.model
         m = 5 + model.n
         dpar = self.uncertainty.effect @ self.theta
@@ -161,7 +162,7 @@ class Columns:
             self.key, self.mesh, self.transfer, self.beta = key, mesh, moved, beta
             after, rate = record.after, record.rates[-1]
             if moved is not None:
-                after, rate = restrict(moved, after, rate)
+                after, rate = carried(moved.restrict, after), carried(moved.restrict, rate)
             columns = self.theta.shape[1]
             work_key = (key, columns)
             if work_key not in self._work:
@@ -179,18 +180,19 @@ class Columns:
                 self._lent = False
             dx, dnodes = np.empty((m, columns)), np.empty(shape)
             ok = theta_tangent(
-                model.tubes, lanes, mesh, record.scheme.dt, par.copy(), record.inputs[-1], record.found[-1], after,
+                model.tubes, lanes, mesh, record.scheme.dt + behind, par.copy(), record.inputs[-1], record.found[-1], after,
                 rate, dpar, EPSILON, model.tangent_step, big, work, self.stored[0], self.stored[1], inverse, dx, dnodes,
             )  # fmt: skip
             if not ok:
                 return False
             self.dx, self.dnodes = dx, dnodes
+            behind = 0.0
         return True
 
     def fields_change(self, a: Floats) -> Floats:
         """(fields,) change of the model's fields by the coefficients ``a`` (r,)."""
         change = self.fields @ a
-        return change if self.transfer is None else self.transfer.prolong @ change
+        return change if self.transfer is None else carried(self.transfer.prolong, change)
 
     def nodes_change(self, a: Floats) -> Floats:
         """(nodes, S) change of the model's node states by the coefficients ``a`` (r,)."""
@@ -200,23 +202,13 @@ class Columns:
     def position_deviation(self, pi: Floats) -> Floats:
         """(nodes,) deviation of the position per axis in m at the model's nodes, coefficients' covariance ``pi`` (r, r)."""
         deviation = position_deviations(self.dnodes, 16 + 3 * self.model.n, pi)
-        return deviation if self.transfer is None else self.transfer.nodes @ deviation
-
-    def widen(self, count: int) -> None:
-        """Append ``count`` columns of zeros."""
-
-        def wide(array: Floats) -> Floats:
-            return np.concatenate([array, np.zeros((*array.shape[:-1], count))], axis=-1)
-
-        self.theta, self.stored, self.dnodes, self.dx = map(
-            wide, (self.theta, self.stored, self.dnodes, self.dx)
-        )
+        return deviation if self.transfer is None else carried(self.transfer.nodes, deviation)
 
     def transform(self, T: Floats) -> None:
-        """Replace the columns V by V T."""
-        self.theta, self.stored, self.dnodes, self.dx = (
-            x @ T for x in (self.theta, self.stored, self.dnodes, self.dx)
-        )
+        """Replace the columns V by V T; those that ``theta`` alone has move no field yet."""
+        self.theta = self.theta @ T
+        T = T[: self.stored.shape[2]]
+        self.stored, self.dnodes, self.dx = self.stored @ T, self.dnodes @ T, self.dx @ T
 
     def snapshot(self) -> tuple:
         """What :meth:`restore` needs; references do, for the next step leaves the arrays alone and goes on with a copy."""

@@ -28,11 +28,10 @@ from ctr_dynamics.snap.stability import StabilityWatch
 
 from .fusion import Fusion, FusionOptions
 from .health import Health
-from .kernels import backbone_rows
+from .kernels import backbone_rows, conjugate, from_vector, matrix
 from .misfit import misfit_monitor
 from .modes import ModeTracker
 from .outputs import Innovation, Modes, Moment, SolverStats, StepOutput
-from .rotations import conjugate, from_vector, matrix
 from .signals import Drives, Signal, finite, joint_order
 from .tip import TipWindow
 from .tracker import ROTATION, TRANSLATION, registered, tracker_model
@@ -154,7 +153,9 @@ class Estimator:
         self._residuals = 0
         self._known: dict[tuple[float, float], tuple[Floats, Floats]] = {}  # the signals of one step
         self._rows: dict[tuple, tuple[Floats, NDArray[np.int64]]] = {}
-        self._turn: tuple[Floats, tuple[Floats, Floats]] | None = None
+        self._busy = False  # whether the last step had other work than most
+        self._watch_due = False
+        self._turn: tuple[bytes, tuple[Floats, Floats]] | None = None
 
     # -- inputs --
 
@@ -514,12 +515,15 @@ class Estimator:
             self.health.substeps += 1
         if track is not None:
             self.fusion.follow(track.fusion, self._fused)
-        elif not self.fusion.predict(self._fused, result, t):
-            self.health.note(
-                "tracker", "tangent", "the step could not be linearised; the covariance was held"
-            )
-        if track is None:
-            self._fuse(k, t)
+        else:
+            due = self._due_samples(t)
+            self._busy = bool(due)
+            if not self.fusion.predict(self._fused, result, t, sampled=bool(due)):
+                self.health.note(
+                    "tracker", "tangent", "the step could not be linearised; the covariance was held"
+                )
+            self._busy |= not self.fusion.unreduced
+            self._fuse(k, due)
         self._keep(k)
         return result
 
@@ -541,15 +545,23 @@ class Estimator:
             float(self._alone.inputs.beta_rate[0]) * (1.0 - self._inserted),
         )
 
-    def _fuse(self, k: int, t: float) -> None:
-        """Samples whose own time is now past."""
-        assert self._fused is not None and self.t0_ns is not None
+    def _due_samples(self, t: float) -> list[tuple[Sample, float, Floats]]:
+        """Samples whose own time is now past, t (s) included, with the time and position of their readings."""
+        assert self.t0_ns is not None
+        due = []
         for sample in self._samples:
-            if sample.fused_k is not None:
-                continue
-            time_s, position = self.tracker.reading((sample.stamp_ns - self.t0_ns) * 1e-9, sample.position)
-            if time_s - self.tracker.delay > t + 1e-9:
-                continue
+            if sample.fused_k is None:
+                time_s, position = self.tracker.reading(
+                    (sample.stamp_ns - self.t0_ns) * 1e-9, sample.position
+                )
+                if time_s - self.tracker.delay <= t + 1e-9:
+                    due.append((sample, time_s, position))
+        return due
+
+    def _fuse(self, k: int, due: list[tuple[Sample, float, Floats]]) -> None:
+        """Compare and fuse what :meth:`_due_samples` found after step ``k``."""
+        assert self._fused is not None and self.t0_ns is not None
+        for sample, time_s, position in due:
             sample.fused_k = k
             moment = self._compare(time_s, position, sample.quaternion)
             if self._fusing:
@@ -590,21 +602,23 @@ class Estimator:
     def _compare(self, time_s: float, position: Floats, quaternion: Floats) -> Moment | None:
         """Residuals of the published outputs against a reading, before its update, and the moment of it."""
         dt, n = DT_NS * 1e-9, self.model.n
-        fused = self.fusion.tips.at(time_s - self.tracker.delay, dt)
-        alone = self._alone_tips.at(time_s - self.tracker.delay, dt)
-        earlier = self._alone_tips.at(time_s - self.tracker.delay - 2 * dt, dt) or alone
+        own_s = time_s - self.tracker.delay
+        fused = self.fusion.tips.at(own_s, dt, columns=False)
+        alone = self._alone_tips.at(own_s, dt, columns=False)
+        earlier = self._alone_tips.at(own_s - 2 * dt, dt, columns=False) or alone
         if fused is None or alone is None or earlier is None:
             return None
         position, _ = self.tracker.to_base(position, quaternion)
         estimate = registered(self.tracker, self.fusion.bias, fused)[:3]
-        self._squares[0] += float(np.sum((position - alone.position) ** 2))
-        self._squares[1] += float(np.sum((position - estimate) ** 2))
+        left = position - alone.position
+        self._squares[0] += float(left @ left)
+        self._squares[1] += float((position - estimate) @ (position - estimate))
         self._residuals += 1
         assert self.t0_ns is not None
-        joints, rates = self._joints.at(self.t0_ns + (time_s - self.tracker.delay) * 1e9)
+        joints, rates = self._joints.at(self.t0_ns + own_s * 1e9)
         acceleration = (alone.velocity - earlier.velocity) / (2 * dt)
         return Moment(
-            position - alone.position, alone.position.copy(), alone.quaternion.copy(), alone.velocity.copy(), acceleration,
+            left, alone.position, alone.quaternion, alone.velocity, acceleration,
             joints[:n], rates[:n], rates[n:],
         )  # fmt: skip
 
@@ -772,13 +786,18 @@ class Estimator:
             return self._invalid(k, "the estimate is not finite; the model starts anew at rest")
         problem = self._problem(k)
         self.health.problem = problem
-        if k % STABILITY_EVERY == 0:
+        # what is not needed at once waits for a step without a sample, so that no step takes long
+        self._watch_due |= k % STABILITY_EVERY == 0
+        watch = self._watch_due and not self._busy
+        if watch:
+            self._watch_due = False
             self._watch_stability(k)
+        modes = self._modes.measure(self._fused, self.simulator.parameters, refresh=not (watch or self._busy))
         since = self._sampled_ns if self._sampled_ns is not None else self.t0_ns
         self.health.tracker_age_s = max(0.0, (stamp - (since or stamp)) * 1e-9)
         return StepOutput(
             stamp, k, not problem, problem, tip.position, tip.quaternion, tip.covariance[:6, :6], tip.twist, tip.covariance[6:, 6:],
-            alone.position.copy(), predicted_q, self._backbone(), self._modes.measure(self._fused, self.simulator.parameters), self.fusion.force,
+            alone.position.copy(), predicted_q, self._backbone(), modes, self.fusion.force,
             np.sqrt(variance), self._take_innovations(), SolverStats(result.iterations, result.sweeps, result.reason),
         )  # fmt: skip
 
@@ -822,10 +841,11 @@ class Estimator:
     def _registration(self) -> tuple[Floats, Floats]:
         """Estimated error of the registration in base axes: rotation (3, 3) and translation (3,) m."""
         bias = self.fusion.bias[:6]
-        if self._turn is None or not np.array_equal(self._turn[0], bias):
+        key = bias.tobytes()
+        if self._turn is None or self._turn[0] != key:
             back = matrix(conjugate(self.tracker.rotation))
             turn = matrix(from_vector(back @ bias[ROTATION]))
-            self._turn = bias.copy(), (turn, back @ bias[TRANSLATION])
+            self._turn = key, (turn, back @ bias[TRANSLATION])
         return self._turn[1]
 
     def snapshot(self) -> dict[str, Any]:
@@ -915,14 +935,13 @@ class _Actuation:
         n = self.n
         key = (float(times[0]), float(times[-1]))
         if key not in self.known:
-            bare = np.empty((len(times), self.count))
-            for row, t in zip(bare, times.tolist(), strict=True):
+            parts: list[Floats] = []
+            for t in times.tolist():
                 time_ns = self.t0_ns + round(t * 1e9)
                 value, rate = self.joints.at(time_ns, self.extrapolate_ns)
-                row[:n], row[n : 2 * n], row[2 * n : 3 * n] = value[:n], rate[:n], value[n:]
-                row[3 * n : 3 * n + 6] = self.load.at(time_ns)[0] if self.load.stamps else _NO_LOAD
-                row[3 * n + 6 :] = rate[n : n + self.count - 3 * n - 6]
-            self.known[key] = bare, rate[n:]
+                load = self.load.at(time_ns)[0] if self.load.stamps else _NO_LOAD
+                parts += [value[:n], rate[:n], value[n:], load, rate[n : self.count - 2 * n - 6]]
+            self.known[key] = np.concatenate(parts).reshape(len(times), self.count), rate[n:]
         bare, beta_rate = self.known[key]
         rows = bare + self.shift
         last = rows[-1]

@@ -1,8 +1,8 @@
 """The extended Kalman filter on the fields of the rod: predict with the tangent of the step, update with filterpy at the sample's own stamp.
 
-Numbered steps, as in docs/ekf.md: (1) columns follow the step's tangent; (2) the tip force decays and is driven, the drift likewise; (3) columns are
-reduced to the rank; (4) a sample is compared with the tip of its own time, whose columns have been kept; (5) gate; (6) filterpy's
-update of (a, b); (7) fields, parameters, kept tips and the shooting unknowns move by the columns.
+Numbered steps, as in docs/ekf.md: (1) columns follow the tangent of the step, or of two at once; (2) the tip force decays and is driven, the
+drift likewise; (3) columns are reduced to the rank; (4) a sample is compared with the tip of its own time, whose columns have been kept;
+(5) gate; (6) filterpy's update of (a, b); (7) fields, parameters, kept tips and the shooting unknowns move by the columns.
 """
 
 from __future__ import annotations
@@ -13,14 +13,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 from filterpy.kalman import ExtendedKalmanFilter
 from numpy.typing import NDArray
-from scipy.linalg import solve_triangular
+from scipy.linalg.lapack import dpotrf, dsyevd, dtrtri
 from scipy.stats import chi2
 
+from ctr_dynamics.model.mesh import Key
 from ctr_dynamics.model.model import Model
 from ctr_dynamics.model.simulator import Inputs, Simulator, State, StepResult
 
 from .columns import Columns
-from .kernels import registered_rows
+from .kernels import registered_rows, spreads
 from .tip import TipWindow
 from .tracker import DELAY, DRIFT, STATES, TrackerModel, expected, residual, sensitivity
 from .uncertainty import bias_sigma, model_uncertainty
@@ -73,12 +74,10 @@ class TipEstimate:
 
 def _roots(covariance: Floats) -> tuple[Floats, Floats]:
     """L with L L^T = ``covariance`` (r, r), and its inverse; by eigenvectors, with a pseudo-inverse, where some direction has no spread."""
-    try:
-        root = np.asarray(np.linalg.cholesky(covariance), dtype=np.float64)
-        if root.diagonal().min() > 1e-7 * root.diagonal().max():
-            return root, solve_triangular(root, np.eye(len(root)), lower=True, check_finite=False)
-    except np.linalg.LinAlgError:
-        pass
+    root, failed = dpotrf(covariance, lower=1, clean=1)
+    diagonal = root.diagonal()
+    if not failed and diagonal.min() > 1e-7 * diagonal.max():
+        return root, dtrtri(root, lower=1)[0]
     lam, E = np.linalg.eigh(0.5 * (covariance + covariance.T))
     lam = np.maximum(lam, 0.0)
     inverse = np.where(lam > 1e-14 * lam.max(), 1.0 / np.sqrt(np.maximum(lam, 1e-300)), 0.0)
@@ -103,10 +102,12 @@ class Fusion:
         # a sample at the edge of the window shows a tip that is older still by the delay
         self.tips = TipWindow(math.ceil((options.window + max(0.0, tracker.delay)) / simulator.scheme.dt) + 5)
         self.pi = np.zeros((0, 0))
-        self.steps = 0
+        self.unreduced = 0  # steps since the columns were reduced
         self.inserted = 0.0  # share of beta's rate that the model's velocities hold already
         self.force_sigma = options.force_sigma
         self._refused = False
+        self._skipped = False  # whether the columns have not followed the last step
+        self._followed: Key = ((), ())  # sections of the last step that they have
         self._filters: dict[tuple[int, int], ExtendedKalmanFilter] = {}
         self._gate = {dof: float(chi2.ppf(options.gate_probability, dof)) for dof in range(1, 7)}
 
@@ -132,8 +133,8 @@ class Fusion:
         for axis, size in enumerate(scale):
             i = force.start + axis
             self.pi[i, i] = (self.options.force_sigma / size) ** 2
-        self.steps = 0
-        self._refused = False
+        self._refused = self._skipped = False
+        self._followed = state.key
         self.force_sigma = self.options.force_sigma
         self.tips.clear(r)
         self._reduce()
@@ -145,19 +146,37 @@ class Fusion:
         par[layout["force"]], par[layout["torque"]] = inputs.force, inputs.torque
         return par
 
-    def predict(self, state: State, result: StepResult, stamp: float) -> bool:
-        """Steps (1)-(3) after the simulator took a step to ``stamp`` (s). False where the tangent does not exist; the columns then stay."""
-        ok = self.columns.propagate(result.records, self.simulator.parameters)
-        self.steps += 1
-        decay = math.exp(-self.simulator.scheme.dt / self.options.force_time)
+    def predict(self, state: State, result: StepResult, stamp: float, sampled: bool = True) -> bool:
+        """Steps (1)-(3) after the simulator took a step to ``stamp`` (s). False where the tangent does not exist; the columns then stay.
+
+        The columns follow every second step, and every one after which a sample is fused (``sampled``) or they are reduced: they change little
+        within 3 ms. The tip of a step that they skipped gets those of its neighbours. They are reduced every eighth step, but after one without
+        a sample, so that no step does all the work.
+        """
+        dt = self.simulator.scheme.dt
+        self.unreduced += 1
+        decay = math.exp(-dt / self.options.force_time)
         force = self.uncertainty.force
         self.theta[force] *= decay
         self.columns.theta[force] *= decay
         self._apply_theta()
+        every = self.options.reduce_every
+        reduce = self.unreduced >= (2 * every if sampled else every)
+        key = result.records[0].key
+        follow = self._skipped or sampled or reduce or key != self._followed or len(result.records) > 1
+        ok = True
+        if follow:
+            ok = self.columns.propagate(
+                result.records, self.simulator.parameters, dt if self._skipped else 0.0
+            )
+            self._followed = result.records[-1].key
         self._keep_tip(state, stamp)
-        if self.steps % self.options.reduce_every == 0:
-            self._drive_drift(self.options.reduce_every)
-            self._drive_force(self.options.reduce_every)
+        if follow and self._skipped:
+            self.tips.interpolate()
+        self._skipped = not follow
+        if reduce:
+            self._drive_drift(self.unreduced)
+            self._drive_force(self.unreduced)
             self._reduce()
         return ok
 
@@ -173,18 +192,19 @@ class Fusion:
         self.pi[rows, rows] += (1 - decay**2) * noise.drift.value**2
 
     def _drive_force(self, steps: int) -> None:
-        """Append three columns that hold the tip force's new randomness of ``steps`` steps."""
+        """Append three columns that hold the tip force's new randomness of ``steps`` steps: so far they move nothing but that force."""
         decay2 = math.exp(-2 * steps * self.simulator.scheme.dt / self.options.force_time)
         c = self.columns
         r = c.theta.shape[1]
         wide = r + 3
-        c.widen(3)
-        self.tips.widen(3)
-        c.theta[self.uncertainty.force, r:] = self.force_sigma * np.eye(3)
+        theta = np.zeros((len(c.theta), wide))
+        theta[:, :r] = c.theta
+        theta[self.uncertainty.force, r:] = self.force_sigma * np.eye(3)
+        c.theta = theta
         pi = np.zeros((wide + STATES, wide + STATES))
-        keep = np.r_[0:r, wide : wide + STATES]
-        pi[np.ix_(keep, keep)] = self.pi
-        pi[range(r, wide), range(r, wide)] = 1.0 - decay2
+        pi[:r, :r], pi[:r, wide:] = self.pi[:r, :r], self.pi[:r, r:]
+        pi[wide:, :r], pi[wide:, wide:] = self.pi[r:, :r], self.pi[r:, r:]
+        np.fill_diagonal(pi[r:wide, r:wide], 1.0 - decay2)
         self.pi = pi
 
     def _reduce(self) -> None:
@@ -193,17 +213,17 @@ class Fusion:
         r = c.theta.shape[1]
         sigma = np.where(self.uncertainty.sigma > 0, self.uncertainty.sigma, self.options.force_sigma)
         V = c.fields
-        gram = V.T @ (c.weights()[:, None] * V)
-        unit = max(float(np.trace(gram)) / r, 1e-12)
+        energy = V.T @ (c.weights()[:, None] * V)
+        unit = max(float(np.trace(energy)) / r, 1e-12)
         scaled = c.theta / sigma[:, None]
-        gram = gram + unit * 0.01 * (scaled.T @ scaled)
+        gram = unit * 0.01 * (scaled.T @ scaled)
+        gram[: len(energy), : len(energy)] += energy
         root, inverse_root = _roots(self.pi[:r, :r])
-        _, U = np.linalg.eigh(root.T @ gram @ root)  # ascending
-        order = np.arange(r)[::-1][: self.options.rank]
-        U = U[:, order]
+        _, U, _ = dsyevd(root.T @ gram @ root)  # ascending
+        U = U[:, : -self.options.rank - 1 : -1]
         T = root @ U  # old coefficients = T new coefficients
         S = U.T @ inverse_root  # new = S old
-        k = len(order)
+        k = U.shape[1]
         pi = np.zeros((k + STATES, k + STATES))
         pi[:k, :k] = np.eye(k)
         pi[:k, k:] = S @ self.pi[:r, r:]
@@ -212,6 +232,7 @@ class Fusion:
         self.pi = pi
         c.transform(T)
         self.tips.transform(T)
+        self.unreduced = 0
 
     def _apply_theta(self) -> None:
         """Write the estimated parameters and force into the simulator's block."""
@@ -271,13 +292,12 @@ class Fusion:
         H = sensitivity(self.tracker, self.bias, tip)[mask]
         R = np.diag(self.tracker.variance[mask])
         S = H @ self.pi @ H.T + R
-        nis = float(nu @ np.linalg.solve(S, nu))
-        if not math.isfinite(nis):
+        if not math.isfinite(float(nu.sum() + S.sum())):
             return Update(unknown, unknown, math.nan, 0, False, "the innovation is not finite", unknown)
+        whitened = _roots(S)[1] @ nu
         full, variance, white = unknown.copy(), unknown.copy(), unknown.copy()
-        full[mask], variance[mask] = nu, np.diag(S)
-        white[mask] = _roots(S)[1] @ nu
-        return nu, H, R, Update(full, variance, nis, int(mask.sum()), False, "", white)
+        full[mask], variance[mask], white[mask] = nu, S.diagonal(), whitened
+        return nu, H, R, Update(full, variance, float(whitened @ whitened), len(nu), False, "", white)
 
     @property
     def force(self) -> Floats:
@@ -286,9 +306,7 @@ class Fusion:
 
     def force_variance(self) -> Floats:
         """(3,) variance of the estimated tip force, N^2."""
-        part = self.columns.theta[self.uncertainty.force]
-        r = part.shape[1]
-        return np.maximum(np.sum((part @ self.pi[:r, :r]) * part, axis=1), 0.0)
+        return spreads(self.columns.theta[self.uncertainty.force], self.pi)
 
     def _inflate(self, nu: Floats, H: Floats, R: Floats, limit: float) -> None:
         """Two readings in a row outside the gate are no outliers: the model has lost the robot. Widen the fields' part of the covariance until
@@ -340,20 +358,21 @@ class Fusion:
             pose,
             covariance,
         )
-        return TipEstimate(pose[:3], pose[3:], self.tips.means[i, 7:13].copy(), covariance, bool(finite))
+        return TipEstimate(pose[:3], pose[3:], self.tips.means[i, 7:13].copy(), covariance, finite)
 
     # -- roll-back --
 
     def snapshot(self) -> tuple:
         """The filter's part of a state to which :meth:`restore` can return."""
         return (
-            self.theta.copy(), self.bias.copy(), self.pi.copy(), self.steps, self.force_sigma, self._refused,
-            self.columns.snapshot(), self.tips.snapshot(),
+            self.theta.copy(), self.bias.copy(), self.pi.copy(), self.unreduced, self.force_sigma,
+            (self._refused, self._skipped, self._followed), self.columns.snapshot(), self.tips.snapshot(),
         )  # fmt: skip
 
     def restore(self, snapshot: tuple) -> None:
         """Return to a snapshot."""
-        theta, bias, pi, self.steps, self.force_sigma, self._refused, columns, tips = snapshot
+        theta, bias, pi, self.unreduced, self.force_sigma, course, columns, tips = snapshot
+        self._refused, self._skipped, self._followed = course
         self.theta, self.bias, self.pi = theta.copy(), bias.copy(), pi.copy()
         self.columns.restore(columns)
         self.tips.restore(tips)

@@ -5,8 +5,14 @@ import math
 import numpy as np
 from numba import njit
 
+from . import rotations
 
-@njit(cache=True, nogil=True, error_model="numpy")
+_compile = njit(cache=True, nogil=True, error_model="numpy")
+matrix, multiply, conjugate = map(_compile, (rotations.matrix, rotations.multiply, rotations.conjugate))
+from_vector, to_vector = map(_compile, (rotations.from_vector, rotations.to_vector))
+
+
+@_compile
 def tip_rows(node, dnode, insertion_rate, mean, columns):
     """Tip from the last node's state (S,) and its columns (S, r): ``mean`` (13,) position, quaternion, velocity, rate; ``columns`` (12, r)."""
     w, x, y, z = node[3], node[4], node[5], node[6]
@@ -44,57 +50,41 @@ def tip_rows(node, dnode, insertion_rate, mean, columns):
         columns[11, c] += tx * ay - ty * ax
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def _matrix(w, x, y, z):
-    R = np.empty((3, 3))
-    k = 2.0 / (w * w + x * x + y * y + z * z)
-    R[0, 0], R[0, 1], R[0, 2] = 1 - k * (y * y + z * z), k * (x * y - w * z), k * (x * z + w * y)
-    R[1, 0], R[1, 1], R[1, 2] = k * (x * y + w * z), 1 - k * (x * x + z * z), k * (y * z - w * x)
-    R[2, 0], R[2, 1], R[2, 2] = k * (x * z - w * y), k * (y * z + w * x), 1 - k * (x * x + y * y)
-    return R
+@_compile
+def applied(A, v):
+    """Product (3,) of a matrix (3, 3) and a vector (3,)."""
+    result = np.empty(3)
+    for i in range(3):
+        result[i] = A[i, 0] * v[0] + A[i, 1] * v[1] + A[i, 2] * v[2]
+    return result
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@_compile
+def registered_pose(mean, rotation, lever, bias, pose):
+    """Fill ``pose`` (7,) with that of :func:`ctr_dynamics.estimation.tracker.registered`.
+
+    ``mean`` (13,): the tip; ``rotation`` (4,), ``lever`` (3,): nominal geometry; ``bias`` (13,): tracker states. Returns the rotation of the
+    tip, that of the registration's estimated error in base axes, and the registration's inverse, (3, 3) each.
+    """
+    R, N = matrix(mean[3:7]), matrix(conjugate(rotation))
+    turn = from_vector(applied(N, bias[0:3]))
+    C = matrix(turn)
+    pose[3:7] = multiply(turn, mean[3:7])
+    point = mean[0:3] + applied(R, lever + bias[6:9])
+    pose[0:3] = applied(C, point) + applied(N, bias[3:6]) - applied(matrix(pose[3:7]), lever)
+    return R, C, N
+
+
+@_compile
 def registered_rows(mean, columns, rotation, lever, bias, pi, pose, covariance):
-    """Pose (7,) of :func:`registered` and the covariance (12, 12) of pose and twist (base axes) under ``pi`` (r + 13, r + 13).
+    """Pose (7,) of :func:`registered_pose` and the covariance (12, 12) of pose and twist (base axes) under ``pi`` (r + 13, r + 13).
 
-    ``mean`` (13,), ``columns`` (12, r): the tip; ``rotation`` (4,), ``lever`` (3,): nominal geometry; ``bias`` (13,): tracker states.
-    Returns False if anything is not finite.
+    ``columns`` (12, r): of the tip. Returns False if anything is not finite.
     """
     r = columns.shape[1]
     size = r + 13
-    R = _matrix(mean[3], mean[4], mean[5], mean[6])
-    N = _matrix(rotation[0], -rotation[1], -rotation[2], -rotation[3])  # R_reg^T
-    # estimated registration error seen in base axes, as a rotation vector
-    e = np.empty(3)
-    for i in range(3):
-        e[i] = N[i, 0] * bias[0] + N[i, 1] * bias[1] + N[i, 2] * bias[2]
-    angle = np.sqrt(e[0] * e[0] + e[1] * e[1] + e[2] * e[2])
-    k = 0.5 * np.sin(0.5 * angle) / (0.5 * angle) if angle > 1e-8 else 0.5
-    tw, tx, ty, tz = np.cos(0.5 * angle), k * e[0], k * e[1], k * e[2]
-    C = _matrix(tw, tx, ty, tz)
-    w, x, y, z = mean[3], mean[4], mean[5], mean[6]
-    pose[3] = tw * w - tx * x - ty * y - tz * z
-    pose[4] = tw * x + tx * w + ty * z - tz * y
-    pose[5] = tw * y - tx * z + ty * w + tz * x
-    pose[6] = tw * z + tx * y - ty * x + tz * w
-    Q = _matrix(pose[3], pose[4], pose[5], pose[6])
-    point, arm = np.empty(3), np.empty(3)
-    for i in range(3):
-        arm[i] = (
-            R[i, 0] * (lever[0] + bias[6]) + R[i, 1] * (lever[1] + bias[7]) + R[i, 2] * (lever[2] + bias[8])
-        )
-    for i in range(3):
-        point[i] = mean[i] + arm[i]
-    for i in range(3):
-        pose[i] = (
-            C[i, 0] * point[0] + C[i, 1] * point[1] + C[i, 2] * point[2]
-            + N[i, 0] * bias[3] + N[i, 1] * bias[4] + N[i, 2] * bias[5]
-            - Q[i, 0] * lever[0] - Q[i, 1] * lever[1] - Q[i, 2] * lever[2]
-        )  # fmt: skip
-    # extra arm beyond the nominal lever moves the pose when the tip turns
-    for i in range(3):
-        arm[i] = R[i, 0] * bias[6] + R[i, 1] * bias[7] + R[i, 2] * bias[8]
+    R, C, N = registered_pose(mean, rotation, lever, bias, pose)
+    arm = applied(R, bias[6:9])  # extra arm beyond the nominal lever moves the pose when the tip turns
     J = np.zeros((12, size))
     for c in range(r):
         ax, ay, az = columns[3, c], columns[4, c], columns[5, c]
@@ -118,11 +108,11 @@ def registered_rows(mean, columns, rotation, lever, bias, pi, pose, covariance):
     half = np.empty(size)
     total = 0.0
     for i in range(12):
-        for q in range(size):
-            value = 0.0
-            for p in range(size):
-                value += J[i, p] * pi[p, q]
-            half[q] = value
+        half[:] = 0.0
+        for p in range(size):
+            x = J[i, p]
+            for q in range(size):
+                half[q] += x * pi[p, q]
         for n in range(i + 1):
             value = 0.0
             for q in range(size):
@@ -135,7 +125,7 @@ def registered_rows(mean, columns, rotation, lever, bias, pi, pose, covariance):
     return np.isfinite(total)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@_compile
 def backbone_rows(s, nodes, fields, points, n, insertion_rate, turn, shift, deviation, rows):
     """Fill ``rows`` (P, 15) float32: s, x, y, z, qx, qy, qz, qw, vx, vy, vz, ux, uy, uz, sd.
 
@@ -174,7 +164,7 @@ def backbone_rows(s, nodes, fields, points, n, insertion_rate, turn, shift, devi
         rows[i, 14] = deviation[i]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@_compile
 def sparse_product(indptr, indices, data, vector):
     """Product (rows,) of a matrix in compressed rows with ``vector`` (columns,)."""
     result = np.empty(len(indptr) - 1)
@@ -186,43 +176,86 @@ def sparse_product(indptr, indices, data, vector):
     return result
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@_compile
+def spreads(rows, pi):
+    """(rows,) variances rows pi rows^T of ``rows`` (rows, r) under ``pi`` (at least r, r), none below zero."""
+    result = np.empty(len(rows))
+    r = rows.shape[1]
+    product = np.empty(r)
+    for n in range(len(rows)):
+        product[:] = 0.0
+        for i in range(r):
+            x = rows[n, i]
+            for k in range(r):
+                product[k] += x * pi[i, k]
+        total = 0.0
+        for k in range(r):
+            total += product[k] * rows[n, k]
+        result[n] = max(total, 0.0)
+    return result
+
+
+@_compile
 def position_deviations(dnodes, size, pi):
     """(nodes,) deviation of the position per axis in m: root of a third of the trace of its covariance under ``pi`` (r, r).
 
     ``dnodes`` (nodes * size, r): columns of the node states, position first.
     """
-    nodes, r = len(dnodes) // size, len(pi)
+    nodes = len(dnodes) // size
     result = np.empty(nodes)
-    product = np.empty(r)
     for node in range(nodes):
-        total = 0.0
-        for axis in range(3):
-            row = dnodes[node * size + axis]
-            product[:] = 0.0
-            for i in range(r):
-                x = row[i]
-                for k in range(r):
-                    product[k] += x * pi[i, k]
-            for k in range(r):
-                total += product[k] * row[k]
-        result[node] = math.sqrt(max(total, 0.0) / 3.0)
+        variances = spreads(dnodes[node * size : node * size + 3], pi)
+        result[node] = math.sqrt((variances[0] + variances[1] + variances[2]) / 3.0)
     return result
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def blend_columns(a, b, w, d, x, columns):
-    """Columns (12, r) between two tips with columns ``a``, ``b``: Hermite weights ``w`` (4,) of the position and ``d`` (4,) of its rate, and the
-    fraction ``x`` of the step for rotation and angular velocity."""
-    for c in range(a.shape[1]):
+@_compile
+def tip_between(a, b, a_columns, b_columns, x, dt, mean, columns):
+    """Tip at the fraction ``x`` of the step ``dt`` (s) from tip ``a`` (13,) to ``b``, or a little outside, into ``mean`` (13,); with its columns
+    where ``columns`` (12, r) has any.
+
+    Cubic Hermite in position, linear turn on top of the nearer end's rotation.
+    """
+    w0, w1 = (1 + 2 * x) * (1 - x) ** 2, x * (1 - x) ** 2 * dt
+    w2, w3 = x * x * (3 - 2 * x), x * x * (x - 1) * dt
+    d0, d1 = 6 * x * (x - 1) / dt, (1 - x) * (1 - 3 * x)
+    d2, d3 = 6 * x * (1 - x) / dt, x * (3 * x - 2)
+    for i in range(3):
+        mean[i] = w0 * a[i] + w1 * a[7 + i] + w2 * b[i] + w3 * b[7 + i]
+        mean[7 + i] = d0 * a[i] + d1 * a[7 + i] + d2 * b[i] + d3 * b[7 + i]
+        mean[10 + i] = (1 - x) * a[10 + i] + x * b[10 + i]
+    turn = to_vector(multiply(b[3:7], conjugate(a[3:7])))
+    mean[3:7] = multiply(from_vector(x * turn), a[3:7])
+    for c in range(columns.shape[1]):
         for i in range(3):
-            columns[i, c] = w[0] * a[i, c] + w[1] * a[6 + i, c] + w[2] * b[i, c] + w[3] * b[6 + i, c]
-            columns[6 + i, c] = d[0] * a[i, c] + d[1] * a[6 + i, c] + d[2] * b[i, c] + d[3] * b[6 + i, c]
-            columns[3 + i, c] = (1 - x) * a[3 + i, c] + x * b[3 + i, c]
-            columns[9 + i, c] = (1 - x) * a[9 + i, c] + x * b[9 + i, c]
+            p, v, q, u = a_columns[i, c], a_columns[6 + i, c], b_columns[i, c], b_columns[6 + i, c]
+            columns[i, c] = w0 * p + w1 * v + w2 * q + w3 * u
+            columns[6 + i, c] = d0 * p + d1 * v + d2 * q + d3 * u
+            columns[3 + i, c] = (1 - x) * a_columns[3 + i, c] + x * b_columns[3 + i, c]
+            columns[9 + i, c] = (1 - x) * a_columns[9 + i, c] + x * b_columns[9 + i, c]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@_compile
+def shift_tips(columns, a, means):
+    """Move tips ``means`` (tips, 13) by their columns (tips, 12, r) times ``a`` (r,)."""
+    d = np.empty(12)
+    for tip in range(len(means)):
+        for row in range(12):
+            d[row] = 0.0
+            for c in range(len(a)):
+                d[row] += columns[tip, row, c] * a[c]
+        mean = means[tip]
+        for i in range(3):
+            mean[i] += d[i]
+        for i in range(6):
+            mean[7 + i] += d[6 + i]
+        # the half turn, made a unit quaternion
+        x, y, z = 0.5 * d[3], 0.5 * d[4], 0.5 * d[5]
+        w = math.sqrt(max(0.0, 1.0 - x * x - y * y - z * z))
+        mean[3:7] = multiply(np.array([w, x, y, z]), mean[3:7])
+
+
+@_compile
 def sensitivity_rows(R, Q, lever, position, velocity, rate, columns, H):
     """Derivative H (6, r + 13) of the expected reading; see :func:`ctr_dynamics.estimation.tracker.sensitivity`.
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,10 +40,10 @@ class ModalBasis:
 
     Attributes:
         frequency_hz, damping: (m,). exponent: (m,) complex mu in 1/s.
-        readout: (m, fields) complex: modal coordinate z = readout (y - rest) such that the tip's displacement along the mode's main direction is
-            2 Re z and its speed 2 Re(mu z).
-        rest: (fields,) fields of the equilibrium; inputs (3N + 6,): actuators and load there, as :func:`input_vector` orders them.
-        follow: (fields, 2N + 6) how the equilibrium's fields move with alpha, beta, force and torque.
+        readout: (2m, fields) real, then imaginary parts of the modal coordinate z = readout (y - rest): the tip's displacement along the mode's
+            main direction is 2 Re z and its speed 2 Re(mu z).
+        rest: (fields,) fields of the equilibrium; inputs (2N + 6,): actuators and load there, as :func:`input_vector` orders them.
+        follow: (2m, 2N + 6) modal coordinates of the equilibrium that moves with alpha, beta, force and torque.
         direction: (m, 3) unit, main direction of the tip's motion in ``ctr_base``.
     """
 
@@ -52,7 +51,7 @@ class ModalBasis:
     frequency_hz: Floats
     damping: Floats
     exponent: NDArray[np.complex128]
-    readout: NDArray[np.complex128]
+    readout: Floats
     rest: Floats
     direction: Floats
     inputs: Floats
@@ -60,13 +59,11 @@ class ModalBasis:
 
     def measure(self, fields: Floats, inputs: Floats) -> Modes:
         """Amplitude and rate of each mode in ``fields`` (fields,) at the actuators and load ``inputs`` (2N + 6,)."""
-        z = self.readout @ (fields - self.rest) - self.readout_follow @ (inputs - self.inputs)
-        return Modes(self.frequency_hz, self.damping, 2.0 * z.real, 2.0 * (self.exponent * z).real)
-
-    @cached_property
-    def readout_follow(self) -> NDArray[np.complex128]:
-        """(m, 2N + 6) modal coordinates of the moving equilibrium."""
-        return self.readout @ self.follow
+        z = self.readout @ (fields - self.rest) - self.follow @ (inputs - self.inputs)
+        real, imag = z[: len(z) // 2], z[len(z) // 2 :]
+        return Modes(
+            self.frequency_hz, self.damping, 2.0 * real, 2.0 * (self.exponent.real * real - self.exponent.imag * imag)
+        )  # fmt: skip
 
 
 def input_vector(alpha: Floats, beta: Floats, force: Floats, torque: Floats) -> Floats:
@@ -207,16 +204,17 @@ def modal_parts(
         readout.append((left[i] @ Q.T) * weights * (axis @ displacement))
         direction.append(axis)
     chosen = mu[order].astype(complex)
+    rows = np.concatenate([np.real(readout), np.imag(readout)])
     yield ModalBasis(
         equilibrium.key,
         np.abs(chosen.imag) / (2 * np.pi),
         -chosen.real / np.abs(chosen),
         chosen,
-        np.array(readout, dtype=complex),
+        rows,
         equilibrium.fields,
         np.array(direction),
         input_vector(par[layout["alpha"]], beta, par[layout["force"]], par[layout["torque"]]),
-        follow,
+        rows @ follow,
     )
 
 
@@ -240,30 +238,29 @@ class ModeTracker:
         self._own: Equilibrium | None = None
         self._transfer: Transfer | None = None
 
-    def measure(self, state: State, parameters: Floats) -> Modes:
-        """Modes in ``state`` with the parameter block (NP,); to be called once a step."""
+    def measure(self, state: State, parameters: Floats, refresh: bool = True) -> Modes:
+        """Modes in ``state`` with the parameter block (NP,); to be called once a step, with ``refresh`` where there is time for a part of the
+        work that renews them."""
         self._age += 1
         if self._own is not None and self._own.key != state.key:
             self.clear()
-        if self._pending is not None:
+        if not refresh:
+            pass
+        elif self._pending is not None:
             part = next(self._pending, _END)
             if part is _END:
                 self._pending = None
             elif isinstance(part, ModalBasis):
                 assert self._own is not None
-                self._basis, self._pending = replace(part, rest=self._restricted(self._own.fields)), None
+                readout = part.readout if self._transfer is None else part.readout @ self._transfer.restrict
+                self._basis, self._pending = replace(part, readout=readout, rest=self._own.fields), None
         elif self._age > self.every:
             self._age = 0
             self._begin(state, parameters)
         now = state.inputs
         if self._basis is None:
             return Modes.none()
-        fields = self._restricted(state.fields)
-        return self._basis.measure(fields, input_vector(now.alpha, now.beta, now.force, now.torque))
-
-    def _restricted(self, fields: Floats) -> Floats:
-        """The model's fields on the sections of the modes."""
-        return fields if self._transfer is None else self._transfer.restrict @ fields
+        return self._basis.measure(state.fields, input_vector(now.alpha, now.beta, now.force, now.torque))
 
     def _begin(self, state: State, parameters: Floats) -> None:
         now, layout = state.inputs, self.model.layout
@@ -285,8 +282,6 @@ class ModeTracker:
             pair = (equilibrium.key, on.key)
             if pair not in self._transfers:
                 self._transfers[pair] = transfer(self.model.n, equilibrium.mesh, on.mesh)
-            if self._basis is not None and self._basis.key != on.key:
-                self._basis = None  # of other sections than the new transfer
             self._transfer = self._transfers[pair]
         self._own = equilibrium
         self._pending = modal_parts(self.coarse, on, par, now.beta.copy())

@@ -1,4 +1,4 @@
-"""Rotations: small helpers on unit quaternions (w, x, y, z) and rotation vectors, in plain floats where the filter needs speed."""
+"""Rotations: small helpers on unit quaternions (w, x, y, z) and rotation vectors, in plain Python that numba compiles too (kernels.py)."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ Floats = NDArray[np.float64]
 
 def matrix(h: Floats) -> Floats:
     """Rotation matrix (3, 3) of a quaternion (4,) wxyz of any length but 0."""
-    w, x, y, z = h
+    w, x, y, z = h[0], h[1], h[2], h[3]
     k = 2.0 / (w * w + x * x + y * y + z * z)
     return np.array(
         [
@@ -25,8 +25,8 @@ def matrix(h: Floats) -> Floats:
 
 def multiply(a: Floats, b: Floats) -> Floats:
     """Hamilton product a b of quaternions (4,)."""
-    aw, ax, ay, az = a
-    bw, bx, by, bz = b
+    aw, ax, ay, az = a[0], a[1], a[2], a[3]
+    bw, bx, by, bz = b[0], b[1], b[2], b[3]
     return np.array(
         [
             aw * bw - ax * bx - ay * by - az * bz,
@@ -46,7 +46,7 @@ def from_vector(r: Floats) -> Floats:
 
 def to_vector(h: Floats) -> Floats:
     """Rotation vector (3,) rad, shorter than pi, of a quaternion (4,) of any length but 0."""
-    w, x, y, z = h
+    w, x, y, z = h[0], h[1], h[2], h[3]
     norm = math.sqrt(x * x + y * y + z * z)
     if norm < 1e-12 * abs(w) or norm == 0.0:
         return np.array([2 * x / w, 2 * y / w, 2 * z / w]) if w else np.zeros(3)

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from .kernels import matrix
 from .outputs import Moment
-from .rotations import matrix
 
 Floats = NDArray[np.float64]
 
@@ -24,6 +24,7 @@ MOVING = 0.2
 INDEPENDENT = (
     10.0  # 1/s: residuals closer than a tenth of a second count as one; the tip swings at a few hertz
 )
+CLOSE = 0.4 / INDEPENDENT  # s: a few samples for each independent residual are enough
 LEAST = 0.3  # part of the residual above the tracker's noise that a cause must explain to be listed
 RIVAL = 0.9  # a cause that alone explains this part of what the best does is its rival
 MOST = 3  # causes listed
@@ -149,7 +150,9 @@ class Regression:
         self.samples = 0.0
 
     def add(self, time: float, moment: Moment) -> None:
-        """Take in the moment of a sample of ``time`` (s)."""
+        """Take in the moment of a sample of ``time`` (s), unless it follows the last one too closely to say anything new."""
+        if self._last is not None and abs(time - self._last) < CLOSE:
+            return
         rates = moment.alpha_rate
         if self._held is None:
             self._held = np.zeros(len(rates))

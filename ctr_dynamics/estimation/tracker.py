@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 
 from ctr_dynamics.effects import Setup
 
-from .kernels import registered_rows, sensitivity_rows
-from .rotations import conjugate, from_vector, matrix, multiply, to_vector
+from .kernels import conjugate, from_vector, matrix, multiply, registered_pose, sensitivity_rows, to_vector
 from .tip import Tip
 
 Floats = NDArray[np.float64]
@@ -135,17 +134,6 @@ def registered(model: TrackerModel, bias: Floats, tip: Tip) -> Floats:
     The base frame of a real robot is known through its registration only, so the estimated registration and lever-arm errors are part of the
     pose: it is where a perfect tracker with the nominal geometry would see the tip. Drift and delay are left out.
     """
-    mean = np.concatenate([tip.position, tip.quaternion, tip.velocity, tip.rate])
-    r = tip.columns.shape[1]
     pose = np.empty(7)
-    registered_rows(
-        mean,
-        tip.columns,
-        model.rotation,
-        model.lever,
-        bias,
-        np.zeros((r + STATES, r + STATES)),
-        pose,
-        np.empty((12, 12)),
-    )
+    registered_pose(tip.mean, model.rotation, model.lever, bias, pose)
     return pose

@@ -16,7 +16,7 @@ from ctr_dynamics.model.model import Model
 from ctr_dynamics.model.newton import CONVERGED, NOT_FINITE
 from ctr_dynamics.model.scheme import RATES, Y_BEFORE, Y_NOW, Scheme, make_scheme
 from ctr_dynamics.model.statics import Statics
-from ctr_dynamics.model.step import EARLIER, RENEW, extrapolate, step
+from ctr_dynamics.model.step import EARLIER, RENEW, extrapolate, remember, step
 
 OUTCOMES = {
     CONVERGED: "ok",
@@ -219,7 +219,7 @@ class Simulator:
             return StepResult(False, "actuators or load hold a number that is not finite", 0, 0, 0)
         bank, mesh = state.bank, state.mesh
         try:
-            still = not self.model.moving_precurvature and np.array_equal(last.beta, state.inputs.beta)
+            still = not self.model.moving_precurvature and last.beta.tobytes() == state.inputs.beta.tobytes()
             key, now_mesh = (state.key, mesh) if still else self.model.mesh(last.beta, state.key)
         except InputError as error:
             return StepResult(False, str(error), 0, 0, 0)
@@ -244,9 +244,7 @@ class Simulator:
         if outcome != CONVERGED:
             return StepResult(False, OUTCOMES[outcome], iterations, sweeps, jacobians)
         state.key, state.mesh, state.bank = key, mesh, bank
-        earlier = np.empty_like(state.earlier)
-        earlier[0], earlier[1:] = state.unknowns, state.earlier[:-1]
-        state.earlier, state.unknowns = earlier, found
+        remember(state.unknowns, state.earlier, found)
         state.nodes = small[6].reshape(-1, 16 + 3 * n).copy()
         state.inputs = last
         records: tuple[Record, ...] = ()

@@ -174,7 +174,8 @@ def test_parameters_compose_with_the_robot_file():
     turn, shift, lever = np.array([-0.5, 0.2, 0.9]), np.array([1.0, 2.0, 3.0]), np.array([0.01, 0.0, -0.02])
     rng = np.random.default_rng(5)
     q = rng.normal(size=4)
-    tip = Tip(0.0, rng.normal(size=3), q / np.linalg.norm(q), np.zeros(3), np.zeros(3), np.zeros((12, 1)))
+    mean = np.concatenate([rng.normal(size=3), q / np.linalg.norm(q), np.zeros(6)])
+    tip = Tip(0.0, mean, np.zeros((12, 1)))
     setup = Model(robot, nodes=12).setup
     plain = expected(tracker_model(setup), np.zeros(STATES), tip)
     both = tracker_model(setup, delay=0.002, lever=lever, rotation=turn, translation=shift)

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from ctr_dynamics.estimation.kernels import registered_rows
 from ctr_dynamics.estimation.rotations import conjugate, from_vector, matrix, multiply, to_vector
 from ctr_dynamics.estimation.tip import Tip, TipWindow, tip_rows
 from ctr_dynamics.estimation.tracker import (
@@ -11,7 +12,6 @@ from ctr_dynamics.estimation.tracker import (
     STATES,
     TrackerModel,
     expected,
-    registered_rows,
     residual,
     sensitivity,
 )
@@ -28,7 +28,7 @@ def random_unit():
 def random_tip():
     return Tip(
         0.0,
-        *(0.1 * RNG.normal(size=3), random_unit(), RNG.normal(size=3), RNG.normal(size=3)),
+        np.concatenate([0.1 * RNG.normal(size=3), random_unit(), RNG.normal(size=6)]),
         RNG.normal(size=(12, COLUMNS)),
     )
 
@@ -50,10 +50,9 @@ def moved(tip, a, seconds=0.0):
     turn = multiply(from_vector(d[3:6] + seconds * tip.rate), tip.quaternion)
     return Tip(
         0.0,
-        tip.position + d[0:3] + seconds * tip.velocity,
-        turn,
-        tip.velocity + d[6:9],
-        tip.rate + d[9:12],
+        np.concatenate(
+            [tip.position + d[0:3] + seconds * tip.velocity, turn, tip.velocity + d[6:9], tip.rate + d[9:12]]
+        ),
         tip.columns,
     )
 
@@ -273,8 +272,16 @@ def test_window_follows_changes_of_the_columns():
     change = RNG.normal(size=(22, 2))
     window.append(0.0, node_at(0.0), change, 0.0)
     columns = window.last.columns.copy()
-    window.widen(1)
-    assert np.allclose(window.last.columns, np.c_[columns, np.zeros(12)])
-    T = RNG.normal(size=(3, 2))
+    T = RNG.normal(size=(3, 2))  # the third column has been appended since: it does not move this tip
     window.transform(T)
     assert np.allclose(window.last.columns, np.c_[columns, np.zeros(12)] @ T)
+
+
+def test_a_step_without_columns_of_its_own_gets_the_mean_of_its_neighbours():
+    window = TipWindow(3)
+    window.clear(2)
+    for k in range(4):
+        window.append(k * DT, node_at(k * DT), RNG.normal(size=(22, 2)), 0.0)
+    first, _, last = (window.at(k * DT, DT).columns for k in (1, 2, 3))
+    window.interpolate()
+    assert np.allclose(window.at(2 * DT, DT).columns, 0.5 * (first + last))

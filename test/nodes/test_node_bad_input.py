@@ -21,7 +21,9 @@ def assert_goes_on(live) -> None:
     for message in live.messages(topics.TIP_POSE)[-60:]:
         p, q = message.pose.pose.position, message.pose.pose.orientation
         assert np.all(np.isfinite([p.x, p.y, p.z, q.x, q.y, q.z, q.w, *message.pose.covariance]))
-    live.wait_for_status("output", 0, "valid")  # diagnostics come once a second: the last one may be older than these steps
+    live.wait_for_status(
+        "output", 0, "valid"
+    )  # diagnostics come once a second: the last one may be older than these steps
 
 
 def test_poses_that_cannot_be_used(start):
