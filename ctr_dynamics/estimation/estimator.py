@@ -43,6 +43,7 @@ AHEAD_NS = 10_000_000_000  # a pose that far after the newest joint state is on 
 WAITING_SAMPLES = 200  # poses kept until the first joint state
 STABILITY_EVERY = 33  # steps between looks at the elastic stability
 MODES_EVERY = 132  # steps between refreshes of the vibration modes
+MOST_UNPAUSED = 8  # steps before what waits for a pause is done without one
 RETRY_EVERY = 33  # steps between starts while there is no equilibrium: looking for one in vain takes long
 MAX_FAILURES = 10  # steps in a row that may fail before the model starts anew at rest
 SAME_COURSE = (
@@ -153,8 +154,8 @@ class Estimator:
         self._residuals = 0
         self._known: dict[tuple[float, float], tuple[Floats, Floats]] = {}  # the signals of one step
         self._rows: dict[tuple, tuple[Floats, NDArray[np.int64]]] = {}
-        self._busy = False  # whether the last step had other work than most
         self._watch_due = False
+        self._unpaused = 0  # steps since the last pause was used
         self._turn: tuple[bytes, tuple[Floats, Floats]] | None = None
 
     # -- inputs --
@@ -370,7 +371,10 @@ class Estimator:
         return stamp <= now_ns if self._predicting else stamp <= now_ns - self._timeout_ns
 
     def advance(self, now_ns: int | None = None) -> list[StepOutput]:
-        """Take every step that is due. ``now_ns``: time on the stamps' clock; None takes only steps that the joints cover."""
+        """Take every step that is due. ``now_ns``: time on the stamps' clock; None takes only steps that the joints cover.
+
+        Once the outputs are on their way, :meth:`use_pause` does what they need not wait for.
+        """
         if self.t0_ns is None:
             return []
         self._skip_ahead(now_ns)
@@ -384,7 +388,21 @@ class Estimator:
             self.k += 1
             outputs.append(self._take(self.k))
             self.step_times_s.append(time.perf_counter() - begin)
+            self._unpaused += 1
+            if self._unpaused >= MOST_UNPAUSED:
+                self.use_pause()
         return outputs
+
+    def use_pause(self) -> None:
+        """A part of the work that no output waits for: a look at the stability, or a part of the modes' refresh."""
+        self._unpaused = 0
+        if self._fused is None:
+            return
+        if self._watch_due:
+            self._watch_due = False
+            self._watch_stability(self.k)
+        else:
+            self._modes.refresh(self._fused, self.simulator.parameters)
 
     def finish(self) -> list[StepOutput]:
         """Steps up to the last joint stamp."""
@@ -517,12 +535,10 @@ class Estimator:
             self.fusion.follow(track.fusion, self._fused)
         else:
             due = self._due_samples(t)
-            self._busy = bool(due)
             if not self.fusion.predict(self._fused, result, t, sampled=bool(due)):
                 self.health.note(
                     "tracker", "tangent", "the step could not be linearised; the covariance was held"
                 )
-            self._busy |= not self.fusion.unreduced
             self._fuse(k, due)
         self._keep(k)
         return result
@@ -786,18 +802,12 @@ class Estimator:
             return self._invalid(k, "the estimate is not finite; the model starts anew at rest")
         problem = self._problem(k)
         self.health.problem = problem
-        # what is not needed at once waits for a step without a sample, so that no step takes long
         self._watch_due |= k % STABILITY_EVERY == 0
-        watch = self._watch_due and not self._busy
-        if watch:
-            self._watch_due = False
-            self._watch_stability(k)
-        modes = self._modes.measure(self._fused, self.simulator.parameters, refresh=not (watch or self._busy))
         since = self._sampled_ns if self._sampled_ns is not None else self.t0_ns
         self.health.tracker_age_s = max(0.0, (stamp - (since or stamp)) * 1e-9)
         return StepOutput(
             stamp, k, not problem, problem, tip.position, tip.quaternion, tip.covariance[:6, :6], tip.twist, tip.covariance[6:, 6:],
-            alone.position.copy(), predicted_q, self._backbone(), modes, self.fusion.force,
+            alone.position.copy(), predicted_q, self._backbone(), self._modes.measure(self._fused), self.fusion.force,
             np.sqrt(variance), self._take_innovations(), SolverStats(result.iterations, result.sweeps, result.reason),
         )  # fmt: skip
 

@@ -219,7 +219,7 @@ def modal_parts(
 
 
 class ModeTracker:
-    """The modes of a moving robot: refreshed now and then, one part of the work a step, and read in every step.
+    """The modes of a moving robot: refreshed now and then, part by part between the steps, and read in every step.
 
     They are found on at most ``MODE_NODES`` nodes; the equilibrium that amplitudes count from is the model's own.
     """
@@ -238,15 +238,19 @@ class ModeTracker:
         self._own: Equilibrium | None = None
         self._transfer: Transfer | None = None
 
-    def measure(self, state: State, parameters: Floats, refresh: bool = True) -> Modes:
-        """Modes in ``state`` with the parameter block (NP,); to be called once a step, with ``refresh`` where there is time for a part of the
-        work that renews them."""
+    def measure(self, state: State) -> Modes:
+        """Modes in ``state``; to be called once a step."""
         self._age += 1
         if self._own is not None and self._own.key != state.key:
             self.clear()
-        if not refresh:
-            pass
-        elif self._pending is not None:
+        if self._basis is None:
+            return Modes.none()
+        now = state.inputs
+        return self._basis.measure(state.fields, input_vector(now.alpha, now.beta, now.force, now.torque))
+
+    def refresh(self, state: State, parameters: Floats) -> None:
+        """A part of the work that renews the modes, where they are old, about ``state`` with the parameter block (NP,)."""
+        if self._pending is not None:
             part = next(self._pending, _END)
             if part is _END:
                 self._pending = None
@@ -257,10 +261,6 @@ class ModeTracker:
         elif self._age > self.every:
             self._age = 0
             self._begin(state, parameters)
-        now = state.inputs
-        if self._basis is None:
-            return Modes.none()
-        return self._basis.measure(state.fields, input_vector(now.alpha, now.beta, now.force, now.torque))
 
     def _begin(self, state: State, parameters: Floats) -> None:
         now, layout = state.inputs, self.model.layout

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-from scipy.sparse import csr_array
+from scipy.sparse import block_diag, csr_array, eye_array, kron
 
 from ctr_dynamics.model.mesh import STAGES, Key, Mesh
 from ctr_dynamics.model.workspace import base_rows
 
-_STAGE_XI = (0.0, 0.5, 0.5, 1.0)
+_STAGE_XI = np.array([0.0, 0.5, 0.5, 1.0])
 
 
 class Transfer(NamedTuple):
@@ -42,52 +43,49 @@ def transfer(n: int, fine: Mesh, coarse: Mesh) -> Transfer:
     )
 
 
-def _weights(cells: int, xi: float) -> tuple[np.ndarray, np.ndarray]:
-    """Node numbers and Lagrange weights that give the value at ``xi`` in [0, 1] from a section's ``cells`` + 1 nodes."""
+def _weights(cells: int, xi: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Node numbers (points, 4) and Lagrange weights that give the values at ``xi`` (points,) in [0, 1] from a section's ``cells`` + 1 nodes.
+
+    Sections of fewer than three cells have as many columns as nodes.
+    """
     count = min(4, cells + 1)
-    first = int(np.clip(np.floor(xi * cells) - (count // 2 - 1), 0, cells + 1 - count))
-    at = np.arange(first, first + count)
+    first = np.clip(np.floor(xi * cells).astype(int) - (count // 2 - 1), 0, cells + 1 - count)
+    at = first[:, None] + np.arange(count)
     x = at / cells
-    weights = np.ones(count)
+    weights = np.ones(at.shape)
     for i in range(count):
         for j in range(count):
             if i != j:
-                weights[i] *= (xi - x[j]) / (x[i] - x[j])
+                weights[:, i] *= (xi - x[:, j]) / (x[:, i] - x[:, j])
     return at, weights
 
 
-def _fields(source: np.ndarray, target: np.ndarray, F: int, base: int) -> csr_array:
-    rows: list[int] = []
-    columns: list[int] = []
-    values: list[float] = []
+def _sections(
+    source: np.ndarray, target: np.ndarray, xi_of: Callable[[int], np.ndarray], stride: int
+) -> csr_array:
+    """Interpolation from the nodes of sections with ``source`` cells, ``stride`` points apart, to the points ``xi_of(cells)`` of those with
+    ``target`` cells."""
+    rows, columns, values = [], [], []
     row = start = 0
-    for old, new in zip(source, target, strict=True):
-        xi = [(cell + x) / new for cell in range(new) for x in _STAGE_XI] + [1.0]
-        for x in xi:
-            at, weights = _weights(int(old), x)
-            for f in range(F):
-                rows.extend([row * F + f] * len(at))
-                columns.extend((start + STAGES * at) * F + f)
-                values.extend(weights)
-            row += 1
-        start += STAGES * int(old) + 1
-    rows.extend(range(row * F, row * F + base))
-    columns.extend(range(start * F, start * F + base))
-    values.extend([1.0] * base)
-    return csr_array((values, (rows, columns)), shape=(row * F + base, start * F + base))
+    for old, new in zip(source.tolist(), target.tolist(), strict=True):
+        xi = xi_of(new)
+        at, weights = _weights(old, xi)
+        rows.append(np.repeat(np.arange(row, row + len(xi)), at.shape[1]))
+        columns.append((start + stride * at).ravel())
+        values.append(weights.ravel())
+        row += len(xi)
+        start += stride * old + 1
+    where = np.concatenate(rows), np.concatenate(columns)
+    return csr_array((np.concatenate(values), where), shape=(row, start))
+
+
+def _fields(source: np.ndarray, target: np.ndarray, F: int, base: int) -> csr_array:
+    def points(cells: int) -> np.ndarray:
+        return np.append((np.arange(cells)[:, None] + _STAGE_XI) / cells, 1.0)
+
+    main = kron(_sections(source, target, points, STAGES), eye_array(F), format="csr")
+    return csr_array(block_diag([main, eye_array(base)], format="csr"))
 
 
 def _nodes(source: np.ndarray, target: np.ndarray) -> csr_array:
-    rows: list[int] = []
-    columns: list[int] = []
-    values: list[float] = []
-    row = start = 0
-    for old, new in zip(source, target, strict=True):
-        for node in range(new + 1):
-            at, weights = _weights(int(old), node / new)
-            rows.extend([row] * len(at))
-            columns.extend(start + at)
-            values.extend(weights)
-            row += 1
-        start += int(old) + 1
-    return csr_array((values, (rows, columns)), shape=(row, start))
+    return _sections(source, target, lambda cells: np.arange(cells + 1) / cells, 1)

@@ -35,6 +35,7 @@ def rehearse(robot: Robot, settings: Settings) -> int:
         steps += len(steps_now)
         for out in steps_now:
             encoder.encode(out, estimator.health.statuses)
+        estimator.use_pause()
         if steps_now and steps_now[-1].valid:
             out = steps_now[-1]
             w, *xyz = out.predicted_quaternion_wxyz.tolist()

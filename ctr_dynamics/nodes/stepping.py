@@ -30,6 +30,8 @@ IDLE_NS = 50_000_000
 RETRY_NS = 1_000_000
 COLLECT_NS = 1_000_000_000
 COLLECT_SLACK_NS = 1_500_000
+PAUSE_NS = 1_000_000
+"""What the estimator does in a pause takes about as long."""
 
 
 class Steps(Protocol):
@@ -38,6 +40,7 @@ class Steps(Protocol):
     @property
     def t0_ns(self) -> int | None: ...
     def advance(self, now_ns: int | None = None) -> Sequence[Any]: ...
+    def use_pause(self) -> None: ...
     def reset(self) -> None: ...
 
 
@@ -196,7 +199,6 @@ class StepLoop(threading.Thread):
         try:
             while not self._stopping:
                 self._wake.clear()
-                self._took_steps = False
                 self._round()
                 self._sleep()
         finally:
@@ -204,6 +206,7 @@ class StepLoop(threading.Thread):
             gc.unfreeze()
 
     def _round(self) -> None:
+        self._took_steps = False
         try:
             if self._step_first():
                 self._advance(corrects=False)
@@ -219,6 +222,8 @@ class StepLoop(threading.Thread):
                 f"fault in the stepping thread, the estimator starts anew\n{traceback.format_exc()}"
             )
             self.reset()
+        if self._took_steps and not self.inbox:
+            self._use_pause()
         self._housekeeping(self._clock_ns())
         self._collect()
 
@@ -263,6 +268,12 @@ class StepLoop(threading.Thread):
             if self._stopping or not more or not steps:
                 return
         self._wake.set()  # there is more to take, after a look at the inbox
+
+    def _use_pause(self) -> None:
+        """Let the estimator do what no output waits for when there is time before the next step; when there never is, it helps itself."""
+        due_ns = self._next_due_ns()
+        if not self._wall or due_ns is None or due_ns - self._now_ns() > PAUSE_NS:
+            self.estimator.use_pause()
 
     def _now_ns(self) -> int:
         """Time on the clock of the stamps; 0 while there is no clock."""

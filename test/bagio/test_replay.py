@@ -89,6 +89,9 @@ class StandIn:
             self.k += 1
         return found
 
+    def use_pause(self) -> None:
+        pass
+
     def advance(self, now_ns=None) -> list:
         self.calls.append(("advance", now_ns))
         if self.t0_ns is None:

@@ -21,8 +21,11 @@ class Scripted:
         self.t0_ns = t0_ns
         self.k = 0
         self.asked = []
-        self.resets = 0
+        self.resets = self.pauses = 0
         self.fault = None
+
+    def use_pause(self):
+        self.pauses += 1
 
     def advance(self, now_ns=None):
         self.asked.append(now_ns)
@@ -74,6 +77,19 @@ def test_inputs_are_taken_in_together_before_the_step(clock):
     loop._round()
     assert order == ["joints", "tracker"]
     assert published == [clock.now]
+
+
+def test_pauses_are_used_after_steps_are_out_and_not_while_inputs_wait(clock):
+    estimator = Scripted(clock.now)
+    loop, published, _ = make_loop(estimator, clock)
+    loop._round()
+    assert (published, estimator.pauses) == ([clock.now], 1)
+    loop._round()  # nothing was due
+    assert estimator.pauses == 1
+    clock.now += STEP_NS
+    loop._publish = lambda step: loop.put(lambda: None) or True  # an input comes meanwhile
+    loop._round()
+    assert estimator.pauses == 1
 
 
 def test_a_flood_of_messages_is_refused_beyond_a_limit_and_counted(clock):
