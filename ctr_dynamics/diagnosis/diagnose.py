@@ -20,8 +20,9 @@ from ctr_dynamics.robot import Robot
 
 from .candidates import Candidate, candidates
 from .checks import Whiteness, block_bootstrap, rms, whiteness
-from .fit import Fit, Local, Problem, add_numerics, fit, make_problem
+from .fit import Fit, Local, Problem, fit, make_problem
 from .mistakes import find_mistake
+from .numerics import add_numerics
 from .recording import Recording
 from .search import Explanation, Search, search
 from .signatures import Linearisation, linearise, observable, separation
@@ -115,9 +116,9 @@ def diagnose(
         InputError: the nominal model cannot be simulated on a bag.
     """
     begin = time.perf_counter()
-    known = quantities(robot)
+    catalogue = quantities(robot)
     forms = {name for effect in EFFECTS.values() for name in effect.form}  # free beside their effect alone
-    nuisances = [q for q in known if q.tolerance > 0.0 and q.effect not in forms]
+    nuisances = [q for q in catalogue if q.tolerance > 0.0 and q.effect not in forms]
     notes = [text for r in (*recordings, *validation) for text in r.notes]
     if mask is None:
         mask = measured_axes(recordings, notes)
@@ -159,18 +160,20 @@ def diagnose(
             do="check the robot, the joints and the load with `ctr-dynamics info`",
         )
     note("re-calibration inside tolerance")
-    clean = fit(problem, (), {})
+    clean = fit(problem, (), {}, polish=False)
     if clean is None:
         raise InputError(
             "the model cannot be simulated near the nominal robot", do="check the robot file and the bag"
         )
     note("numerics")
     result.numerics = add_numerics(problem, clean.point, workers)
-    clean = fit(problem, (), clean.point, Local(clean.residual - problem.offset, clean.by_key)) or clean
+    here = problem.residual(clean.point)
+    known = None if here is None else Local(here, clean.by_key)
+    clean = fit(problem, (), clean.point, known) or clean
     result.clean = result.best = clean
     result.tested += ["time_discretisation", "space_discretisation"]
     pool = candidates(
-        known, np.concatenate([r.position[np.isfinite(r.position).all(axis=1)] for r in recordings])
+        catalogue, np.concatenate([r.position[np.isfinite(r.position).all(axis=1)] for r in recordings])
     )
     result.tested += sorted({c.effect for c in pool})
     result.white_before = whiteness(problem, clean.whitened, len(clean.active))
@@ -241,7 +244,7 @@ def _decide(
         return
     if best.members:
         note("separability")
-        result.at_best = linearise(problem, best.fit.point, found.pool, workers)
+        result.at_best = linearise(problem, best.fit.point, found.pool, workers, again=best.fit)
         lin = result.at_best or found.linearised
         result.members = [_member(problem, found, best, c, lin) for c in best.members]
     apart = not any(m.rivals or m.separation < FITTED for m in result.members if m.separation is not None)
@@ -311,7 +314,8 @@ def validate(problem: Problem, clean: Fit, best: Fit, recordings: Sequence[Recor
     before, after, stamps, bags = [], [], [], []
     nis = [0.0, 0.0, 0]
     shift = 0.0
-    own = make_problem(problem.robot, recordings, problem.nuisances, problem.whiteners[0].mask)
+    nodes = problem.experiments[0].nodes
+    own = make_problem(problem.robot, recordings, problem.nuisances, problem.whiteners[0].mask, nodes)
     for experiment, whiten in zip(own.experiments, own.whiteners, strict=True):
         residuals = []
         for point in (clean.point, best.point):

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from ctr_dynamics.effects import EFFECTS, Quantity, Setup, apply_effects, make_setup, play
 from ctr_dynamics.model.model import Model
 from ctr_dynamics.model.scheme import make_scheme
-from ctr_dynamics.model.trajectory import InputRows, Trajectory, run
+from ctr_dynamics.model.trajectory import WIDE, InputRows, Trajectory, run
 from ctr_dynamics.robot import Robot
 
 from .recording import Recording
@@ -24,6 +24,7 @@ Floats = NDArray[np.float64]
 Point = Mapping[
     tuple[str, str], float
 ]  # coordinates of quantities that are not at their off-values, by (effect, name)
+NODES = 10  # from plate to tip: the error in space is then far below that in time (numerics.py measures both)
 FRACTION = 1e-3  # of a quantity's unit, for differences of what is cheap to evaluate
 AVERAGE_POINTS = np.array([0.04691008, 0.23076534, 0.5, 0.76923466, 0.95308992])
 AVERAGE_WEIGHTS = np.array([0.11846344, 0.23931434, 0.28444444, 0.23931434, 0.11846344])
@@ -51,11 +52,16 @@ class Experiment:
         nodes, dt: the model's resolution.
     """
 
-    def __init__(self, recording: Recording, robot: Robot, nodes: int = 20, dt: float = 0.003) -> None:
+    def __init__(self, recording: Recording, robot: Robot, nodes: int = NODES, dt: float = 0.003) -> None:
         self.recording, self.robot, self.nodes = recording, robot, nodes
         self.scheme = make_scheme("sdirk3", dt)
         self._models = {False: Model(robot, nodes=nodes), True: Model(robot, nodes=nodes, extended=True)}
         self.nominal = make_setup(self._models[False])
+
+    def resolved(self, nodes: int, dt: float) -> Experiment:
+        """The same at another resolution."""
+        same = nodes == self.nodes and dt == self.scheme.dt
+        return self if same else Experiment(self.recording, self.robot, nodes, dt)
 
     # -- the chain --
 
@@ -157,22 +163,27 @@ class Experiment:
             )
             needs = model and (setup.extended or other.extended)
             kinds.append("tracker" if not model else "extended" if needs else "plain")
+        numbers = {kind: [i for i, k in enumerate(kinds) if k == kind] for kind in ("plain", "extended")}
+        room = sensitivity_room(self.nominal.n)
+        surplus = len(numbers["plain"]) - room
+        if 0 < surplus <= room - len(numbers["extended"]) and numbers["extended"]:
+            # the extended model has the same derivatives, and room left
+            numbers["extended"] += numbers["plain"][room:]
+            del numbers["plain"][room:]
         columns = np.zeros((len(self.recording.stamps), 6, len(wanted)))
         prediction: Prediction | None = None
-        for kind in ("plain", "extended"):
-            if kind == "plain" and setup.extended:
+        for kind, chosen in numbers.items():
+            if not chosen and not (kind == "extended" and prediction is None):
                 continue
-            numbers = [i for i, k in enumerate(kinds) if k == kind]
-            if not numbers and (kind == "extended" and prediction is not None):
-                continue
-            trajectory = self._columns(setup, [changed[i] for i in numbers], kind == "extended")
+            extended = kind == "extended" and (bool(chosen) or setup.extended)
+            trajectory = self._columns(setup, [changed[i] for i in chosen], extended)
             position, quaternion = self._observe(setup, trajectory)
             if trajectory.failure:
                 position[self.recording.stamps > trajectory.t[-1]] = np.nan
-            if prediction is None:
+            if prediction is None or trajectory.failure:
                 prediction = Prediction(position, quaternion, trajectory, trajectory.failure)
-            if numbers:
-                columns[:, :, numbers] = self._through(setup, trajectory)
+            if chosen:
+                columns[:, :, chosen] = self._through(setup, trajectory)
         assert prediction is not None
         for i, kind in enumerate(kinds):
             if kind == "tracker":
@@ -228,6 +239,11 @@ class Experiment:
         shift = setup.tracker_scale * (rows[:, :3].transpose(0, 2, 1) + swing)
         shift = rotate(setup.rotation, shift.reshape(-1, 3)).reshape(len(times), r, 3)
         return np.concatenate([shift, turn], axis=2).transpose(0, 2, 1)
+
+
+def sensitivity_room(n: int) -> int:
+    """Columns that one simulation of ``n`` tubes carries: lanes less the base case's and one for each unknown of the shooting."""
+    return 8 * WIDE - 6 - n
 
 
 def moved(point: Point, quantity: Quantity, share: float) -> dict[tuple[str, str], float]:

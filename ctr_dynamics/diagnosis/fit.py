@@ -8,10 +8,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
-from joblib import Parallel, delayed
 from numpy.typing import NDArray
 from scipy.special import log_ndtr
 
@@ -19,7 +18,7 @@ from ctr_dynamics.effects import Quantity
 from ctr_dynamics.errors import InputError
 from ctr_dynamics.robot import Robot
 
-from .experiment import Experiment
+from .experiment import NODES, Experiment
 from .noise import Whitener
 from .recording import Recording
 
@@ -28,7 +27,8 @@ Key = tuple[str, str]
 INSIDE = 2.9  # tolerances: an error beyond is not one of tolerance, and needs a cause
 WIDENING = 1.5  # of posterior deviations: errors of tuning cases were larger than stated by that much
 DIFFERENCE = 0.02  # of the scale, for columns by differences
-NUMERICS_SIGMA = 0.6  # of the difference to a finer solution, which the prediction includes
+# how many times over a fit may gain what its columns promise, at its first steps and later: beyond, it cannot reach its limit
+SURPRISE = (20.0, 8.0, 5.0)
 
 LOG_INSIDE = float(log_ndtr(INSIDE))
 
@@ -103,6 +103,10 @@ class Problem:
         """Number of whitened values."""
         return sum(w.size for w in self.whiteners)
 
+    def with_step(self, dt: float) -> Problem:
+        """The same with another time step (s)."""
+        return replace(self, experiments=[e.resolved(e.nodes, dt) for e in self.experiments])
+
     def residual(self, point: Mapping[Key, float]) -> Floats | None:
         """(m,) whitened residual at ``point``; None where a simulation fails."""
         parts = []
@@ -135,10 +139,14 @@ class Problem:
 
 
 def make_problem(
-    robot: Robot, recordings: Sequence[Recording], nuisances: Sequence[Quantity], mask: NDArray[np.bool_]
+    robot: Robot,
+    recordings: Sequence[Recording],
+    nuisances: Sequence[Quantity],
+    mask: NDArray[np.bool_],
+    nodes: int = NODES,
 ) -> Problem:
     """Problem of ``recordings``; axes that are not finite or not in ``mask`` (6,) are left out."""
-    experiments = [Experiment(r, robot) for r in recordings]
+    experiments = [Experiment(r, robot, nodes) for r in recordings]
     whiteners = []
     for r in recordings:
         used = np.isfinite(r.position).all(axis=1) & (r.stamps >= 0.0)
@@ -202,6 +210,7 @@ def fit(
     iterations: int = 10,
     renewals: int = 2,
     limit: float = math.inf,
+    polish: bool = True,
 ) -> Fit | None:
     """Best values of nuisances and ``causes`` from ``start``.
 
@@ -209,42 +218,38 @@ def fit(
         known: the model at ``start``, where it has been computed already; columns that it lacks are zero until the fit has moved.
         renewals: how often columns may be computed exactly on the way.
         limit: cost beyond which the fit is given up early.
+        polish: whether to end on exact columns after a way on which they have changed.
     Returns:
         None where no simulation succeeds.
     """
     descent = _Descent(problem, causes, start)
     if not descent.begin(known):
         return None
+    stale = False  # columns have missed the last step
     for number in range(iterations):
         step = descent.step()
-        size = float(np.linalg.norm(descent.columns @ step))
-        if size < 0.05:
-            break
-        promise = descent.cost - descent.promised(step)
-        if number > 2 and descent.cost - 5.0 * promise > limit:
-            break
-        moved = descent.move(step)
-        if moved is None:  # not even a small part of the step is good: the columns are not
-            if descent.exact or not renewals or not descent.renew():
-                break
-            renewals -= 1
-            continue
-        error, gain, factor = moved
-        blind = descent.see()
-        hopeless = number > 2 and descent.cost - 2.0 * promise > limit
-        if (
-            error > 0.3 * size * factor
-            and descent.travelled > 3.0
-            and renewals
-            and not blind
-            and not hopeless
-        ):
+        if descent.cost - SURPRISE[min(number, len(SURPRISE) - 1)] * descent.promise(step) > limit:
+            return descent.result()
+        if stale:
             if not descent.renew():
                 return None
             renewals -= 1
-        elif gain < 0.02 and factor == 1.0 and not blind:
+            step = descent.step()
+        size = float(np.linalg.norm(descent.columns @ step))
+        if size < 0.05:
             break
-    if renewals and descent.travelled > 3.0 and descent.renew():
+        moved = descent.move(step)
+        if moved is None:  # not even a small part of the step is good: the columns are not
+            stale = not descent.exact and renewals > 0
+            if not stale:
+                break
+            continue
+        error, gain, factor = moved
+        blind = descent.see()
+        stale = error > 0.3 * size * factor and descent.travelled > 3.0 and renewals > 0 and not blind
+        if gain < 0.02 and factor == 1.0 and not (stale or blind):
+            break
+    if polish and renewals and descent.travelled > 3.0 and descent.renew():
         step = descent.step()
         if np.linalg.norm(descent.columns @ step) > 0.02:
             descent.move(step, parts=1, learn=False)
@@ -324,9 +329,9 @@ class _Descent:
             step[free] = np.clip(self.off[free] + others, self.low[free], self.high[free]) - self.values[free]
         return step
 
-    def promised(self, step: Floats) -> float:
-        """Cost after ``step`` if the columns are right."""
-        return self.cost_at(self.residual - self.columns @ step, self.values + step)
+    def promise(self, step: Floats) -> float:
+        """What ``step`` takes off the cost if the columns are right."""
+        return self.cost - self.cost_at(self.residual - self.columns @ step, self.values + step)
 
     def move(self, step: Floats, parts: int = 4, learn: bool = True) -> tuple[float, float, float] | None:
         """Go by ``step`` or a part of it that lowers the cost: (error of the prediction, gain, part); None where none does."""
@@ -393,36 +398,3 @@ def _numerics_part(residual: Floats, numerics: Floats) -> Floats:
     return numerics @ np.linalg.solve(
         np.eye(numerics.shape[1]) + numerics.T @ numerics, numerics.T @ residual
     )
-
-
-def add_numerics(problem: Problem, point: Mapping[Key, float], workers: int) -> dict[str, float]:
-    """Compare with a finer solution at ``point``: correct the residual by the difference, and let it vary.
-
-    Returns rms differences in m: ``time_error_m`` (half the step), ``space_error_m`` (twice the nodes).
-    """
-
-    def residual(experiment: Experiment, nodes: int, dt: float) -> Floats | None:
-        finer = Experiment(experiment.recording, experiment.robot, nodes, dt)
-        prediction = finer.predict(point)
-        return None if prediction.failure else finer.residual(prediction)
-
-    jobs = []
-    for e in problem.experiments:
-        nodes, dt = e.nodes, e.scheme.dt
-        jobs += [delayed(residual)(e, *finer) for finer in ((nodes, dt), (nodes, 0.5 * dt), (2 * nodes, dt))]
-    done = Parallel(workers, prefer="threads")(jobs)
-    directions: list[list[Floats]] = [[], []]
-    squares = np.zeros(2)
-    for number, whiten in enumerate(problem.whiteners):
-        base, *others = done[3 * number : 3 * number + 3]
-        for i, finer in enumerate(others):
-            failed = base is None or finer is None
-            difference = np.zeros((len(whiten.used), 6)) if failed else base - finer
-            directions[i].append(whiten(difference))
-            squares[i] += float(np.sum(difference[:, :3] ** 2))
-    count = sum(len(w.used) for w in problem.whiteners)
-    D = np.stack([np.concatenate(parts) for parts in directions], axis=1)
-    problem.offset = D.sum(axis=1)
-    problem.numerics = NUMERICS_SIGMA * D
-    rms = np.sqrt(squares / max(count, 1))
-    return {"time_error_m": float(rms[0]), "space_error_m": float(rms[1])}

@@ -98,7 +98,7 @@ def _separation(d: Diagnosis, scenario: Scenario, own: Candidate, rival: Candida
     assert d.at_best is not None
     fit = d.best
     recording = planned(scenario, d.robot)
-    experiment = Experiment(recording, d.robot)
+    experiment = Experiment(recording, d.robot, d.problem.experiments[0].nodes)
     rivals = [q for q in rival.quantities if q.key not in {x.key for x in fit.active}]
     point = {**fit.point, **dict(rival.start)}
     prediction, jacobian = experiment.jacobian(point, (*fit.active, *rivals))

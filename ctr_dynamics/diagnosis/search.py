@@ -29,6 +29,10 @@ SECOND = 4  # second causes that are fitted beside a first
 HOPELESS = 0.3  # of the misfit: two causes that leave more are not made right by a third
 SECOND_EVIDENCE = 5.0  # log evidence that a further cause must add
 MIN_SCREEN = 1.0  # log evidence by the linear estimate below which a candidate is not worth a fit
+CONTENDERS, CONTEND = (
+    3,
+    6.0,
+)  # explanations that are finished with exact columns, and the log evidence to the best within which they may be
 CONTENDER = 8.0  # deviations by which the cost may exceed the best one's: beyond, a fit is given up
 
 
@@ -87,8 +91,7 @@ def search(
     first = _distinct([s for s in screened if s.gain > MIN_SCREEN][: SHORTLIST + 3])[:SHORTLIST]
     note(f"fitting {len(first)} single causes")
     found = [base]
-    # those that need the larger model cost twice as much and come second; what cannot win against those before it is given up
-    first.sort(key=lambda s: s.candidate.quantities[0].extended)
+    # likeliest first: what cannot win against those before it is given up
     for begin in range(0, len(first), BATCH):
         jobs = [Job((), s, clean, lin) for s in first[begin : begin + BATCH]]
         found += _fits(problem, jobs, _limit(problem, found), workers)
@@ -98,10 +101,15 @@ def search(
         _score(found, pool)
         found += _fewer(problem, found, note, workers)
         _score(found, pool)
-        for _ in range(2):  # finishing one may put another first
-            if found[0].members and not found[0].finished and found[0].fit.cost < _hopeless(problem, clean):
-                finish(problem, found[0])
-                _score(found, pool)
+    for _ in range(CONTENDERS):  # finishing one may put another first
+        near = [e for e in found if e.members and not e.finished and e.fit.cost < _limit(problem, found)]
+        near = [
+            e for e in near if e.score > found[0].score - CONTEND and e.fit.cost < _hopeless(problem, clean)
+        ]
+        if not near:
+            break
+        finish(problem, near[0])
+        _score(found, pool)
     return Search(found, _probabilities(found, problem), base, lin, screened, pool)
 
 
@@ -120,12 +128,15 @@ def explain(problem: Problem, job: Job, limit: float = math.inf) -> Explanation 
     members = (*job.members, job.new.candidate)
     causes = causes_of(members)
     point = {**dict(job.new.candidate.start), **job.start.point}
-    residual = job.lin.residual
+    residual: Floats | None = job.lin.residual
     if job.new.probe is not None:
         point.update(job.new.probe.shift)
-        residual = job.new.probe.residual
+        residual = problem.residual(point)
+    if residual is None:
+        return None
     known = Local(residual, {**job.lin.own(job.new.candidate), **job.start.by_key, **job.lin.columns})
-    result = fit(with_nuisances(problem, members), causes, point, known, renewals=1, limit=limit)
+    own = with_nuisances(problem, members)
+    result = fit(own, causes, point, known, renewals=1, limit=limit, polish=False)
     return None if result is None else Explanation(members, result)
 
 

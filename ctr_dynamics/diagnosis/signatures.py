@@ -16,11 +16,12 @@ from .candidates import Candidate, causes_of, tube_of
 from .fit import INSIDE, Fit, Key, Problem, inside, posterior, prior_variance, variances
 
 Floats = NDArray[np.float64]
+PROBE_STEP = 0.005  # s: what a finite size changes is large against the error in time of what it changes
 
 
 @dataclass(frozen=True)
 class Probe:
-    """A candidate at a finite size: coordinates beside the base point, and the residual (m,) there."""
+    """A candidate at a finite size: coordinates beside the base point, and the residual (m,) there, as longer steps in time show it."""
 
     shift: dict[Key, float]
     residual: Floats
@@ -61,10 +62,17 @@ class Linearisation:
 
 
 def linearise(
-    problem: Problem, point: Mapping[Key, float], pool: Sequence[Candidate], workers: int
+    problem: Problem,
+    point: Mapping[Key, float],
+    pool: Sequence[Candidate],
+    workers: int,
+    *,
+    again: Fit | None = None,
 ) -> Linearisation | None:
     """Columns of nuisances and all candidates at ``point``; those without a derivative by finite probes.
 
+    Args:
+        again: the fit whose ``point`` it is, when signatures are only compared with it: its columns serve, and one probe of each candidate.
     Returns:
         None where the model cannot be simulated at ``point``.
     """
@@ -78,39 +86,58 @@ def linearise(
             shaped.append(c)
         else:
             plain.update({q.key: q for q in c.quantities})
-    wanted = tuple(plain.values())
+    known = again.by_key if again else {}
+    wanted = tuple(q for key, q in plain.items() if key not in known)
     groups = _compatible(shaped)
+    at, members = groups[0] if groups else ({}, [])
+    first = tuple(q for c in members for q in c.quantities)
 
-    def columns(at: Mapping[Key, float], quantities: Sequence[Quantity]) -> tuple[Floats, Floats] | None:
-        return problem.linearise({**at, **point}, quantities)
+    def columns(
+        at: Mapping[Key, float], wanted: Sequence[Quantity], more: Sequence[Quantity] = ()
+    ) -> tuple[Floats, Floats] | None:
+        found = problem.linearise({**at, **point}, (*wanted, *more))
+        return columns({}, wanted) if found is None and more else found
 
-    def probe(c: Candidate, size: float, back: Mapping[Key, float]) -> Probe | None:
+    probing = problem if again else problem.with_step(PROBE_STEP)
+
+    def probe(c: Candidate, size: float, back: Mapping[Key, float]) -> tuple[dict[Key, float], Floats | None]:
         shift = {**back, **dict(c.start), **{q.key: q.off + size * q.scale for q in c.quantities}}
-        found = problem.residual({**point, **shift})
-        return None if found is None else Probe(shift, found)
+        return shift, probing.residual({**point, **shift})
 
     # nuisances that have left their tolerances imitate a cause: then it is tried beside nominal ones too
     strayed = any(abs(point.get(q.key, q.off) - q.off) > INSIDE * q.tolerance for q in problem.nuisances)
-    places = [{}, {q.key: q.off for q in problem.nuisances}] if strayed else [{}]
-    probes = [(c, size, back) for back in places for c in rough for size in EFFECTS[c.effect].probes]
-    jobs = [delayed(columns)(at, tuple(q for c in members for q in c.quantities)) for at, members in groups]
-    jobs += [delayed(columns)({}, wanted), *(delayed(probe)(*arguments) for arguments in probes)]
+    places = [{}, {q.key: q.off for q in problem.nuisances}] if strayed and again is None else [{}]
+    probes = [
+        (c, size, back)
+        for back in places
+        for c in rough
+        for size in EFFECTS[c.effect].probes[: 1 if again else None]
+    ]
+    jobs = [
+        delayed(columns)(at, wanted, first)
+    ]  # together: what has no room in one simulation has it in another
+    jobs += [delayed(columns)(at, tuple(q for c in group for q in c.quantities)) for at, group in groups[1:]]
+    jobs += [delayed(probing.residual)(point)] if again is None and probes else []
+    jobs += [delayed(probe)(*arguments) for arguments in probes]
     done = Parallel(workers, prefer="threads")(jobs)
-    found = done[len(groups)]
-    if found is None:
+    if done[0] is None:
         return None
-    residual = found[0]
-    result = Linearisation(dict(point), residual, {q.key: found[1][:, i] for i, q in enumerate(wanted)})
-    for (_, members), outcome in zip(groups, done, strict=False):
-        if outcome is None:
-            continue
-        first = 0
-        for c in members:
-            result.signatures[c] = outcome[1][:, first : first + len(c.quantities)]
-            first += len(c.quantities)
-    for (c, _, _), new in zip(probes, done[len(groups) + 1 :], strict=True):
-        if new is not None:
-            result.probes.setdefault(c, []).append(new)
+    residual, computed = again.residual if again else done[0][0], done[0][1]
+    result = Linearisation(
+        dict(point), residual, {**known, **{q.key: computed[:, i] for i, q in enumerate(wanted)}}
+    )
+    outcomes = [(members, computed[:, len(wanted) :])] if computed.shape[1] > len(wanted) else []
+    outcomes += [(m, o[1]) for (_, m), o in zip(groups[1:], done[1:], strict=False) if o is not None]
+    for group, found in outcomes:
+        last = 0
+        for c in group:
+            result.signatures[c] = found[:, last : last + len(c.quantities)]
+            last += len(c.quantities)
+    tried = done[len(jobs) - len(probes) :]
+    reference = residual if again or not probes else done[-len(probes) - 1]
+    for (c, _, _), (shift, new) in zip(probes, tried, strict=True):
+        if new is not None and reference is not None:
+            result.probes.setdefault(c, []).append(Probe(shift, residual + new - reference))
     for c in pool:
         if c in result.probes:
             (q,), first_probe = c.quantities, result.probes[c][0]
