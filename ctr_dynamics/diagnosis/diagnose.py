@@ -24,7 +24,7 @@ from .fit import Fit, Local, Problem, fit, make_problem
 from .mistakes import find_mistake
 from .numerics import add_numerics
 from .recording import Recording
-from .search import Explanation, Search, search
+from .search import Explanation, Search, distinct, search
 from .signatures import Linearisation, linearise, observable, separation
 from .unexplained import Unexplained, unexplained
 
@@ -244,7 +244,8 @@ def _decide(
         return
     if best.members:
         note("separability")
-        result.at_best = linearise(problem, best.fit.point, found.pool, workers, again=best.fit)
+        forms_once = [s.candidate for s in distinct(found.screened)]
+        result.at_best = linearise(problem, best.fit.point, forms_once, workers, again=best.fit)
         lin = result.at_best or found.linearised
         result.members = [_member(problem, found, best, c, lin) for c in best.members]
     apart = not any(m.rivals or m.separation < FITTED for m in result.members if m.separation is not None)

@@ -165,11 +165,12 @@ class Experiment:
             kinds.append("tracker" if not model else "extended" if needs else "plain")
         numbers = {kind: [i for i, k in enumerate(kinds) if k == kind] for kind in ("plain", "extended")}
         room = sensitivity_room(self.nominal.n)
-        surplus = len(numbers["plain"]) - room
-        if 0 < surplus <= room - len(numbers["extended"]) and numbers["extended"]:
+        spare = room - len(numbers["extended"])
+        keep = 0 if len(numbers["plain"]) <= spare else room
+        if numbers["extended"] and len(numbers["plain"][keep:]) <= spare:
             # the extended model has the same derivatives, and room left
-            numbers["extended"] += numbers["plain"][room:]
-            del numbers["plain"][room:]
+            numbers["extended"] += numbers["plain"][keep:]
+            del numbers["plain"][keep:]
         columns = np.zeros((len(self.recording.stamps), 6, len(wanted)))
         prediction: Prediction | None = None
         for kind, chosen in numbers.items():

@@ -28,7 +28,8 @@ INSIDE = 2.9  # tolerances: an error beyond is not one of tolerance, and needs a
 WIDENING = 1.5  # of posterior deviations: errors of tuning cases were larger than stated by that much
 DIFFERENCE = 0.02  # of the scale, for columns by differences
 # how many times over a fit may gain what its columns promise, at its first steps and later: beyond, it cannot reach its limit
-SURPRISE = (20.0, 8.0, 5.0)
+SURPRISE = (12.0, 6.0, 4.0)
+SETTLED = 0.05  # of the cost: what is not worth a simulation
 
 LOG_INSIDE = float(log_ndtr(INSIDE))
 
@@ -228,17 +229,19 @@ def fit(
     stale = False  # columns have missed the last step
     for number in range(iterations):
         step = descent.step()
-        if descent.cost - SURPRISE[min(number, len(SURPRISE) - 1)] * descent.promise(step) > limit:
+        promise = descent.promise(step)
+        if descent.cost - SURPRISE[min(number, len(SURPRISE) - 1)] * promise > limit:
             return descent.result()
         if stale:
             if not descent.renew():
                 return None
             renewals -= 1
             step = descent.step()
-        size = float(np.linalg.norm(descent.columns @ step))
-        if size < 0.05:
+            promise = descent.promise(step)
+        if promise < SETTLED and not descent.unseen:
             break
-        moved = descent.move(step)
+        size = float(np.linalg.norm(descent.columns @ step))
+        moved = descent.move(step, parts=4 if promise > 1.0 else 1)
         if moved is None:  # not even a small part of the step is good: the columns are not
             stale = not descent.exact and renewals > 0
             if not stale:
@@ -247,11 +250,11 @@ def fit(
         error, gain, factor = moved
         blind = descent.see()
         stale = error > 0.3 * size * factor and descent.travelled > 3.0 and renewals > 0 and not blind
-        if gain < 0.02 and factor == 1.0 and not (stale or blind):
+        if gain < SETTLED and factor == 1.0 and not (stale or blind):
             break
     if polish and renewals and descent.travelled > 3.0 and descent.renew():
         step = descent.step()
-        if np.linalg.norm(descent.columns @ step) > 0.02:
+        if descent.promise(step) > SETTLED:
             descent.move(step, parts=1, learn=False)
     return descent.result()
 

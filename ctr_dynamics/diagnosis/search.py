@@ -88,7 +88,7 @@ def search(
     if lin is None:
         return None
     screened = screen(problem, lin, clean, (), pool)
-    first = _distinct([s for s in screened if s.gain > MIN_SCREEN][: SHORTLIST + 3])[:SHORTLIST]
+    first = distinct([s for s in screened if s.gain > MIN_SCREEN][: SHORTLIST + 3])[:SHORTLIST]
     note(f"fitting {len(first)} single causes")
     found = [base]
     # likeliest first: what cannot win against those before it is given up
@@ -181,7 +181,7 @@ def _further(
             here = lin.carried(leader.fit)
             scored = screen(problem, here, leader.fit, leader.members, pool)
             jobs = []
-            for s in _distinct([s for s in scored if s.gain > SECOND_EVIDENCE - 2.0])[:SECOND]:
+            for s in distinct([s for s in scored if s.gain > SECOND_EVIDENCE - 2.0])[:SECOND]:
                 names = frozenset(x.label for x in (*leader.members, s.candidate))
                 if names not in tried:
                     tried.add(names)
@@ -247,7 +247,7 @@ def _fits(problem: Problem, jobs: Sequence[Job], limit: float, workers: int) -> 
     return [e for e in results if e is not None]
 
 
-def _distinct(found: Sequence[Scored]) -> list[Scored]:
+def distinct(found: Sequence[Scored]) -> list[Scored]:
     """One preset for each set of parameters: the first."""
     seen: set[frozenset[Key]] = set()
     out = []
