@@ -126,6 +126,7 @@ def make_case(
         stamps = sensors.tracker_stamps(motion)
         exact[f"{motion.name}_t"] = stamps
         exact[f"{motion.name}_reading"] = sensors.readings(run, world.sensing, stamps)[0]
+        exact[f"{motion.name}_realised"] = sensors.realised(run, world.sensing, stamps)
         exact[f"{motion.name}_tip"] = run.pose(stamps)[0]
     np.savez(folder / "truth.npz", **exact)
     answer = {

@@ -39,13 +39,19 @@ def _mean_pose(run: Run, t: np.ndarray, window_s: float) -> tuple[np.ndarray, np
 def readings(run: Run, sensing: Sensing, stamps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Noise-free tracker readings (n, 3) m and (n, 3, 3) at stamps (n,) s after the start."""
     t = stamps / (1.0 + sensing.skew)
-    p, rotation = _mean_pose(run, t - sensing.delay_s, sensing.window_s)
+    p, rotation = _registered(*_mean_pose(run, t - sensing.delay_s, sensing.window_s), sensing)
+    return p + sensing.drift * t[:, None], rotation
+
+
+def realised(run: Run, sensing: Sensing, t: np.ndarray) -> np.ndarray:
+    """Tip position (n, 3) m at times t (n,) s as the tracker realises it: registration and lever arm in, delay and drift out."""
+    return _registered(*run.pose(t), sensing)[0]
+
+
+def _registered(p: np.ndarray, rotation: np.ndarray, sensing: Sensing) -> tuple[np.ndarray, np.ndarray]:
     registration = Rotation.from_rotvec(sensing.rotation).as_matrix()
     p = sensing.scale * (p + rotation @ sensing.lever)
-    return (
-        p @ registration.T + sensing.translation + sensing.drift * t[:, None],
-        registration @ rotation,
-    )
+    return p @ registration.T + sensing.translation, registration @ rotation
 
 
 def tracker_stamps(motion: Motion) -> np.ndarray:
