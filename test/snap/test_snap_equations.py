@@ -8,6 +8,7 @@ from ctr_dynamics.errors import InputError
 from ctr_dynamics.model.model import Model
 from ctr_dynamics.robot import load_robot
 from ctr_dynamics.snap import newton
+from ctr_dynamics.snap.equations import body, slope, state_size
 from ctr_dynamics.snap.grid import build_grid, default_cells
 from ctr_dynamics.snap.solver import SnapSolver
 
@@ -28,6 +29,50 @@ def test_residual_equals_its_numpy_twin(n, at_plate, c0):
         np.testing.assert_allclose(
             found[rows], expected[rows], rtol=1e-8, atol=1e-11 * scale, err_msg=f"cell {cell}"
         )
+
+
+def test_spinning_discs_turn_as_their_angular_momentum_says():
+    """The terms in gamma of (12) and (20), which the printed equations hold in part.
+
+    The angular momentum of a body of revolution does not depend on how far it has turned about its axis: in the frame of tube 1 it is
+    L = (h omega_x, h omega_y, h_z (omega_z + gamma)), and the moment on it is L_t + omega x L, without any frame of tube i.
+    """
+    rng = np.random.default_rng(5)
+    n, m, c0 = 2, 2, 1.5e5
+    solver, _ = random_problem(n, 3)
+    layout, par = solver.model.layout, solver.parameters.copy()
+    for axis, value in zip("xyz", (4.9e-10, 4.9e-10, 9.6e-10), strict=True):
+        par[layout[f"body_inertia_{axis}"]] = value
+    y, hist = rng.uniform(-1, 1, state_size(m)), rng.uniform(-1, 1, 7 + 2 * n) * 1e4
+    y[10:13] *= 300.0
+    gamma_row, omega = 17 + 2 * m, y[10:13]
+    y[gamma_row] = 9000.0
+    omega_t, gamma_t = c0 * omega + hist[3:6], c0 * y[gamma_row] + hist[7 + n + 1]
+
+    def moment(across, along, spin, spin_t):
+        inertia = np.array([across, across, along])
+        total = omega + np.array([0.0, 0.0, spin])
+        return inertia * (omega_t + np.array([0.0, 0.0, spin_t])) + np.cross(omega, inertia * total)
+
+    wrench = np.zeros(6)
+    body(y, m, 1, n, par, hist, c0, wrench)
+    np.testing.assert_allclose(
+        wrench[3:], moment(4.9e-10, 9.6e-10, y[gamma_row], gamma_t), rtol=1e-10, atol=1e-16
+    )
+
+    def bending_rate(parameters):
+        """(2,) m_xy,s of a piece of the tubes."""
+        out, w, f = np.zeros(7 + 2 * n), np.zeros(2 * n), np.zeros(state_size(m))
+        slope(y, m, n, parameters, np.zeros(3 * n), hist, c0, out, w, f)
+        return f[16:18]
+
+    still = par.copy()
+    still[layout["inertia_per_length"]] = 0.0
+    inertia = par[layout["inertia_per_length"]]
+    rods = moment(inertia[0], 2 * inertia[0], 0.0, 0.0) + moment(
+        inertia[1], 2 * inertia[1], y[gamma_row], gamma_t
+    )
+    np.testing.assert_allclose(bending_rate(par) - bending_rate(still), rods[:2], rtol=1e-8)
 
 
 @pytest.mark.parametrize("n", [1, 2, 3, 4])
