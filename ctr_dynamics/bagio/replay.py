@@ -309,7 +309,7 @@ def _run(
         if log is not None:
             log.step(out)
         if writer is not None:
-            for message in encoder.encode(out, estimator.health.statuses):
+            for message in encoder.encode(out, estimator.health.statuses, estimator.health.snap_ahead):
                 writer.write(message.topic, message.stamp_ns, message.data)
         if progress is not None and steps % 50 == 0:
             progress(min(1.0, (last_ns - first_ns) / span_ns) if span_ns > 0 else 1.0, steps)

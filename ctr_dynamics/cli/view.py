@@ -95,7 +95,7 @@ def _replay(
         while pending is not None and pending.log_ns <= out.stamp_ns:
             server.put(pending.topic, pending.log_ns, pending.data)
             pending = next(inputs, None)
-        for message in encoder.encode(out, estimator.health.statuses):
+        for message in encoder.encode(out, estimator.health.statuses, estimator.health.snap_ahead):
             server.put(message.topic, message.stamp_ns, message.data)
 
 

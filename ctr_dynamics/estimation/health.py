@@ -172,6 +172,11 @@ class Health:
             return Status("tracker", WARN, message, values)
         return Status("tracker", status.level, status.message, values)
 
+    @property
+    def snap_ahead(self) -> bool:
+        """Whether the equilibrium is lost or unstable, or its loss is foretold within SNAP_WARNING_S: news that cannot wait."""
+        return self._stability().level > OK
+
     def _stability(self) -> Status:
         if self.stability is None:
             return Status("stability", OK, "not yet known", {})

@@ -145,7 +145,7 @@ class StepEncoder:
         self.frame_id = frame_id
         self.backbone_every = backbone_every
         self.hardware_id = hardware_id
-        self._was_valid: bool | None = None
+        self._was: tuple[bool, bool] | None = None  # validity and alarm of the step before
         self._pose = templates.stamped_numbers(topics.TIP_POSE, frame_id, 43)
         self._twist = templates.stamped_numbers(topics.TIP_TWIST, frame_id, 42)
         self._predicted = templates.stamped_numbers(topics.TIP_POSE_PREDICTED, frame_id, 7)
@@ -157,14 +157,18 @@ class StepEncoder:
         self._innovations: dict[tuple[str, ...], templates.Template] = {}
 
     def encode(
-        self, out: StepOutput, statuses: Callable[[], Sequence[StatusLike]] | None = None
+        self,
+        out: StepOutput,
+        statuses: Callable[[], Sequence[StatusLike]] | None = None,
+        alarm: bool = False,
     ) -> list[Encoded]:
         """All messages of one step, `valid` last.
 
         Args:
             out: the step.
-            statuses: asked for the health lines when /diagnostics is due (1 Hz and at changes of validity);
+            statuses: asked for the health lines when /diagnostics is due (1 Hz and at changes of validity or alarm);
                 None leaves /diagnostics to the caller.
+            alarm: whether a warning stands that must not wait for its turn, such as of a snap.
 
         Raises:
             NotFiniteError: a valid step holds a NaN or an infinity.
@@ -173,11 +177,10 @@ class StepEncoder:
         messages = [self._innovation(item) for item in out.innovations]
         if out.valid:
             messages += self._outputs(out)
-        if statuses is not None and (
-            out.k % topics.DIAGNOSTICS_EVERY == 0 or bool(out.valid) != self._was_valid
-        ):
+        now = bool(out.valid), alarm
+        if statuses is not None and (out.k % topics.DIAGNOSTICS_EVERY == 0 or now != self._was):
             messages.append(Encoded(topics.DIAGNOSTICS, stamp, self.diagnostics(out, statuses())))
-        self._was_valid = bool(out.valid)
+        self._was = now
         messages.append(Encoded(topics.VALID, stamp, _TRUE if out.valid else _FALSE))
         return messages
 

@@ -382,8 +382,8 @@ TOPICS: tuple[Topic, ...] = (
         "diagnostic_msgs/msg/DiagnosticArray",
         "out",
         OUTPUT_QOS,
-        "about 1 Hz, and at once when validity changes",
-        "Health of solver, timing, tracker, joints, consistency and misfit.",
+        "about 1 Hz, and at once when validity or the warning of a snap changes",
+        "Health of solver, timing, tracker, joints, consistency, misfit and elastic stability.",
         (
             Field("header.stamp", "model time of the step it belongs to", "s, ns"),
             Field("header.frame_id", "empty"),

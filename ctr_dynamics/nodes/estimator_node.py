@@ -67,7 +67,9 @@ class EstimatorNode(Node):
         self._qos_faults = qos.QosFaults()
         self._undecodable: dict[str, tuple[int, str]] = {}
         self._next_diagnostics_ns = 0
-        self._shown_valid: bool | None = None
+        self._shown: tuple[bool | None, bool] | None = (
+            None  # validity and warning of a snap as last published
+        )
         self.outputs = Outputs(
             self,
             qos.profile(self.settings["qos.publisher_reliability"], self.settings["qos.publisher_depth"]),
@@ -208,15 +210,16 @@ class EstimatorNode(Node):
         self._undecodable[topic] = (count + 1, str(error))
 
     def _housekeeping(self, now_ns: int) -> None:
-        """Diagnostics, at once when validity has changed and else at 2 Hz of the wall clock."""
+        """Diagnostics, at once when validity or the warning of a snap has changed and else at 2 Hz of the wall clock."""
         monotonic_ns = time.monotonic_ns()
         if self.rolling is not None:
             self.rolling.alarm(self._estimator.health.misfit.alarm, monotonic_ns)
-        if self.outputs.valid == self._shown_valid and monotonic_ns < self._next_diagnostics_ns:
+        before, now = self._shown, (self.outputs.valid, self._estimator.health.snap_ahead)
+        if now == before and monotonic_ns < self._next_diagnostics_ns:
             return
         self._next_diagnostics_ns = monotonic_ns + DIAGNOSTICS_NS
-        if self.outputs.valid != self._shown_valid:
-            self._shown_valid = self.outputs.valid
+        self._shown = now
+        if before is None or self.outputs.valid != before[0]:
             if self.outputs.valid:
                 self.get_logger().info("outputs are valid")
             else:

@@ -74,14 +74,14 @@ def test_invalid_step_publishes_valid_false_and_the_reason(step, innovation):
     assert diagnostics.status[0].hardware_id == "robot"
 
 
-def test_diagnostics_once_a_second_and_at_changes_of_validity(step):
+def test_diagnostics_once_a_second_and_at_changes_of_validity_or_alarm(step):
     encoder = encode.StepEncoder()
     due = []
     for k in range(700):
         out = step(k=k, points=2, valid=not 100 <= k < 103, reason="x")
-        if topics.DIAGNOSTICS in by_topic(encoder.encode(out, list)):
+        if topics.DIAGNOSTICS in by_topic(encoder.encode(out, list, alarm=400 <= k < 500)):
             due.append(k)
-    assert due == [0, 100, 103, 333, 666]
+    assert due == [0, 100, 103, 333, 400, 500, 666]
 
 
 def test_diagnostics_bytes(reference):

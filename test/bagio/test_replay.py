@@ -44,9 +44,10 @@ class StandIn:
         self.innovations: list = []
         self.invalid = range(0)
         self.health = SimpleNamespace(
+            snap_ahead=False,
             statuses=lambda: [
                 SimpleNamespace(name="solver", level=0, message="ok", values={"steps": str(self.k)})
-            ]
+            ],
         )
 
     def add_joint_state(self, stamp_ns, names, positions) -> None:

@@ -14,7 +14,10 @@ from estimation_cases import (
     play,
 )
 
+from ctr_dynamics.messages.encode import StepEncoder
+from ctr_dynamics.messages.topics import DIAGNOSTICS
 from ctr_dynamics.robot import load_robot
+from ctr_dynamics.snap.scurve import s_curve
 
 REST = (1.5708, 1.5708, -0.2521, -0.1977)
 
@@ -248,6 +251,33 @@ def test_snap_of_the_tubes():
     check_outputs(run)
     assert run.last.valid
     assert run.last.k == 500
+
+
+def test_snap_is_announced_in_the_diagnostics_before_it_happens():
+    """Turned slowly up to its snap: /diagnostics warns well before the first step that fails, and after 30 ms the model goes on behind it."""
+    robot = load_robot("till2020_snap")
+    snap, rate = s_curve(robot, robot.rest.beta.value, points=300).snap[0], 2.0
+    made, encoder = estimator(None, robot), StepEncoder()
+    warned, failed, outputs = [], [], []
+    for k in range(171):
+        turn = snap - 2.0 + rate * min(0.01 * k, 1.5)
+        joints(0.01 * k, [-turn, 0.0, *robot.rest.beta.value]).give(made)
+        for out in made.advance(START_NS + k * 10_000_000):
+            outputs.append(out)
+            at = (out.stamp_ns - START_NS) * 1e-9
+            for message in encoder.encode(out, made.health.statuses, made.health.snap_ahead):
+                if message.topic == DIAGNOSTICS and b"a snap is ahead in" in message.data:
+                    warned.append(at)
+            if not out.valid:
+                failed.append((at, out.reason))
+    assert 0.1 < warned[0] < 0.5  # the equilibrium is lost at 1 s
+    assert len(failed) <= 10
+    assert all("step failed" in reason and at > 0.99 for at, reason in failed)
+    print(f"warned of at {warned[0]:.3f} s, failed {failed}")
+    assert outputs[-1].valid
+    assert made.health.restarts == bool(failed)
+    [stability] = [s for s in made.health.statuses() if s.name == "stability"]
+    assert stability.message.startswith("stable")
 
 
 # -- tracker --
