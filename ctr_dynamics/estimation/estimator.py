@@ -42,6 +42,7 @@ LOAD_GRACE_NS = 100_000_000  # a first load that comes this soon after the joint
 AHEAD_NS = 10_000_000_000  # a pose that far after the newest joint state is on another clock
 WAITING_SAMPLES = 200  # poses kept until the first joint state
 STABILITY_EVERY = 33  # steps between looks at the elastic stability
+KEEP_EVERY = 8  # steps between kept states that late inputs return to
 MODES_EVERY = 132  # steps between refreshes of the vibration modes
 MOST_UNPAUSED = 8  # steps before what waits for a pause is done without one
 RETRY_EVERY = 33  # steps between starts while there is no equilibrium: looking for one in vain takes long
@@ -508,8 +509,9 @@ class Estimator:
         self._failures = 0
         return self._output(k, result)
 
-    def _step(self, k: int, track: Kept | None = None) -> StepResult:
-        """Both runs from step k - 1 to k, and every sample that has become due; with ``track`` the covariance is taken from there."""
+    def _step(self, k: int, track: Kept | None = None, keep: bool = True) -> StepResult:
+        """Both runs from step k - 1 to k, and every sample that has become due; with ``track`` the covariance is taken from there. Without
+        ``keep`` the state is kept at every eighth step only."""
         assert self._fused is not None and self._alone is not None
         before, t = (k - 1) * DT_NS * 1e-9, k * DT_NS * 1e-9
         self._known.clear()
@@ -540,7 +542,8 @@ class Estimator:
                     "tracker", "tangent", "the step could not be linearised; the covariance was held"
                 )
             self._fuse(k, due)
-        self._keep(k)
+        if keep or k % KEEP_EVERY == 0:
+            self._keep(k)
         return result
 
     def _start_filter(self, k: int) -> None:
@@ -642,7 +645,7 @@ class Estimator:
 
     def _keep(self, k: int) -> None:
         """Remember the whole state after step ``k``, for as long as inputs may come late."""
-        if not self._predicting and k % 8:
+        if not self._predicting and k % KEEP_EVERY:
             return
         assert self._fused is not None and self._alone is not None
         self._kept.append(
@@ -688,9 +691,11 @@ class Estimator:
             return
         before = (len(self._innovations), self.health.nis_sum)
         counters = self._frozen()
+        # the next joints will return to the last step that these cover; what comes later than it should, to one of every eighth
+        covered = (self._joints.stamps[-1] - self.t0_ns) // DT_NS
         for again in range(k + 1, reached + 1):
             self.health.rolled_back += 1
-            result = self._step(again, tracks.get(again))
+            result = self._step(again, tracks.get(again), keep=again >= covered)
             if not result.ok:
                 tracks.clear()
                 self.health.failed(result.reason)

@@ -30,6 +30,8 @@ IDLE_NS = 50_000_000
 RETRY_NS = 1_000_000
 COLLECT_NS = 1_000_000_000
 COLLECT_SLACK_NS = 1_500_000
+LONGEST_WAIT_NS = 2_400_000
+"""Inputs wait no longer than this for a step: one that has just been published leaves about as long until the next."""
 PAUSE_NS = 1_000_000
 """What the estimator does in a pause takes about as long."""
 
@@ -237,7 +239,7 @@ class StepLoop(threading.Thread):
         if self.timing.policy != "predict" or not self._wall or due_ns is None or not self.inbox:
             return False
         wait_ns = due_ns - self._now_ns()
-        if wait_ns > min(self._correction_ns, STEP_NS // 2):
+        if wait_ns > min(self._correction_ns, LONGEST_WAIT_NS):
             return False
         if wait_ns > 0:
             time.sleep(wait_ns * 1e-9)
