@@ -13,7 +13,17 @@ parameter block of :class:`ctr_dynamics.model.layout.Layout`; ``ust`` (3N,) the 
 import numpy as np
 from numba import njit
 
+from ctr_dynamics.model.layout import EXTENDED, EXTENDED_TUBES
+
 Q, O, N, M, Z = 7, 10, 13, 16, 18  # noqa: E741
+
+# Rows of the extensions that are in use here: scalars k at 14n + k, groups of one row a tube k at 14n + TUBES + k n.
+_FIRST = {name: 14 + sum(size for _, size in EXTENDED[:k]) for k, (name, _) in enumerate(EXTENDED)}
+EXCESS, INVERSE_SPEED, OVERLAP = (
+    _FIRST[name] for name in ("stribeck_excess", "stribeck_inverse_speed", "overlap_friction")
+)
+TUBES = 14 + sum(size for _, size in EXTENDED)
+COMPLIANCE, INERTIA = (EXTENDED_TUBES.index(name) for name in ("drive_compliance", "drive_inertia"))
 
 
 @njit(cache=True, inline="always")
@@ -74,6 +84,11 @@ def slope(y, m, n, par, ust, hist, c0, out, w, f):
             - par[4 * n + i] * (ux * (uyt - gamma * ux) - uy * (uxt + gamma * uy))
             + 2.0 * inertia * (ozt + gt)
         )
+        if i > 0 and par[14 * n + OVERLAP] != 0.0:
+            rate = gamma if i == 1 else gamma - out[6 + n + i]
+            rub = par[14 * n + OVERLAP] * rate / np.sqrt(rate * rate + par[14 * n + 11] ** 2)
+            f[Z + i - 1] -= rub
+            f[Z + i] += rub
         ra += par[2 * n + i]
         ri += inertia
         gyro += inertia * (oz + 2.0 * gamma)
@@ -118,6 +133,31 @@ def base_slope(y, i, n, par, uz_ref, hist, c0, out, f):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
+def drive(i, n, par, moment, hist, c0, out):
+    """(psi, psi_t) of tube ``i`` at its actuator under the internal ``moment`` there: the drive gives way by (moment - J psi_tt) / k.
+
+    ``hist``, ``out`` (2N,) belong to what each drive gives way, rad, and to psi_t.
+    """
+    at = 14 * n + TUBES + i
+    compliance, inertia = par[at + COMPLIANCE * n], par[at + INERTIA * n]
+    rate, h = par[12 * n + i], hist[2 * i]
+    give = (
+        compliance
+        * (moment - inertia * (c0 * (rate + h) + hist[2 * i + 1]))
+        / (1.0 + compliance * inertia * c0 * c0)
+    )
+    out[2 * i], out[2 * i + 1] = give, rate + c0 * give + h
+    return par[11 * n + i] + give, rate + c0 * give + h
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def coulomb(n, par, rate):
+    """Smoothed sign of a relative ``rate``, with the Stribeck peak near rest."""
+    eps, slow = par[14 * n + 11], rate * par[14 * n + INVERSE_SPEED]
+    return (1.0 + par[14 * n + EXCESS] * np.exp(-slow * slow)) * rate / np.sqrt(rate * rate + eps * eps)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def bending(y, m, n, par, hist, c0, out, w, moments):
     """Bending moment of every tube, (14), in the frame of tube 1, from the fields of :func:`strain`; zero for tubes that have ended."""
     ux, uy = out[6], out[7]
@@ -142,11 +182,7 @@ def friction(y, m, n, par, near, far, torque):
         rate = y[17 + 2 * m + i]
         if i > 0:
             rate = rate - y[16 + 2 * m + i]
-        eps = par[14 * n + 11]
-        tau = (
-            par[14 * n + 9] * np.sqrt(dx * dx + dy * dy) * rate / np.sqrt(rate * rate + eps * eps)
-            + par[14 * n + 10] * rate
-        )
+        tau = par[14 * n + 9] * np.sqrt(dx * dx + dy * dy) * coulomb(n, par, rate) + par[14 * n + 10] * rate
         torque[i] -= tau
         torque[i + 1] += tau
 
@@ -197,37 +233,36 @@ def body(y, m, i, n, par, hist, c0, wrench):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def enter(x, turning, n, par, ust_behind, ust, hist, c0, out, w, near, far, torque, y):
+def enter(x, turning, n, par, ust_behind, ust, hist, hist_drive, c0, out, out_drive, w, near, far, torque, y):
     """State at s = 0+ from the unknowns there, (19) and (24): p, h, q, omega, theta, gamma are held by the tubes behind the plate.
 
-    ``x``: (psi, psi_t, m_z) of the ``turning`` innermost tubes, which begin behind the plate, then n (3), m_xy (2), m_z of the others.
+    ``x``: (psi, psi_t, m_z) of the ``turning`` innermost tubes, which begin behind the plate, then n (3), m_xy (2), m_z of the others,
+    which their drives hold here.
     """
     first = 3 * turning
-    psi1, rate1 = par[11 * n] + 0.0 * x[0], par[12 * n] + 0.0 * x[0]
-    if turning > 0:
-        psi1, rate1 = x[0], x[1]
     for k in range(state_size(n)):
         y[k] = 0.0
-    y[3], y[6] = np.cos(0.5 * psi1), np.sin(0.5 * psi1)
-    y[12] = rate1
     for k in range(5):
         y[N + k] = x[first + k]
-    outer = rate1
+    psi1, rate1, outer = 0.0 * x[0], 0.0 * x[0], 0.0 * x[0]
     for i in range(n):
         if i < turning:
             psi, rate, moment = x[3 * i], x[3 * i + 1], x[3 * i + 2]
         else:
-            psi, rate = par[11 * n + i] + 0.0 * x[0], par[12 * n + i] + 0.0 * x[0]
             moment = x[first + 5 + i - turning]
+            psi, rate = drive(i, n, par, moment, hist_drive, c0, out_drive)
         y[Z + i] = moment
-        if i > 0:
+        if i == 0:
+            psi1, rate1 = psi, rate
+        else:
             y[17 + n + i] = psi - psi1
             y[16 + 2 * n + i] = rate - rate1
         outer = rate
-    mx, my, eps = y[M], y[M + 1], par[14 * n + 11]
+    y[3], y[6] = np.cos(0.5 * psi1), np.sin(0.5 * psi1)
+    y[12] = rate1
+    mx, my = y[M], y[M + 1]
     y[Z + n - 1] += (
-        par[14 * n + 12] * np.sqrt(mx * mx + my * my) * outer / np.sqrt(outer * outer + eps * eps)
-        + par[14 * n + 13] * outer
+        par[14 * n + 12] * np.sqrt(mx * mx + my * my) * coulomb(n, par, outer) + par[14 * n + 13] * outer
     )
     strain(y, n, n, par, ust_behind, hist, c0, out, w)
     for i in range(n):

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from ctr_dynamics.snap.equations import Z, base_slope, cross, enter, slope, state_size, tip
+from ctr_dynamics.snap.equations import Z, base_slope, cross, drive, enter, slope, state_size, tip
 from ctr_dynamics.snap.grid import Arrays
 
 CONVERGED, NOT_CONVERGED, NOT_FINITE = 0, 1, 2
@@ -21,12 +21,15 @@ SLOW = 0.1  # a reused Jacobian that reduces ||E|| by less is renewed
 
 class Work(NamedTuple):
     """Arrays that a solve writes. ``hist``, ``out`` (points, F): points are the cells beyond the plate, then start and end of each section;
-    ``hist_base``, ``out_base`` (base, N, 2): psi_t and u_z of the cells behind the plate."""
+    ``hist_base``, ``out_base`` (base, N, 2): psi_t and u_z of the cells behind the plate; ``hist_drive``, ``out_drive`` (2N,): what each drive
+    gives way and psi_t at the actuator."""
 
     hist: np.ndarray
     out: np.ndarray
     hist_base: np.ndarray
     out_base: np.ndarray
+    hist_drive: np.ndarray
+    out_drive: np.ndarray
     left: np.ndarray  # (nodes, S) state on the far side of each node: the left end of the next cell
     right: np.ndarray  # (nodes, S) state on its near side: the right end of the cell before
     error: np.ndarray  # (unknowns,) E of (25)
@@ -55,6 +58,8 @@ def make_work(g: Arrays) -> Work:
         out=np.zeros((points, F)),
         hist_base=np.zeros((max(g.base, 1), n, 2)),
         out_base=np.zeros((max(g.base, 1), n, 2)),
+        hist_drive=np.zeros(2 * n),
+        out_drive=np.zeros(2 * n),
         left=np.zeros((nodes, S)),
         right=np.zeros((nodes, S)),
         error=np.zeros(size),
@@ -79,7 +84,7 @@ def _special(g, k):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _node(g, k, x, par, hist, c0, out_near, out_far, scratch, right, left):
+def _node(g, k, x, par, hist, hist_drive, c0, out_near, out_far, out_drive, scratch, right, left):
     """States on both sides of node ``k`` from its unknowns ``x``, with every boundary condition held."""
     n = g.n
     w, near, far, torque, wrench = scratch[0], scratch[1], scratch[2], scratch[3], scratch[4]
@@ -89,25 +94,12 @@ def _node(g, k, x, par, hist, c0, out_near, out_far, scratch, right, left):
             right[i] = x[i]
         hist_start = hist[cells]
         enter(
-            x,
-            g.turning,
-            n,
-            par,
-            g.ust_behind,
-            g.ust_start[0],
-            hist_start,
-            c0,
-            out_far,
-            w,
-            near,
-            far,
-            torque,
-            left,
-        )
+            x, g.turning, n, par, g.ust_behind, g.ust_start[0], hist_start, hist_drive, c0, out_far, out_drive,
+            w, near, far, torque, left,
+        )  # fmt: skip
     elif k == 0:
         for i in range(g.turning):
-            left[3 * i] = par[11 * n + i]
-            left[3 * i + 1] = par[12 * n + i]
+            left[3 * i], left[3 * i + 1] = drive(i, n, par, x[i], hist_drive, c0, out_drive)
             left[3 * i + 2] = x[i]
     elif not _special(g, k):
         for i in range(g.size[k]):
@@ -148,8 +140,8 @@ def residual(g, x, par, c0, work):
     total = 0.0
     for k in range(last + 1):
         _node(
-            g, k, x[g.start[k] : g.start[k + 1]], par, work.hist, c0, out_near, out_far, scratch,
-            work.right[k], work.left[k],
+            g, k, x[g.start[k] : g.start[k + 1]], par, work.hist, work.hist_drive, c0, out_near, out_far,
+            work.out_drive, scratch, work.right[k], work.left[k],
         )  # fmt: skip
         if k >= g.base and _special(g, k):
             if k > g.base:
@@ -202,6 +194,7 @@ def _differentiate_nodes(g, x, par, c0, work):
     """d left / d x and d right / d x of the special nodes, by complex steps."""
     scratch = work.imag
     xc, right, left, out_near, out_far = scratch[5], scratch[6], scratch[7], scratch[8], scratch[9]
+    out_drive = scratch[10]
     for k in range(len(g.size)):
         if not _special(g, k):
             continue
@@ -212,7 +205,9 @@ def _differentiate_nodes(g, x, par, c0, work):
             right[:] = 0.0
             left[:] = 0.0
             xc[j] += TINY * 1j
-            _node(g, k, xc, par, work.hist, c0, out_near, out_far, scratch, right, left)
+            _node(
+                g, k, xc, par, work.hist, work.hist_drive, c0, out_near, out_far, out_drive, scratch, right, left
+            )  # fmt: skip
             xc[j] = x[g.start[k] + j]
             for r in range(len(right)):
                 work.d_right[k, r, j] = right[r].imag / TINY

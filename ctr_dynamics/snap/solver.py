@@ -14,6 +14,17 @@ from ctr_dynamics.snap.grid import Grid, build_grid, default_cells
 from ctr_dynamics.snap.newton import CONVERGED, NOT_FINITE, make_work, solve
 
 TOLERANCE = 1e-9  # of ||E||^2, SI units (section III-F)
+# Effects on the mechanics that (25) does not hold; those of encoders and tracker do not concern it: its actuator angles are the true ones.
+ABSENT = {
+    "air_drag",
+    "clearance",
+    "contact",
+    "exposed_length",
+    "ovality",
+    "softening",
+    "tip_force",
+    "tip_spring",
+}
 OUTCOMES = {
     CONVERGED: "ok",
     1: "Newton's method did not converge",
@@ -42,7 +53,7 @@ class SnapSolver:
         tolerance: largest ||E||^2.
 
     Raises:
-        InputError: translations or cells that do not fit the robot.
+        InputError: translations or cells that do not fit the robot, or an extension that these equations lack.
     """
 
     def __init__(
@@ -55,6 +66,13 @@ class SnapSolver:
         problem = robot.actuator_problem(np.asarray(beta, float))
         if problem:
             raise InputError(problem, do="mend beta", where=f"robot {robot.name}")
+        absent = ABSENT.intersection(robot.extensions)
+        if absent:
+            raise InputError(
+                f"extension '{min(absent)}' is not in the finite-difference solver",
+                do="take it out of the robot file",
+                where=f"robot {robot.name}",
+            )
         self.model = model = Model(robot)
         self.beta = np.array(beta, float)
         self.grid: Grid = build_grid(
@@ -69,7 +87,7 @@ class SnapSolver:
         self.x = np.zeros(self.grid.unknowns)
         self.x_before = self.x.copy()
         self.x_earlier = self.x.copy()
-        self.bank = np.zeros((3, self.work.out.size + self.work.out_base.size))  # y now, y before, rate now
+        self.bank = np.zeros((3, len(self._fields())))  # y now, y before, rate now
         self.t = 0.0
         self.dt = self.dt_before = 0.0
         self.angle_surprise = 0.0  # rad, theta_f of the last step less its quadratic extrapolation
@@ -92,19 +110,17 @@ class SnapSolver:
                 self.x[at + 2], self.x[at + 3] = s, 1.0
 
     def _fields(self) -> np.ndarray:
-        return np.concatenate([self.work.out.ravel(), self.work.out_base.ravel()])
+        work = self.work
+        return np.concatenate([work.out.ravel(), work.out_base.ravel(), work.out_drive])
 
     def _solve(self, c0: float, history: np.ndarray | None, guess: np.ndarray, limit: int) -> Solved:
-        main = self.work.hist.size
-        if history is None:
-            self.work.hist[:] = 0.0
-            self.work.hist_base[:] = 0.0
-        else:
-            self.work.hist.flat[:] = history[:main]
-            self.work.hist_base.flat[:] = history[main:]
+        work, done = self.work, 0
+        for part in (work.hist, work.hist_base, work.hist_drive):
+            part.flat[:] = 0.0 if history is None else history[done : done + part.size]
+            done += part.size
         x = guess.copy()
         outcome, iterations, jacobians, norm = solve(
-            self.grid.arrays, x, self.parameters, c0, self.work, *self.scratch, self._fresh or c0 != self._c0, self.tolerance, limit
+            self.grid.arrays, x, self.parameters, c0, work, *self.scratch, self._fresh or c0 != self._c0, self.tolerance, limit
         )  # fmt: skip
         self._c0 = c0
         self._fresh = outcome != CONVERGED
@@ -266,7 +282,9 @@ class SnapSolver:
     def end_angles(self) -> np.ndarray:
         """(N,) psi_L: base angle of tube 1 plus its twist up to each tube's end plus theta there, rad."""
         g, work = self.grid.arrays, self.work
-        psi = self.parameters[self.model.layout["alpha"]][0] if not g.turning else work.right[g.base, 0]
+        psi = self.parameters[self.model.layout["alpha"]][0] + work.out_drive[0]
+        if g.turning:
+            psi = work.right[g.base, 0]
         twist = work.out[: len(g.ds) - g.base, 8] * g.ds[g.base :]
         angles = np.zeros(self.n)
         for k, m in enumerate(g.tubes):

@@ -21,8 +21,11 @@ def table(name: str) -> dict[str, np.ndarray]:
         return dict(zip(header, np.loadtxt(stream, delimiter=",").T, strict=True))
 
 
-def random_problem(n: int, seed: int, last_at_plate: bool = True):
-    """A solver of `n` tubes with random unknowns, actuators, loads and histories of the size of motion, everything in the model on."""
+def random_problem(n: int, seed: int, last_at_plate: bool = True, extended: bool = False):
+    """A solver of `n` tubes with random unknowns, actuators, loads and histories of the size of motion, everything in the model on.
+
+    `extended`: compliant drives, friction along the overlap and its Stribeck peak too.
+    """
     rng = np.random.default_rng(seed)
     robot = many_tubes(n)
     beta = np.array(robot.rest.beta.value)
@@ -38,10 +41,17 @@ def random_problem(n: int, seed: int, last_at_plate: bool = True):
     par[layout["alpha_rate"]] = rng.uniform(-2, 2, n)
     par[layout["force"]] = rng.uniform(-0.2, 0.2, 3)
     par[layout["torque"]] = rng.uniform(-0.01, 0.01, 3)
+    if extended:
+        par[layout["drive_compliance"]] = rng.uniform(1.0, 10.0, n)
+        par[layout["drive_inertia"]] = rng.uniform(0.0, 1e-8, n)
+        par[layout["overlap_friction"]] = 0.02
+        par[layout["stribeck_excess"]], par[layout["stribeck_inverse_speed"]] = 0.7, 0.01
     work = solver.work
     scale = np.array([5.0] * 3 + [50.0] * 3 + [100.0] * 3 + [100.0] * (n - 1) + [50.0] * (n - 1))
     work.hist[:] = rng.uniform(-1, 1, work.hist.shape) * scale
     work.hist_base[:] = rng.uniform(-1, 1, work.hist_base.shape) * np.array([50.0, 100.0])
+    if extended:
+        work.hist_drive[:] = rng.uniform(-1, 1, 2 * n) * np.tile([5.0, 1e4], n)
     x = solver.x + 0.3 * rng.standard_normal(len(solver.x))
     return solver, x
 
@@ -50,9 +60,23 @@ def error_of(solver: SnapSolver, x: np.ndarray, c0: float) -> tuple[np.ndarray, 
     """E, fields and base fields at `x` with the solver's histories."""
     arrays = solver.grid.arrays
     work = make_work(arrays)
-    work.hist[:], work.hist_base[:] = solver.work.hist, solver.work.hist_base
+    for mine, given in (
+        (work.hist, solver.work.hist),
+        (work.hist_base, solver.work.hist_base),
+        (work.hist_drive, solver.work.hist_drive),
+    ):
+        mine[:] = given
     residual(arrays, x, solver.parameters, c0, work)
     return work.error, work.out, work.out_base
+
+
+class ExtendedOracle(Oracle):
+    """The model's twin with a Stribeck peak of Coulomb friction."""
+
+    def slip(self, rate):
+        """Smoothed sign of a sliding rate, larger near rest."""
+        excess, inverse = self.p["stribeck_excess"][0], self.p["stribeck_inverse_speed"][0]
+        return super().slip(rate) * (1.0 + excess * np.exp(-((rate * inverse) ** 2)))
 
 
 class Twin:
@@ -61,7 +85,7 @@ class Twin:
     def __init__(self, solver: SnapSolver, c0: float) -> None:
         self.g, self.c0, self.n = solver.grid.arrays, c0, solver.n
         self.work = solver.work
-        self.oracle = Oracle(solver.model.layout, solver.parameters, None, None, c0)
+        self.oracle = ExtendedOracle(solver.model.layout, solver.parameters, None, None, c0)
         self.rows = []
 
     def to_model(self, y, m):
@@ -84,9 +108,29 @@ class Twin:
         found[:18] = k[:18]
         found[13:16] = R @ (k[13:16] + np.cross(fields[6:9], full[13:16]))
         found[18 : 18 + m] = k[18 : 18 + m]
+        p, gamma = self.oracle.p, np.concatenate([[0.0], y[17 + 2 * m : 16 + 3 * m]])
+        for i in range(m - 1):
+            rub = p["overlap_friction"][0] * Oracle.slip(self.oracle, gamma[i + 1] - gamma[i])
+            found[18 + i] -= rub
+            found[19 + i] += rub
         found[18 + m : 17 + 2 * m] = k[18 + n : 17 + n + m]
         found[17 + 2 * m :] = k[17 + 2 * n : 16 + 2 * n + m]
         return found
+
+    def drive(self, i, torque):
+        """(psi, psi_t) of tube i at its actuator, by the balance of its drive: J psi_tt = (alpha - psi) / compliance + torque."""
+        p, c0 = self.oracle.p, self.c0
+        h, h_rate = self.work.hist_drive[2 * i : 2 * i + 2]
+
+        def imbalance(give):
+            rate = p["alpha_rate"][i] + c0 * give + h
+            inertia = p["drive_inertia"][i] * (c0 * rate + h_rate)
+            return give - p["drive_compliance"][i] * (torque - inertia), rate
+
+        # linear in what the drive gives way
+        at_0, at_1 = imbalance(0.0)[0], imbalance(1.0)[0]
+        give = -at_0 / (at_1 - at_0)
+        return p["alpha"][i] + give, imbalance(give)[1]
 
     def base_slope(self, v, i, reference, hist):
         """(18) of tube i."""
@@ -104,6 +148,8 @@ class Twin:
         for i in range(t):
             psi[i], rate[i], torque[i] = x[3 * i : 3 * i + 3]
         torque[t:] = x[3 * t + 5 :]
+        for i in range(t, n):
+            psi[i], rate[i] = self.drive(i, torque[i])
         y = np.zeros(16 + 3 * n)
         y[3], y[6], y[12] = np.cos(psi[0] / 2), np.sin(psi[0] / 2), rate[0]
         y[13:18] = x[3 * t : 3 * t + 5]
@@ -181,8 +227,7 @@ class Twin:
         left = None
         for k in range(len(g.size)):
             if k == 0 and g.base:
-                p = self.oracle.p
-                left = np.array([[p["alpha"][i], p["alpha_rate"][i], part(0)[i]] for i in range(g.turning)])
+                left = np.array([[*self.drive(i, part(0)[i]), part(0)[i]] for i in range(g.turning)])
                 continue
             right: np.ndarray
             following = None

@@ -16,9 +16,10 @@ from ctr_dynamics.snap.solver import SnapSolver
 @pytest.mark.parametrize("n", [1, 2, 3, 4])
 @pytest.mark.parametrize("at_plate", [True, False])
 @pytest.mark.parametrize("c0", [0.0, 1.5e5])
-def test_residual_equals_its_numpy_twin(n, at_plate, c0):
-    """Random states and histories; damping, friction, bodies, loads and every gyroscopic term on."""
-    solver, x = random_problem(n, 10 * n, at_plate)
+@pytest.mark.parametrize("extended", [False, True])
+def test_residual_equals_its_numpy_twin(n, at_plate, c0, extended):
+    """Random states and histories; damping, friction, bodies, loads and every gyroscopic term on, with and without extensions."""
+    solver, x = random_problem(n, 10 * n, at_plate, extended)
     found, *_ = error_of(solver, x, c0)
     expected = Twin(solver, c0).error(x)
     assert np.isfinite(expected).all()
@@ -77,9 +78,10 @@ def test_spinning_discs_turn_as_their_angular_momentum_says():
 
 @pytest.mark.parametrize("n", [1, 2, 3, 4])
 @pytest.mark.parametrize("c0", [0.0, 1.5e3])
-def test_elimination_inverts_the_jacobian(n, c0):
+@pytest.mark.parametrize("extended", [False, True])
+def test_elimination_inverts_the_jacobian(n, c0, extended):
     """The factors applied to (dense Jacobian by central differences) v give v."""
-    solver, x = random_problem(n, n)
+    solver, x = random_problem(n, n, extended=extended)
     x = solver.x + 0.1 * (x - solver.x)
     g, work = solver.grid.arrays, solver.work
     newton.residual(g, x, solver.parameters, c0, work)

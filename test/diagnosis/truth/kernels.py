@@ -728,11 +728,11 @@ def _full_newton(plant, scheme, c, v, A, inputs, h, tolerance, counts):
 
 
 @njit(cache=True)
-def integrate(plant, scheme, c, v, inputs, h, tolerance, tips, counts):
+def integrate(plant, scheme, c, v, inputs, h, tolerance, tips, counts, path):
     """Integrate len(inputs) steps of h s in place of (c, v); tips[0] is the begin.
 
-    `inputs` (steps, 3, N + 16) at the stages, `tips` (steps + 1, TIP), `counts` (2,) iterations and Jacobians. Returns the
-    number of steps done; fewer than asked when Newton's method fails.
+    `inputs` (steps, 3, N + 16) at the stages, `tips` (steps + 1, TIP), `counts` (2,) iterations and Jacobians; `path` gets the coordinates
+    (steps, n) behind every step unless it is empty. Returns the number of steps done; fewer than asked when Newton's method fails.
     """
     n = c.shape[0]
     steps = inputs.shape[0]
@@ -832,5 +832,7 @@ def integrate(plant, scheme, c, v, inputs, h, tolerance, tips, counts):
                 V[k] += h * scheme.A[2, i] * A[i, k]
         c[:] = C
         v[:] = V
+        if len(path):
+            path[step] = C
         residual(plant, c, v, A[2], inputs[step, 2], r[0], tips[step + 1])
     return steps

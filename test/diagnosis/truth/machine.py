@@ -15,6 +15,7 @@ CELL_M = 0.012  # longest quadrature cell
 DRIVE = 3e4  # N m/rad of a rigid drive: 0.02 N m turn it by 7e-7 rad
 TOLERANCE = 1e-5  # 1/m and rad, of the last Newton correction
 INPUTS_BEYOND_ANGLES = 16
+NO_PATH = np.empty((0, 0))  # coordinates of the steps are not kept
 
 
 class NoMotionError(RuntimeError):
@@ -109,8 +110,8 @@ class Machine:
         return self.segments[tube][-1][1]
 
 
-def plant_of(machine: Machine, refine: int = 1) -> tuple[Plant, int]:
-    """(plant, number of coordinates); `refine` divides the cells and adds as many less one polynomials."""
+def plant_of(machine: Machine, refine: int = 1, cell_m: float = CELL_M) -> tuple[Plant, int]:
+    """(plant, number of coordinates); `refine` divides the cells, at most `cell_m` long, and adds as many less one polynomials."""
     n = machine.n
     ends = machine.beta + [sum(length for length, _ in tube) for tube in machine.segments]
     edges = {0.0}
@@ -131,7 +132,7 @@ def plant_of(machine: Machine, refine: int = 1) -> tuple[Plant, int]:
     terms = 6 + refine
     for k in range(sections):
         length = stations[k + 1] - stations[k]
-        count = refine * max(1, math.ceil(length / CELL_M))
+        count = refine * max(1, math.ceil(length / cell_m))
         degree = 1 + refine if length < 0.005 else (4 + refine if k == sections - 1 else 3 + refine)
         offset.append(at)
         nb.append(degree)
@@ -293,7 +294,7 @@ def run(
     c, v = c.copy(), np.zeros(len(c))
     done = 0
     while done < len(inputs):
-        done += integrate(plant, RADAU, c, v, inputs[done:], step_s, TOLERANCE, tips[done:], counts)
+        done += integrate(plant, RADAU, c, v, inputs[done:], step_s, TOLERANCE, tips[done:], counts, NO_PATH)
         if done < len(inputs):
             if not _in_parts(plant, c, v, inputs[done], step_s, tips[done + 1], counts, 3):
                 raise NoMotionError(f"the step at {done * step_s:.4f} s did not converge")
@@ -317,7 +318,7 @@ def _in_parts(
         times = (part + RADAU.nodes) / 4
         # inputs between the stages by the parabola through them
         now = _parabola(RADAU.nodes, times) @ inputs
-        if not integrate(plant, RADAU, c, v, now[None], h / 4, TOLERANCE, tips, counts) and (
+        if not integrate(plant, RADAU, c, v, now[None], h / 4, TOLERANCE, tips, counts, NO_PATH) and (
             depth == 0 or not _in_parts(plant, c, v, now, h / 4, tips[1], counts, depth - 1)
         ):
             return False
