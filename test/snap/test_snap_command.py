@@ -5,12 +5,13 @@ import json
 
 import numpy as np
 import pytest
+import yaml
 from snap_cases import EXAMPLE
 
 from ctr_dynamics.bagio.info import inspect
 from ctr_dynamics.cli.main import main
 from ctr_dynamics.errors import InputError
-from ctr_dynamics.robot import load_robot
+from ctr_dynamics.robot import load_robot, robot_to_dict
 from ctr_dynamics.snap.experiment import Plan, Trajectory, robot_for_snap, run
 
 SHORT = ("--duration", "1e-4", "--points", "120", "--cells", "4,4,3,6,4,2")
@@ -82,6 +83,22 @@ def test_options_reach_the_solver(tmp_path):
     assert [float(row[0]) for row in rows] == pytest.approx([2e-5, 4e-5, 6e-5, 8e-5, 1e-4])
     assert float(rows[0][1]) == pytest.approx(3.0002)
     assert json.loads((tmp_path / "summary.json").read_text())["cells"] == [8, 8, 6, 12, 8, 4]
+
+
+def test_extensions_of_the_robot_file_are_in_use(tmp_path):
+    """A drive that gives way lets the base turn further before the snap."""
+    data = robot_to_dict(load_robot(EXAMPLE))
+    data["extensions"] = {
+        "drivetrain_compliance": {"tube1.stiffness_Nm_per_rad": 0.3, "tube1.inertia_kgm2": 1.4e-9}
+    }
+    file = tmp_path / "soft.yaml"
+    file.write_text(yaml.safe_dump(data))
+    assert (
+        main(["snap", "--robot", str(file), "--output", str(tmp_path / "out"), "--start", "3.6", *SHORT]) == 0
+    )
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert summary["snap_predicted"]["theta_b"] > 3.573 + 0.1
+    assert summary["theta_f_start"] < 2.0
 
 
 def test_transmission_length_changes_the_straight_length_only():
