@@ -42,7 +42,7 @@ def diagnose(folder: Path, jobs: int, effects: list[str] | None = None) -> dict[
     fitter = Fitter(robot, snaps[0])
     # the long ones first
     tried.sort(key=lambda c: -len(c.starts))
-    fits = Parallel(n_jobs=jobs, verbose=51)(delayed(fitter.fit)(cause) for cause in tried)
+    fits = Parallel(n_jobs=jobs, verbose=10)(delayed(fitter.fit)(cause) for cause in tried)
     fits.sort(key=lambda fit: fit.bic)
     near = [fit for fit in fits if fit.bic < fits[0].bic + 100.0 * DECISIVE]  # the others cannot catch up
     fits[: len(near)] = Parallel(n_jobs=jobs)(delayed(fitter.fit)(fit.cause, fit) for fit in near)
