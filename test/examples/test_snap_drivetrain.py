@@ -33,10 +33,11 @@ def small_drives():
 
 @pytest.fixture(scope="module")
 def example():
-    """(fitter, snaps) of the shipped data: 3.4 ms of the first snap."""
+    """(fitter, snaps) of the shipped data: 3.4 ms of the first snap, and a fine grid that is less fine than the example's."""
     name, snaps = snap_fit.load(EXAMPLE / "data")
     first = replace(snaps[0], t=snaps[0].t[:170], theta_f=snaps[0].theta_f[:170])
-    return snap_fit.Fitter(load_robot(name), first), snaps
+    fine = snap_fit.Grid((10, 6, 3, 24, 8, 3), 5e-6)
+    return snap_fit.Fitter(load_robot(name), first, fine=fine), snaps
 
 
 def test_a_straight_crossing_is_found_between_frames():

@@ -39,7 +39,7 @@ class Hidden:
     """What the generator hides: the drive of tube 1, and errors inside tolerance.
 
     Attributes:
-        stiffness_Nm_per_rad, inertia_kgm2: of the drive; infinite and 0 for a rigid one.
+        stiffness_Nm_per_rad, inertia_kgm2: of the drive.
         factors: on the robot file's values, by name. zero_rad: added to every angle.
     """
 
@@ -49,7 +49,7 @@ class Hidden:
     zero_rad: float
 
 
-def draw(seed: int, robot: Robot, rigid: bool = False) -> Hidden:
+def draw(seed: int, robot: Robot) -> Hidden:
     """A drive of 0.15 to 0.4 N m/rad that swings by itself at 2.0 to 2.5 kHz; normal errors with the robot file's deviations."""
     rng = np.random.default_rng(seed)
     stiffness = 0.15 * (0.4 / 0.15) ** rng.uniform()
@@ -66,8 +66,6 @@ def draw(seed: int, robot: Robot, rigid: bool = False) -> Hidden:
     }
     factors = {name: float(1.0 + size * truncated(rng)) for name, size in sizes.items()}
     zero = float(ZERO * truncated(rng))
-    if rigid:
-        return Hidden(float("inf"), 0.0, factors, zero)
     return Hidden(stiffness, stiffness / (2.0 * np.pi * frequency) ** 2, factors, zero)
 
 
@@ -83,8 +81,7 @@ def hidden_machine(robot: Robot, hidden: Hidden) -> Machine:
     machine.rho_i *= factor["density"]
     machine.mu *= factor["tube_coulomb"]
     machine.nu *= factor["tube_viscous"]
-    if np.isfinite(hidden.stiffness_Nm_per_rad):
-        machine.drive[0] = hidden.stiffness_Nm_per_rad, hidden.inertia_kgm2
+    machine.drive[0] = hidden.stiffness_Nm_per_rad, hidden.inertia_kgm2
     return machine
 
 
@@ -137,21 +134,20 @@ def snap(
 
 def fold(robot: Robot, hidden: Hidden) -> float:
     """theta_b (rad) at which the drive's tube snaps."""
-    if np.isfinite(hidden.stiffness_Nm_per_rad):
-        drive = {"tube1.stiffness_Nm_per_rad": hidden.stiffness_Nm_per_rad}
-        robot = robot.model_copy(update={"extensions": {"drivetrain_compliance": drive}})
+    drive = {"tube1.stiffness_Nm_per_rad": hidden.stiffness_Nm_per_rad}
+    robot = robot.model_copy(update={"extensions": {"drivetrain_compliance": drive}})
     found = s_curve(robot, np.array(robot.rest.beta.value), points=80, last=2.8, nodes=24).snap
     assert found is not None
     return found[0]
 
 
-def record(seed: int, folder: Path, rigid: bool = False) -> Hidden:
+def record(seed: int, folder: Path) -> Hidden:
     """Write ``NAME.csv`` of both snaps, ``snaps.json`` about them and the sealed ``answer.json``; the same seed gives the same bytes.
 
     The camera's clock starts at its first frame, BEFORE + AFTER s long, somewhere around the snap.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    hidden = draw(seed, load_robot(ROBOT), rigid)
+    hidden = draw(seed, load_robot(ROBOT))
     snaps = []
     for number, (name, beta1) in enumerate(LENGTHS.items()):
         rng = np.random.default_rng([seed, number])
@@ -176,7 +172,7 @@ def record(seed: int, folder: Path, rigid: bool = False) -> Hidden:
             }
         )
     (folder / "snaps.json").write_text(json.dumps({"robot": ROBOT, "snaps": snaps}, indent=1) + "\n")
-    answer = {"seed": seed, "cause": "" if rigid else "drivetrain_compliance", **asdict(hidden)}
+    answer = {"seed": seed, "cause": "drivetrain_compliance", **asdict(hidden)}
     (folder / "answer.json").write_text(json.dumps(answer, indent=1) + "\n")
     return hidden
 
@@ -185,6 +181,5 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser(prog="snap_truth", description=__doc__)
     parser.add_argument("--seed", type=int, required=True)
     parser.add_argument("--output", type=Path, required=True, metavar="DIR")
-    parser.add_argument("--rigid", action="store_true", help="hide no drive")
     options = parser.parse_args()
-    record(options.seed, options.output, options.rigid)
+    record(options.seed, options.output)
