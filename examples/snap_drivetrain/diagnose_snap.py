@@ -1,6 +1,6 @@
 """What the rigid model gets wrong about a recorded snap, which cause mends it, and what that is worth on a snap that was not fitted.
 
-``python run.py [--data DIR] [--output DIR] [--jobs N]`` prints the table and writes ``snap_diagnosis.png`` and ``result.json``.
+``python diagnose_snap.py [--data DIR] [--output DIR] [--jobs N]`` prints the table and writes ``snap_diagnosis.png`` and ``result.json``.
 """
 
 from __future__ import annotations
