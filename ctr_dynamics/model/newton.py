@@ -6,6 +6,7 @@ import numpy as np
 from numba import njit
 
 from ctr_dynamics.model.kernels import sweep
+from ctr_dynamics.model.lanes import PACK
 from ctr_dynamics.model.mesh import section_lengths
 from ctr_dynamics.model.workspace import base_rows, field_rows, lane_count, parameter_rows, state_rows
 
@@ -240,6 +241,13 @@ def lanes_for(count: int) -> tuple[int, ...]:
     return () if count == 1 else (0,) * math.ceil(count / 8)
 
 
+def _zeros(size: int) -> np.ndarray:
+    """Zeros that begin with a line of the cache, so that every pack of lanes lies in one line."""
+    block = np.zeros(size + PACK - 1)
+    first = -block.ctypes.data % (8 * PACK) // 8
+    return block[first : first + size]
+
+
 def buffers(n: int, mesh, points: int, nodes: int, lanes: int, rows: int):
     """Zeroed buffers of a sweep with ``lanes`` lanes: (W, par, seclen, x, hist, histb, out, outb, nodes, res), flat."""
     S, F = state_rows(n), field_rows(n)
@@ -256,4 +264,4 @@ def buffers(n: int, mesh, points: int, nodes: int, lanes: int, rows: int):
         nodes * S,
         5 + n,
     )
-    return tuple(np.zeros(size * lanes) for size in sizes)
+    return tuple(_zeros(size * lanes) for size in sizes)

@@ -6,9 +6,10 @@ from model_cases import many_tubes
 from model_oracle import Oracle
 
 from ctr_dynamics.model.kernels import sweep
+from ctr_dynamics.model.lanes import sincos
 from ctr_dynamics.model.mesh import section_lengths
 from ctr_dynamics.model.model import Model
-from ctr_dynamics.model.workspace import lane_count, sincos
+from ctr_dynamics.model.workspace import lane_count
 
 
 def random_problem(n, seed, nodes=12):
