@@ -241,7 +241,7 @@ def lanes_for(count: int) -> tuple[int, ...]:
     return () if count == 1 else (0,) * math.ceil(count / 8)
 
 
-def _zeros(size: int) -> np.ndarray:
+def aligned_zeros(size: int) -> np.ndarray:
     """Zeros that begin with a line of the cache, so that every pack of lanes lies in one line."""
     block = np.zeros(size + PACK - 1)
     first = -block.ctypes.data % (8 * PACK) // 8
@@ -264,4 +264,4 @@ def buffers(n: int, mesh, points: int, nodes: int, lanes: int, rows: int):
         nodes * S,
         5 + n,
     )
-    return tuple(_zeros(size * lanes) for size in sizes)
+    return tuple(aligned_zeros(size * lanes) for size in sizes)

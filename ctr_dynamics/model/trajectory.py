@@ -8,16 +8,17 @@ that the derivatives by dozens of parameters cost a few simulations (docs/model.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
 from ctr_dynamics.errors import InputError
+from ctr_dynamics.model.lanes import PACK
 from ctr_dynamics.model.mesh import Key, Mesh, fits
 from ctr_dynamics.model.model import Model
-from ctr_dynamics.model.newton import CONVERGED
+from ctr_dynamics.model.newton import CONVERGED, aligned_zeros, lanes_for
 from ctr_dynamics.model.scheme import RATES, Scheme
 from ctr_dynamics.model.simulator import Inputs, Record, Simulator, State, remap_columns
 from ctr_dynamics.model.step import RENEW, extrapolate, remember, step
@@ -29,7 +30,6 @@ InputRows = Callable[[Floats], Floats]
 TIP_ROWS = 13  # p, h, q, omega
 CHUNK = 256  # steps between returns to Python
 PATIENCE = 40  # steps that may need more than the compiled loop before a run is given up
-WIDE = 5  # times eight lanes for sensitivities: one lane count, compiled once, for any number of columns
 EPSILON = 1e-6  # of a column's unit: small against the curvature of the step, large against rounding
 
 
@@ -105,16 +105,29 @@ def _advance_tangent(tubes, lane, lanes, wide, mesh, c0, weights, par, inputs, b
 
 
 class _Columns:
-    """Columns of the stored fields along a simulation, with their buffers."""
+    """Columns of the stored fields along a simulation, with their buffers.
+
+    Packs of eight columns lie apart, each in one piece of memory; columns of zeros fill the last one.
+    """
 
     def __init__(self, model: Model, effect: Floats, input_effect: Callable[[Floats], Floats]) -> None:
-        self.model, self.effect, self.input_effect = model, np.ascontiguousarray(effect), input_effect
-        self.count = effect.shape[1]
-        self.wide = (0,) * WIDE
+        self.asked = effect.shape[1]
+        self.count = -(-self.asked // PACK) * PACK
+        self.model, self.effect = model, self._padded(effect)
+        self._input_effect = input_effect
+        self.wide = (*lanes_for(6 + model.n), 0)  # a pack for columns beside the unknowns' lanes
         m = 5 + model.n
         self.dx, self.matrix = np.zeros((m, self.count)), np.zeros((m, m))
         self.dnodes = np.zeros((16 + 3 * model.n, self.count))
         self._buffers: dict[Key, tuple] = {}
+
+    def _padded(self, columns: Floats) -> Floats:
+        spare = [(0, 0)] * (columns.ndim - 1) + [(0, self.count - self.asked)]
+        return np.ascontiguousarray(np.pad(columns, spare))
+
+    def input_effect(self, times: Floats) -> Floats:
+        """(k, inputs, columns) derivatives of the inputs at times (k,)."""
+        return self._padded(self._input_effect(times))
 
     def buffers(self, key: Key, mesh: Mesh, slots: int) -> tuple:
         """(many, work, before) for the sections ``key``."""
@@ -124,8 +137,7 @@ class _Columns:
             main, base = len(many[4]) // L, len(many[5]) // L
             fields = main + base
             work = (
-                np.zeros(main), np.zeros(base), np.zeros((fields, self.count)), np.zeros((slots, fields)),
-                np.zeros((fields, self.count)), np.zeros_like(self.effect),
+                np.zeros(main), np.zeros(base), np.zeros((slots, fields)), np.zeros_like(self.effect),
             )  # fmt: skip
             self._buffers[key] = many, work, np.zeros((RATES, fields))
         return self._buffers[key]
@@ -134,8 +146,9 @@ class _Columns:
         """Columns at rest; returns those of the tip (13, r)."""
         n, layout = self.model.n, self.model.layout
         many, work, _ = self.buffers(state.key, state.mesh, slots)
-        hist, histb, dhist, _, dfields, dstage = work
-        hist[:], histb[:], dhist[:] = 0.0, 0.0, 0.0
+        hist, histb, _, dstage = work
+        hist[:], histb[:] = 0.0, 0.0
+        fields = np.zeros((len(hist) + len(histb), self.count))
         rows = input_rows(n)[: len(row)]
         par = par.copy()
         par[rows] = row
@@ -144,20 +157,28 @@ class _Columns:
         dstage[rows] += drow[: len(rows)]
         dstage[layout["alpha_rate"]] = dstage[layout["beta_rate"]] = 0.0
         linearise(
-            self.model.tubes, self.wide, state.mesh, 0.0, par, dstage, state.unknowns[-1], hist, histb, dhist, EPSILON,
-            self.model.tangent_step, many, self.matrix, self.dx, dfields, self.dnodes,
+            self.model.tubes, self.wide, state.mesh, 0.0, par, dstage, state.unknowns[-1], hist, histb, np.zeros_like(fields), EPSILON,
+            self.model.tangent_step, many, self.matrix, self.dx, fields, self.dnodes,
         )  # fmt: skip
-        self.bank = np.zeros((slots, *dfields.shape))
-        self.bank[:2] = dfields
-        return self.dnodes[:TIP_ROWS].copy()
+        self.bank = aligned_zeros(len(fields) * slots * self.count).reshape(-1, slots, len(fields), PACK)
+        self.bank[:, :2] = np.moveaxis(fields.reshape(len(fields), -1, PACK), 1, 0)[:, None]
+        return self.tip
+
+    @property
+    def tip(self) -> Floats:
+        """(13, r) columns of the tip."""
+        return self.dnodes[:TIP_ROWS, : self.asked].copy()
 
     def remap(self, old: Mesh, old_beta: Floats, new: Mesh, new_beta: Floats) -> None:
         """Carry the columns to another set of sections."""
-        self.bank = remap_columns(self.model.n, self.bank, old, old_beta, new, new_beta)
+        blocks, slots, fields, _ = self.bank.shape
+        flat = np.moveaxis(self.bank, 0, 2).reshape(slots, fields, -1)
+        flat = remap_columns(self.model.n, flat, old, old_beta, new, new_beta)
+        self.bank = np.ascontiguousarray(np.moveaxis(flat.reshape(slots, -1, blocks, PACK), 2, 0))
 
     def follow(self, record: Record, par: Floats) -> bool:
         """Move the columns over one recorded (sub)step."""
-        slots = len(self.bank)
+        slots = self.bank.shape[1]
         many, work, _ = self.buffers(record.key, record.mesh, slots)
         dinputs = self.input_effect(record.times)
         return step_tangent(
@@ -206,30 +227,6 @@ def run(
         InputError: no static equilibrium at the first inputs.
     """
     n = model.n
-    room = 8 * WIDE - 6 - n
-    if effect is not None and effect.shape[1] > room:
-        parts = []
-        for first in range(0, effect.shape[1], room):
-            chosen = slice(first, min(first + room, effect.shape[1]))
-            part = None if input_effect is None else _some(input_effect, chosen)
-            parts.append(
-                run(
-                    model,
-                    scheme,
-                    parameters,
-                    inputs,
-                    duration,
-                    effect=effect[:, chosen],
-                    input_effect=part,
-                    tolerance=tolerance,
-                    guess=guess,
-                )
-            )
-        shortest = min(parts, key=lambda p: len(p.t))
-        columns_of = [p.columns[: len(shortest.t)] for p in parts if p.columns is not None]
-        return replace(
-            shortest, columns=np.concatenate(columns_of, axis=2), sweeps=sum(p.sweeps for p in parts)
-        )
     simulator = Simulator(model, scheme, tolerance, parameters)
     dt, stages = scheme.dt, scheme.stages
     steps = int(np.floor(duration / dt + 1e-9))
@@ -247,7 +244,7 @@ def run(
         give = input_effect or (lambda times: np.zeros((len(times), model.input_count, r)))
         columns = _Columns(model, effect, give)
         out = np.empty((steps + 1, TIP_ROWS, r))
-        out[0] = columns.start(state, parameters, first, give(np.zeros(1))[0], RATES + stages)
+        out[0] = columns.start(state, parameters, first, columns.input_effect(np.zeros(1))[0], RATES + stages)
     k, sweeps, failure, hard = 0, 0, "", 0
     while k < steps:
         count = min(CHUNK, steps - k)
@@ -295,7 +292,7 @@ def run(
                 if reason:
                     failure = f"step at {k * dt:.4f} s {reason}"
                     break
-                out[k + 1] = columns.dnodes[:TIP_ROWS]
+                out[k + 1] = columns.tip
             tip[k + 1] = state.nodes[-1, :TIP_ROWS]
             k += 1
     done = k + 1
@@ -306,10 +303,6 @@ def run(
         failure,
         sweeps,
     )
-
-
-def _some(input_effect: Callable[[Floats], Floats], chosen: slice) -> Callable[[Floats], Floats]:
-    return lambda times: input_effect(times)[:, :, chosen]
 
 
 def while_fitting(model: Model, key: Key, beta: Floats) -> int:

@@ -32,7 +32,10 @@ tubes 2..N. p and h are in the base frame; q, omega, n and m are components in t
 Field rows (F = 7 + 2N): q 0-2, omega 3-5, u of tube 1 6-8, then u_z and gamma of tubes 2..N.
 """
 
+import math
+
 from numba import njit
+from numba.extending import overload
 
 # Rows of the state that every robot has.
 P0, H0, Q0, O0, N0, M0, Z0 = 0, 3, 7, 10, 13, 16, 18
@@ -84,6 +87,17 @@ def extra(tubes):
 def lane_count(lanes):
     """Lanes that a lane tuple stands for: none for one, else eight for each entry."""
     return max(1, 8 * len(lanes))
+
+
+def unknown_lanes(tubes):
+    """Lane tuple with room for a base case and one lane for each unknown of the shooting problem; for compiled code."""
+    raise NotImplementedError("for compiled code only")
+
+
+@overload(unknown_lanes)
+def _unknown_lanes(tubes):
+    lanes = (0,) * math.ceil((6 + len(tubes)) / 8)
+    return lambda tubes: lanes
 
 
 @njit(cache=True, forceinline=True)

@@ -13,7 +13,7 @@ from ctr_dynamics.model.simulator import Inputs, Simulator
 from ctr_dynamics.model.tangent import step_tangent
 from ctr_dynamics.robot import load_robot
 
-DT, STEPS, COLUMNS = 0.003, 12, 4
+DT, STEPS, COLUMNS = 0.003, 12, 8
 BETA, STILL = np.array([-0.2521, -0.1977]), np.zeros(2)
 
 
@@ -59,8 +59,8 @@ def test_tangent_of_steps_equals_finite_differences(scheme):
     state, records = run()
     m, stages = 5 + model.n, make_scheme(scheme, DT).stages
     fields = state.bank.shape[1]
-    columns = np.zeros((RATES + stages, fields, COLUMNS))
-    columns[:RATES, :, 0] = direction
+    columns = np.zeros((1, RATES + stages, fields, COLUMNS))
+    columns[0, :RATES, :, 0] = direction
     parameters = np.zeros((layout.size, COLUMNS))
     parameters[stiffness, 1] = model.parameters[stiffness] * 0.01
     parameters[angle, 2] = 0.01
@@ -70,8 +70,7 @@ def test_tangent_of_steps_equals_finite_differences(scheme):
     points, base = big[4].size // (8 * len(lanes)), big[5].size // (8 * len(lanes))
     inverse, dx, nodes = np.zeros((m, m)), np.zeros((m, COLUMNS)), np.zeros((state.nodes.size, COLUMNS))
     work = (
-        np.zeros(points), np.zeros(base), np.zeros((fields, COLUMNS)), np.zeros((RATES + stages, fields)),
-        np.zeros((fields, COLUMNS)), np.zeros((layout.size, COLUMNS)),
+        np.zeros(points), np.zeros(base), np.zeros((RATES + stages, fields)), np.zeros((layout.size, COLUMNS)),
     )  # fmt: skip
     still = np.zeros((stages, 3 * model.n + 6, COLUMNS))
     for record in records:
@@ -90,6 +89,6 @@ def test_tangent_of_steps_equals_finite_differences(scheme):
     ):
         plus, minus = run(**{name: h * scale})[0], run(**{name: -h * scale})[0]
         expected = (plus.bank[0] - minus.bank[0]) / (2 * h)
-        assert np.abs(columns[0, :, column] - expected).max() < 2e-4 * np.abs(expected).max(), name
+        assert np.abs(columns[0, 0, :, column] - expected).max() < 2e-4 * np.abs(expected).max(), name
         shape = (plus.nodes - minus.nodes).ravel() / (2 * h)
         assert np.abs(nodes[:, column] - shape).max() < 2e-4 * np.abs(shape).max(), name
