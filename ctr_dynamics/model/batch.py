@@ -32,8 +32,9 @@ from ctr_dynamics.model.trajectory import (
 from ctr_dynamics.model.workspace import input_row, lane_count
 
 Floats = NDArray[np.float64]
-LANES = 16  # cases in one batch
+LANES = 8  # cases in one batch: one pack, so that none waits for many
 LIMIT = 40  # iterations of a stage
+OLD, ANOTHER, OWN = 0, 1, 2
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -102,20 +103,29 @@ def _solve(
 ):
     """Unknowns ``x`` (m * L,) of all living lanes, in place; returns sweeps. Lanes that cannot be solved die.
 
-    ``fresh`` (L,): lanes whose ``inverse`` is not usable. ``spent`` (L,): sweeps of each lane, counted on.
+    ``fresh`` (L,): lanes whose ``inverse`` is not usable. ``spent`` (L,): sweeps of each lane, counted on. A new Jacobian of one lane serves all
+    that want one: the cases are alike. A lane that it does not help gets its own.
     """
     W, par, seclen, trial, hist, histb, out, outb, nodes, res = big
     L, m = lane_count(lanes), len(scale)
     norm, new = np.empty(L), np.empty(L)
-    newest = np.zeros(L, np.bool_)
+    newest = np.zeros(
+        L, np.int64
+    )  # whose Jacobian a lane has: an OLD one, a new one of ANOTHER lane, a new one of its OWN
     dx, dr = np.empty(m), np.empty(m)
     before = np.empty(m * L)
+    shared = -1
     for j in range(L):
         if fresh[j] and alive[j]:
-            alive[j] = _renew(
-                tubes, lanes, few, mesh, c0, big, one, eight, x, j, perturb, inverse, scale, norm
-            )
-            newest[j] = True
+            if shared < 0:
+                alive[j] = _renew(
+                    tubes, lanes, few, mesh, c0, big, one, eight, x, j, perturb, inverse, scale, norm
+                )
+                shared = j if alive[j] else -1
+                newest[j] = OWN
+            else:
+                inverse[j] = inverse[shared]
+                newest[j] = ANOTHER
             fresh[j] = False
     trial[:] = x
     sweep(tubes, lanes, W, c0, mesh, par, seclen, trial, hist, histb, out, outb, nodes, res)
@@ -124,6 +134,7 @@ def _solve(
     for _ in range(limit):
         waiting = False
         before[:] = res
+        shared = -1
         for j in range(L):
             if alive[j] and norm[j] > tolerance:
                 waiting = True
@@ -150,15 +161,23 @@ def _solve(
                     x[i * L + j] = trial[i * L + j]
                 broyden(inverse[j], dx, dr)
                 norm[j] = new[j]
-            if not better and newest[j]:
+            if not better and newest[j] == OWN:
                 alive[j] = False
             elif not better or slow:
-                alive[j] = _renew(
-                    tubes, lanes, few, mesh, c0, big, one, eight, x, j, perturb, inverse, scale, norm
-                )
-                newest[j] = True
+                if newest[j] == OLD and shared >= 0:
+                    inverse[j] = inverse[shared]
+                    newest[j] = ANOTHER
+                    if not better:  # back to where it was
+                        for i in range(m):
+                            res[i * L + j] = before[i * L + j]
+                else:
+                    alive[j] = _renew(
+                        tubes, lanes, few, mesh, c0, big, one, eight, x, j, perturb, inverse, scale, norm
+                    )
+                    newest[j] = OWN
+                    shared = j if alive[j] else -1
             else:
-                newest[j] = False
+                newest[j] = OLD
     for j in range(L):
         alive[j] &= norm[j] <= tolerance
     return sweeps
