@@ -1,0 +1,109 @@
+"""Memory of the estimator over a long run: a bag again and again, its stamps running on, every step encoded as the node does.
+
+Between two passes the joints move back to where the bag begins, and no tracker pose comes. One row a minute of robot time goes to standard
+output as a Markdown table: resident memory, steps, invalid steps, and how much faster than real time the minute was.
+
+    python benchmarks/memory.py [BAG] --minutes 60
+"""
+
+from __future__ import annotations
+
+import argparse
+import resource
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+from ctr_dynamics.bagio.reader import InputMessage, open_bag
+from ctr_dynamics.bench.fused import DT_NS
+from ctr_dynamics.cli.demo import shipped_file
+from ctr_dynamics.estimation.estimator import Estimator
+from ctr_dynamics.messages.cdr import JointStateIn, PoseIn
+from ctr_dynamics.messages.encode import StepEncoder
+from ctr_dynamics.parameters import Settings
+from ctr_dynamics.robot import load_robot
+
+RETURN_NS, JOINTS_NS = 2_000_000_000, 10_000_000  # length of the way back, and between its joint states
+MINUTE_NS = 60_000_000_000
+LIMIT = 0.01  # of the memory after a sixth of the time: growth allowed from there to the end
+
+
+def endless(bag: Path) -> Iterator[InputMessage]:
+    """Messages of the bag in passes; stamps and log times are moved on by the same amount."""
+    items = [item for item in open_bag(bag).inputs() if item.message.stamp_ns > 0]
+    joints = [item.message for item in items if isinstance(item.message, JointStateIn)]
+    first, last = joints[0], joints[-1]
+    period = last.stamp_ns - first.stamp_ns + RETURN_NS
+    target = dict(zip(first.names, first.positions, strict=True))
+    moved = 0
+    while True:
+        for item in items:
+            message = item.message._replace(stamp_ns=item.message.stamp_ns + moved)
+            yield item._replace(log_ns=item.log_ns + moved, message=message)
+        for since in range(JOINTS_NS, RETURN_NS, JOINTS_NS):
+            share = since / RETURN_NS
+            positions = tuple(
+                (1.0 - share) * position + share * target[name]
+                for name, position in zip(last.names, last.positions, strict=True)
+            )
+            stamp = last.stamp_ns + moved + since
+            message = last._replace(stamp_ns=stamp, positions=positions)
+            yield InputMessage("", stamp, message)
+        moved += period
+
+
+def resident_mb() -> float:
+    """Resident memory of this process in MB (Linux)."""
+    pages = int(Path("/proc/self/statm").read_text(encoding="utf-8").split()[1])
+    return pages * resource.getpagesize() / 1e6
+
+
+def main() -> int:
+    """Run the benchmark; returns 1 when memory grows by more than the limit."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n", maxsplit=1)[0])
+    parser.add_argument("bag", nargs="?", type=Path, default=shipped_file("clean_release.mcap"))
+    parser.add_argument("--minutes", type=int, default=60)
+    parser.add_argument("--robot", default="till2020_tissue")
+    options = parser.parse_args()
+    robot, settings = load_robot(options.robot), Settings({"output.policy": "wait"})
+    estimator = Estimator(robot, settings)
+    encoder = StepEncoder(settings["output.frame_id"], robot.name, settings["output.backbone_every"])
+    print("| minute | resident (MB) | steps | invalid | times real time |\n|---|---|---|---|---|", flush=True)
+    memory: list[float] = []
+    steps = invalid = 0
+    begin, end_ns = time.perf_counter(), None
+    for item in endless(options.bag):
+        message = item.message
+        end_ns = message.stamp_ns + MINUTE_NS if end_ns is None else end_ns
+        if isinstance(message, JointStateIn):
+            estimator.add_joint_state(message.stamp_ns, message.names, message.positions)
+        elif isinstance(message, PoseIn):
+            estimator.add_tracker_pose(
+                message.stamp_ns, message.position, message.quaternion_xyzw, message.frame_id
+            )
+        else:
+            estimator.add_tip_load(message.stamp_ns, message.force, message.torque, message.frame_id)
+        for out in estimator.advance(message.stamp_ns):
+            steps += 1
+            invalid += not out.valid
+            for _ in encoder.encode(out, estimator.health.statuses):
+                pass
+        if message.stamp_ns >= end_ns:
+            memory.append(resident_mb())
+            now = time.perf_counter()
+            print(
+                f"| {len(memory)} | {memory[-1]:.1f} | {steps} | {invalid} | {steps * DT_NS * 1e-9 / (now - begin):.1f} |",
+                flush=True,
+            )
+            begin, end_ns, steps, invalid = now, end_ns + MINUTE_NS, 0, 0
+            if len(memory) == options.minutes:
+                break
+    settled = memory[len(memory) // 6]
+    growth = memory[-1] - settled
+    print(f"\ngrowth after minute {len(memory) // 6 + 1}: {growth:+.1f} MB", flush=True)
+    return 1 if growth > LIMIT * settled else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
