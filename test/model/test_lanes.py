@@ -1,0 +1,90 @@
+"""Packs of eight lanes against NumPy arrays of eight numbers."""
+
+import math
+
+import numpy as np
+import pytest
+from numba import njit
+
+from ctr_dynamics.model.lanes import PACK, columns, fma, largest, local_copy, rows, where_above
+from ctr_dynamics.model.newton import aligned_zeros
+from ctr_dynamics.model.workspace import workspace_rows
+
+
+@njit
+def _formulas(lanes, a, b, out):
+    """Each operation once, row by row."""
+    x, y, z = rows(lanes, a, 0, 8), rows(lanes, b, 0, 8), rows(lanes, out, 0, 8)
+    for r in range(len(x)):
+        total = 0.0
+        total += x[r]
+        z[7 * r] = (total - 2.0 * y[r]) / (1.0 + y[r] * y[r])
+        z[7 * r + 1] = fma(x[r], 3.0, -y[r])
+        z[7 * r + 2] = math.sqrt(x[r] * x[r]) + math.floor(y[r])
+        z[7 * r + 3] = where_above(x[r], y[r], x[r], 0.25)
+        z[7 * r + 4] = math.exp(y[r])
+        z[7 * r + 5] = largest(x[r])
+        z[7 * r + 6] = 1.5
+
+
+def test_arithmetic_on_packs_is_that_of_every_lane():
+    rng = np.random.default_rng(0)
+    a, b = rng.standard_normal((5, PACK)), rng.standard_normal((5, PACK))
+    out = np.zeros((35, PACK))
+    _formulas((0,), a.ravel(), b.ravel(), out.reshape(-1))
+    expected = np.stack(
+        [
+            (a - 2.0 * b) / (1.0 + b * b), 3.0 * a - b, np.abs(a) + np.floor(b), np.where(a > b, a, 0.25), np.exp(b),
+            np.repeat(a.max(axis=1, keepdims=True), PACK, axis=1), np.full_like(a, 1.5),
+        ],
+        axis=1,
+    )  # fmt: skip
+    np.testing.assert_allclose(out.reshape(5, 7, PACK), expected, rtol=1e-14, atol=1e-15)
+
+
+@njit
+def _fused(a, b, c):
+    return fma(a, b, c)
+
+
+def test_a_fused_multiplication_rounds_once():
+    a = 1.0 + 2.0**-30
+    assert _fused(a, a, -1.0) == 2.0**-29 + 2.0**-60
+    assert a * a - 1.0 != 2.0**-29 + 2.0**-60
+
+
+@njit
+def _column_sums(table, first, out):
+    source, target = columns(table, first), rows((0,), out, 0, 8)
+    for r in range(len(source)):
+        target[0] += source[r]
+
+
+@pytest.mark.parametrize("first", [0, 3])
+def test_columns_of_a_table_as_packs(first):
+    table = np.random.default_rng(1).standard_normal((6, 13))
+    out = np.zeros(PACK)
+    _column_sums(table, first, out)
+    np.testing.assert_allclose(out, table[:, first : first + PACK].sum(axis=0), rtol=1e-14)
+
+
+@njit
+def _copied(tubes, lanes, values):
+    W = rows(lanes, values, 0, 8)
+    V = local_copy(tubes, W)
+    V[0] = V[1] + V[2]
+    W[3] = V[0]
+
+
+def test_a_local_copy_leaves_the_workspace_alone():
+    values = np.random.default_rng(2).standard_normal((workspace_rows(2), PACK))
+    before = values.copy()
+    _copied((0, 0), (0,), values.reshape(-1))
+    np.testing.assert_array_equal(values[3], before[1] + before[2])
+    np.testing.assert_array_equal(np.delete(values, 3, axis=0), np.delete(before, 3, axis=0))
+
+
+def test_buffers_begin_with_a_line_of_the_cache():
+    for size in (1, 7, 1000):
+        assert aligned_zeros(size).ctypes.data % 64 == 0
+        assert aligned_zeros(size).shape == (size,)
