@@ -80,10 +80,11 @@ def text(result: Result) -> str:
     lines += [
         "",
         f"error over node spacing against {space['reference_nodes']} nodes (tip, rms, mm)",
-        "nodes  spacing (mm)   error (mm)",
+        "nodes  spacing (mm)  Runge-Kutta 4    Euler",
     ]
     lines += [
-        f"{r['nodes']:5d}  {1e3 * r['spacing_m']:12.2f}  {_number(None if r['error_m'] is None else 1e3 * r['error_m'], '.2e'):>11s}"
+        f"{r['nodes']:5d}  {1e3 * r['spacing_m']:12.2f}  {_number(None if r['error_m'] is None else 1e3 * r['error_m'], '.2e'):>13s}"
+        f"  {_number(None if r['euler_error_m'] is None else 1e3 * r['euler_error_m'], '.2e'):>8s}"
         for r in space["rows"]
     ]
     snap = result["snap"]
@@ -184,6 +185,10 @@ def plots(result: Result, folder: Path) -> list[Path]:
     axes = figure.subplots()
     rows = [r for r in result["figure_14"]["rows"] if r["error_m"]]
     axes.loglog([1e3 * r["spacing_m"] for r in rows], [1e3 * r["error_m"] for r in rows], "o-", label="RK4")
+    euler = [r for r in rows if r["euler_error_m"]]
+    axes.loglog(
+        [1e3 * r["spacing_m"] for r in euler], [1e3 * r["euler_error_m"] for r in euler], "s-", label="Euler"
+    )
     if rows:
         first = rows[0]
         axes.loglog(

@@ -74,6 +74,9 @@ def test_quick_bench_writes_figures_and_plots(tmp_path, capsys):
     assert error["sdirk3"] < error["sdirk2"] < error["bdf2"] < error["backward_euler"]
     space = [r["error_m"] for r in result["figure_14"]["rows"]]
     assert space[0] > 10 * space[1] > 10 * space[2] or space[2] < 1e-8
+    euler = {r["nodes"]: r["euler_error_m"] for r in result["figure_14"]["rows"]}
+    assert 1.7 < euler[24] / euler[48] < 2.6  # first order
+    assert euler[48] > 1000 * space[2]
 
     for name in ("sweeps", "ticks", "figure_13", "figure_14", "time_error"):
         assert (tmp_path / f"{name}.png").read_bytes().startswith(b"\x89PNG")
