@@ -13,9 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctr_dynamics.effects import EFFECTS, Quantity, Setup, apply_effects, make_setup, play
+from ctr_dynamics.model.lanes import PACK
 from ctr_dynamics.model.model import Model
 from ctr_dynamics.model.scheme import make_scheme
-from ctr_dynamics.model.trajectory import WIDE, InputRows, Trajectory, run
+from ctr_dynamics.model.trajectory import InputRows, Trajectory, run
 from ctr_dynamics.robot import Robot
 
 from .recording import Recording
@@ -164,13 +165,10 @@ class Experiment:
             needs = model and (setup.extended or other.extended)
             kinds.append("tracker" if not model else "extended" if needs else "plain")
         numbers = {kind: [i for i, k in enumerate(kinds) if k == kind] for kind in ("plain", "extended")}
-        room = sensitivity_room(self.nominal.n)
-        spare = room - len(numbers["extended"])
-        keep = 0 if len(numbers["plain"]) <= spare else room
-        if numbers["extended"] and len(numbers["plain"][keep:]) <= spare:
-            # the extended model has the same derivatives, and room left
-            numbers["extended"] += numbers["plain"][keep:]
-            del numbers["plain"][keep:]
+        if numbers["extended"] and len(numbers["plain"]) <= -len(numbers["extended"]) % PACK:
+            # the extended model has the same derivatives, and room left in its last pack of columns
+            numbers["extended"] += numbers["plain"]
+            numbers["plain"] = []
         columns = np.zeros((len(self.recording.stamps), 6, len(wanted)))
         prediction: Prediction | None = None
         for kind, chosen in numbers.items():
@@ -240,11 +238,6 @@ class Experiment:
         shift = setup.tracker_scale * (rows[:, :3].transpose(0, 2, 1) + swing)
         shift = rotate(setup.rotation, shift.reshape(-1, 3)).reshape(len(times), r, 3)
         return np.concatenate([shift, turn], axis=2).transpose(0, 2, 1)
-
-
-def sensitivity_room(n: int) -> int:
-    """Columns that one simulation of ``n`` tubes carries: lanes less the base case's and one for each unknown of the shooting."""
-    return 8 * WIDE - 6 - n
 
 
 def moved(point: Point, quantity: Quantity, share: float) -> dict[tuple[str, str], float]:
