@@ -37,6 +37,11 @@ class Release:
     wrench: Floats
     early: float
 
+    @property
+    def events(self) -> tuple[float, float]:
+        """Times in s at which the load begins to fall and is gone."""
+        return 1.0 - self.early, 1.01 - self.early
+
     @classmethod
     def make(cls, cut: float) -> Release:
         """The shipped scenario's weight on `till2020_tissue`, cut at `cut` s within 10 ms."""
@@ -90,8 +95,7 @@ def compiled(test: Release, nodes: int, duration: float, tolerance: float) -> tu
     def rows(times: Floats) -> Floats:
         key = float(times[0]), len(times)
         if key not in known:
-            found = [test.at(float(t)) for t in times]
-            known[key] = np.array([np.r_[x.alpha, x.alpha_rate, x.beta, x.force, x.torque] for x in found])
+            known[key] = _input_rows(test, times)
         return known[key]
 
     for _ in range(2):
@@ -100,6 +104,23 @@ def compiled(test: Release, nodes: int, duration: float, tolerance: float) -> tu
         done = trajectory.run(model, scheme, model.parameters, rows, duration, tolerance=tolerance)
         wall = time.perf_counter() - begin
     return steps * DT / wall, done.sweeps / steps
+
+
+def _input_rows(test: Release, times: Floats) -> Floats:
+    found = [test.at(float(t)) for t in times]
+    return np.array([np.r_[x.alpha, x.alpha_rate, x.beta, x.force, x.torque] for x in found])
+
+
+def divided(test: Release, dt: float, nodes: int, duration: float, tolerance: float = 1e-7) -> Path:
+    """The release at the default scheme, the steps around the cut divided there."""
+    model = Model(release_robot(), nodes=nodes)
+    begin = time.perf_counter()
+    done = trajectory.run(
+        model, make_scheme("sdirk3", dt), model.parameters, lambda times: _input_rows(test, times), duration, tolerance=tolerance,
+        events=test.events,
+    )  # fmt: skip
+    wall = time.perf_counter() - begin
+    return Path(dt, done.tip[:, :3], wall, 3 * (len(done.t) - 1), done.sweeps, 0, done.failure)
 
 
 def run(test: Release, scheme: str, dt: float, nodes: int, duration: float, tolerance: float = 1e-7) -> Path:
@@ -174,9 +195,20 @@ def work(
 def time_error(
     test: Release, nodes: int, duration: float, reference: tuple[str, float], since: float
 ) -> dict[str, Any]:
-    """Error of every scheme at 3 ms against the scheme and step (s) `reference` on the same nodes."""
+    """Error of every scheme at 3 ms against the scheme and step (s) `reference` on the same nodes; and of the default scheme over the step, with
+    steps across the cut as they fall and divided there."""
     scheme, fine_dt = reference
     fine = run(test, scheme, fine_dt, nodes, duration)
+    steps = []
+    for count in (1, 2, 3):
+        dt = DT / count
+        steps.append(
+            {
+                "dt_s": dt,
+                "error_m": rms_difference(run(test, "sdirk3", dt, nodes, duration), fine, since),
+                "divided_error_m": rms_difference(divided(test, dt, nodes, duration), fine, since),
+            }
+        )
     rows = []
     for name in SCHEMES:
         path = run(test, name, DT, nodes, duration)
@@ -188,7 +220,7 @@ def time_error(
                 "failure": path.failure or fine.failure,
             }
         )
-    return {"nodes": nodes, "reference": {"scheme": scheme, "dt_s": fine_dt}, "schemes": rows}
+    return {"nodes": nodes, "reference": {"scheme": scheme, "dt_s": fine_dt}, "schemes": rows, "steps": steps}
 
 
 def grid(

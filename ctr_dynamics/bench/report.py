@@ -67,6 +67,16 @@ def text(result: Result) -> str:
         f"{'  ' + r['failure'] if r['failure'] else ''}"
         for r in error["schemes"]
     ]
+    lines += [
+        "",
+        "error of sdirk3 over the step (tip, rms, mm)",
+        "step (ms)  as the steps fall  divided at the cut",
+    ]
+    lines += [
+        f"{1e3 * r['dt_s']:9.2f}  {_number(None if r['error_m'] is None else 1e3 * r['error_m'], '.4f'):>17s}"
+        f"  {_number(None if r['divided_error_m'] is None else 1e3 * r['divided_error_m'], '.4f'):>18s}"
+        for r in error["steps"]
+    ]
     lines += ["", "real-time ratio over time step and node spacing (release test, steps from Python)"]
     steps = sorted({r["dt_s"] for r in result["figure_13"]})
     lines += ["spacing (mm)" + "".join(f"{1e3 * dt:9g} ms" for dt in steps)]

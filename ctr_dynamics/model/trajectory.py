@@ -7,8 +7,9 @@ that the derivatives by dozens of parameters cost a few simulations (docs/model.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numba import njit
@@ -19,7 +20,7 @@ from ctr_dynamics.model.lanes import PACK
 from ctr_dynamics.model.mesh import Key, Mesh, fits
 from ctr_dynamics.model.model import Model
 from ctr_dynamics.model.newton import CONVERGED, aligned_zeros, lanes_for
-from ctr_dynamics.model.scheme import RATES, Scheme
+from ctr_dynamics.model.scheme import RATES, Scheme, make_scheme
 from ctr_dynamics.model.simulator import Inputs, Record, Simulator, State, remap_columns
 from ctr_dynamics.model.step import RENEW, extrapolate, remember, step
 from ctr_dynamics.model.tangent import linearise, step_tangent
@@ -212,6 +213,7 @@ def run(
     input_effect: Callable[[Floats], Floats] | None = None,
     tolerance: float = 1e-6,
     guess: Floats | None = None,
+    events: Sequence[float] = (),
 ) -> Trajectory:
     """Simulate from rest in the static equilibrium of the first inputs.
 
@@ -223,6 +225,8 @@ def run(
         effect: (NP, r) derivative of the parameter block by r quantities, in units in which a millionth is a small change.
         input_effect: gives (k, inputs, r) derivatives of the inputs at times (k,).
         guess: (5 + N,) unknowns of the static equilibrium to start from.
+        events: s, times at which the inputs jump or bend. One-step schemes divide the steps around them there, since a step across one is of
+            first order only.
     Raises:
         InputError: no static equilibrium at the first inputs.
     """
@@ -245,6 +249,7 @@ def run(
         columns = _Columns(model, effect, give)
         out = np.empty((steps + 1, TIP_ROWS, r))
         out[0] = columns.start(state, parameters, first, columns.input_effect(np.zeros(1))[0], RATES + stages)
+    divided = _divided(events, dt) if scheme.one_step else {}
     k, sweeps, failure, hard = 0, 0, "", 0
     while k < steps:
         count = min(CHUNK, steps - k)
@@ -257,7 +262,9 @@ def run(
             usable = 0
         elif not still:
             usable = while_fitting(model, state.key, beta)
-        taken, reason = 0, ""
+        plain = min((step - k for step in divided if step >= k), default=count)  # steps that are not divided
+        usable = min(usable, plain)
+        taken = 0
         if usable:
             taken, spent, outcome = _fast(model, simulator, state, rows_now[:usable], times[:usable], columns, tip[k + 1 :],
                                           None if out is None else out[k + 1 :])  # fmt: skip
@@ -269,29 +276,35 @@ def run(
                 break
         k += taken
         if taken < count:
-            hard += usable == count
+            hard += taken < usable == min(count, plain)
             if hard > PATIENCE:
                 failure = f"step at {k * dt:.4f} s: more than {PATIENCE} steps did not converge at once"
                 break
-            mesh, before = state.mesh, state.inputs.beta
-            key = state.key
-            result = simulator.step(
-                state, k * dt, lambda t: to_inputs(n, inputs(np.array([t]))[0]), record=columns is not None
-            )
-            sweeps += result.sweeps
-            if not result.ok:
-                failure = f"step at {k * dt:.4f} s failed: {result.reason}"
+            parts = [k * dt, *divided.get(k, ()), (k + 1) * dt]
+            for begin, end in pairwise(parts):
+                mesh, before = state.mesh, state.inputs.beta
+                key = state.key
+                simulator.scheme = scheme if len(parts) == 2 else make_scheme(scheme.name, end - begin)
+                result = simulator.step(
+                    state, begin, lambda t: to_inputs(n, inputs(np.array([t]))[0]), record=columns is not None
+                )
+                sweeps += result.sweeps
+                if not result.ok:
+                    failure = f"step at {begin:.4f} s failed: {result.reason}"
+                    break
+                if columns is not None:
+                    for record in result.records:
+                        if record.key != key:
+                            columns.remap(mesh, before, record.mesh, record.inputs[-1, 2 * n : 3 * n])
+                            key = record.key
+                        if not columns.follow(record, parameters):
+                            failure = f"step at {begin:.4f} s could not be linearised"
+                if failure:
+                    break
+            simulator.scheme = scheme
+            if failure:
                 break
             if columns is not None and out is not None:
-                for record in result.records:
-                    if record.key != key:
-                        columns.remap(mesh, before, record.mesh, record.inputs[-1, 2 * n : 3 * n])
-                        key = record.key
-                    if not columns.follow(record, parameters):
-                        reason = "could not be linearised"
-                if reason:
-                    failure = f"step at {k * dt:.4f} s {reason}"
-                    break
                 out[k + 1] = columns.tip
             tip[k + 1] = state.nodes[-1, :TIP_ROWS]
             k += 1
@@ -303,6 +316,16 @@ def run(
         failure,
         sweeps,
     )
+
+
+def _divided(events: Sequence[float], dt: float) -> dict[int, list[float]]:
+    """Events within steps, by the step's number; those at its ends are met anyway."""
+    within: dict[int, list[float]] = {}
+    for event in sorted(events):
+        step = int(np.floor(event / dt))
+        if min(event - step * dt, (step + 1) * dt - event) > 1e-6 * dt:
+            within.setdefault(step, []).append(float(event))
+    return within
 
 
 def while_fitting(model: Model, key: Key, beta: Floats) -> int:

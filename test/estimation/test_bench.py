@@ -72,6 +72,9 @@ def test_quick_bench_writes_figures_and_plots(tmp_path, capsys):
     assert lanes[100, 8] < 0.6  # of a plain sweep a lane: lanes vectorise
     error = {r["scheme"]: r["error_m"] for r in result["time_error"]["schemes"]}
     assert error["sdirk3"] < error["sdirk2"] < error["bdf2"] < error["backward_euler"]
+    over = {round(1e6 * r["dt_s"]): r for r in result["time_error"]["steps"]}
+    assert over[3000]["divided_error_m"] < over[3000]["error_m"]
+    assert over[1500]["divided_error_m"] < 0.7 * over[3000]["divided_error_m"]
     space = [r["error_m"] for r in result["figure_14"]["rows"]]
     assert space[0] > 10 * space[1] > 10 * space[2] or space[2] < 1e-8
     euler = {r["nodes"]: r["euler_error_m"] for r in result["figure_14"]["rows"]}

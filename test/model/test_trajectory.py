@@ -192,3 +192,27 @@ def test_sensitivities_of_an_extended_run():
         [(1, 0.01), (7, 0.01)],
         2e-3,
     )
+
+
+def test_steps_are_divided_at_events():
+    """A load that falls off within one step: divided there, coarse steps come nearer to fine ones, and sensitivities are those of the run."""
+    model = Model(ROBOT, nodes=12)
+    effect = np.zeros((len(model.parameters), 1))
+    effect[0, 0] = 0.01 * model.parameters[0]
+
+    def follow(dt, events=(), stiffer=0.0, columns=None):
+        found = run(
+            model, make_scheme("sdirk3", dt), model.parameters + stiffer * effect[:, 0], inputs_of(model), 0.3, effect=columns, tolerance=1e-9,
+            events=events,
+        )  # fmt: skip
+        assert not found.failure
+        return found
+
+    fine = follow(0.0005).tip[::6, :3]
+    whole, divided = follow(DT).tip[:, :3], follow(DT, (0.1, 0.102), columns=effect)
+    assert np.sum((divided.tip[:, :3] - fine) ** 2) < 0.7 * np.sum((whole - fine) ** 2)
+    plus, minus = (follow(DT, (0.1, 0.102), sign * 1e-3).tip[:, :3] for sign in (1, -1))
+    expected = (plus - minus) / 2e-3
+    assert np.abs(divided.columns[:, :3, 0] - expected).max() < 1e-3 * np.abs(expected).max()
+    met = follow(DT, (0.102, 0.3))  # events at the ends of steps divide nothing
+    np.testing.assert_array_equal(met.tip[:, :3], whole)
