@@ -108,6 +108,7 @@ class Player:
 
     def __init__(self, estimator: Estimator) -> None:
         self.estimator = estimator
+        estimator.step_times_s = array("d")
         self.joint_names: set[str] = set()
         self._clock = StampClock()
         self._call_times_s = array("d")

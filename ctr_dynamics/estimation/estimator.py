@@ -125,7 +125,9 @@ class Estimator:
             float(self.setup.block[self.model.layout["insertion"]][0]) if self.model.extended else 0.0
         )
         self.fusion.inserted = self._inserted
-        self.step_times_s = array("d")
+        self.step_times_s: array[float] | None = (
+            None  # s of every step, where someone sets an array to be filled
+        )
         self._reported: deque[Innovation] = deque(maxlen=200)
         self._clear()
         self.health = Health(misfit=misfit_monitor(settings, robot.tracker.noise.position.value))
@@ -388,7 +390,8 @@ class Estimator:
                 self._go_back()
             self.k += 1
             outputs.append(self._take(self.k))
-            self.step_times_s.append(time.perf_counter() - begin)
+            if self.step_times_s is not None:
+                self.step_times_s.append(time.perf_counter() - begin)
             self._unpaused += 1
             if self._unpaused >= MOST_UNPAUSED:
                 self.use_pause()
