@@ -24,16 +24,17 @@ def ensemble(test: Release, nodes: int, cases: int, duration: float, tolerance: 
     """Releases of robots whose stiffness and angles vary: times of one after another and of all at once, on one core."""
     model, scheme = Model(release_robot(), nodes=nodes), make_scheme("sdirk3", DT)
     rng = np.random.default_rng(0)
+    count = int(
+        np.floor(duration / DT + 1e-9)
+    )  # as many as a run takes, or it would sample the last ones anew
     blocks, inputs = [], []
     for _ in range(cases):
         setup = make_setup(model)
         apply_effects(setup, {"youngs_modulus": {"all.scale": 1.0 + SPREAD * rng.standard_normal()}})
         blocks.append(setup.block)
         inputs.append(_rows(test, SPREAD * rng.standard_normal(2)))
-        for k in range(
-            0, round(duration / DT), CHUNK
-        ):  # sampled before the clock starts, as those of a bag are
-            steps = np.arange(k, min(k + CHUNK, round(duration / DT)))
+        for k in range(0, count, CHUNK):  # sampled before the clock starts, as those of a bag are
+            steps = np.arange(k, min(k + CHUNK, count))
             inputs[-1](((steps[:, None] + scheme.times) * DT).ravel())
     parameters = np.stack(blocks)
     run_many(model, scheme, parameters[:LANES], inputs[:LANES], 4 * DT, tolerance=tolerance)
