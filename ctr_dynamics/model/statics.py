@@ -297,7 +297,10 @@ class _Work:
         states = np.ascontiguousarray(nodesL.reshape(-1, L).T).reshape(L, -1, 16 + 3 * n)
         values = np.concatenate([resL.reshape(m, L), self._end_angles(out, states).T])
         steps = np.concatenate([step, np.full(n, 1e-7)])
-        return (values[:, 1 : 1 + m + n] - values[:, :1]) / steps
+        change = values[:, 1 : 1 + m + n] - values[:, :1]
+        # the base angle is that of a quaternion, which begins anew after two turns
+        change[m:] -= 4.0 * np.pi * np.round(change[m:] / (4.0 * np.pi))
+        return change / steps
 
     def stability(self, par: np.ndarray, x: np.ndarray) -> float:
         """det(d alpha / d psi_L) at ``x``, see :meth:`Statics.stability`."""
