@@ -32,6 +32,7 @@ Floats = NDArray[np.float64]
 Note = Callable[[str], None]
 NOT_NOISE = 1e-4  # p below which what is left is no noise
 LEFT_SHARE = 0.03  # of the misfit beyond noise that a named cause may leave before it is called unknown
+PREDICTED = 1.15  # NIS per degree of freedom on validation bags up to which they are predicted down to the noise
 NAMED = 0.9  # probability from which a set of causes is named
 CLEAN_GAIN = 4.0  # log evidence, priors included, that a cause must gain over none
 SEPARATION = 5.0  # whitened units: linear signatures that are nearer cannot be told apart
@@ -233,7 +234,8 @@ def _decide(
     if validation:
         note("validation")
         result.validation = validate(problem, clean.fit, best.fit, validation)
-    if not noise and (not best.members or left > LEFT_SHARE):
+    predicted = result.validation is not None and result.validation.nis_after <= PREDICTED
+    if not noise and (not best.members or (left > LEFT_SHARE and not predicted)):
         result.verdict = "unknown"
         result.members = [Member(None, "unknown", 0.95, None, [])]
         result.unexplained = unexplained(problem.experiments[0], clean.fit.point)
@@ -264,8 +266,9 @@ def _decide(
                 "the causes make the prediction of the validation bags worse: they are not named"
             )
         if not noise:
-            result.members.append(Member(None, "unknown", 0.6, None, []))
             result.notes.append("something small is left that is not noise")
+            if not predicted:
+                result.members.append(Member(None, "unknown", 0.6, None, []))
 
 
 def _member(problem: Problem, found: Search, best: Explanation, c: Candidate, lin: Linearisation) -> Member:
