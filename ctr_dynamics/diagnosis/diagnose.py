@@ -243,7 +243,7 @@ def _decide(
         result.unexplained = unexplained(problem.experiments[0], clean.fit.point)
         if result.unexplained is not None:
             result.notes.append(result.unexplained.text)
-        rest = [(s, 0.05 * p) for s, p in result.sets[:2]] if best.members else []
+        rest = [(s, 0.05 * p) for s, p in result.sets[:2] if s] if best.members else []
         result.sets = [(("unknown",), 0.95), *rest]
         return
     if best.members:
