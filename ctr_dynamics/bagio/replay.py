@@ -116,10 +116,10 @@ class Player:
     def times_s(self) -> Sequence[float]:
         """Time spent on each step, in s, roll-back included.
 
-        From the estimator's own account (`step_times_s`) when it keeps one; else steps that came from one
-        call share its time.
+        From the estimator's own account (`step_times_s`) when it has one of every step; else steps that came
+        from one call share its time.
         """
-        own = getattr(self.estimator, "step_times_s", None)
+        own = self.estimator.step_times_s
         return own if own is not None and len(own) == len(self._call_times_s) else self._call_times_s
 
     def play(self, bag: Bag, until_ns: int | None = None) -> Iterator[StepOutput]:

@@ -90,14 +90,7 @@ def compiled(test: Release, nodes: int, duration: float, tolerance: float) -> tu
     """
     scheme = make_scheme("sdirk3", DT)
     steps = round(duration / DT)
-    known: dict[tuple[float, int], Floats] = {}
-
-    def rows(times: Floats) -> Floats:
-        key = float(times[0]), len(times)
-        if key not in known:
-            known[key] = _input_rows(test, times)
-        return known[key]
-
+    rows = sampled(test, DT, duration)
     for _ in range(2):
         model = Model(release_robot(), nodes=nodes)
         begin = time.perf_counter()
@@ -106,18 +99,36 @@ def compiled(test: Release, nodes: int, duration: float, tolerance: float) -> tu
     return steps * DT / wall, done.sweeps / steps
 
 
-def _input_rows(test: Release, times: Floats) -> Floats:
-    found = [test.at(float(t)) for t in times]
-    return np.array([np.r_[x.alpha, x.alpha_rate, x.beta, x.force, x.torque] for x in found])
+def sampled(test: Release, dt: float, duration: float, turn: Floats | None = None) -> trajectory.InputRows:
+    """Inputs of the release as :func:`trajectory.run <ctr_dynamics.model.trajectory.run>` asks for them with the default scheme, ``dt`` and
+    ``duration`` in s, both tubes turned by ``turn`` (2,) rad. They are sampled here, before a clock starts, as those of a bag are."""
+    known: dict[tuple[float, int], Floats] = {}
+    more = np.zeros(2) if turn is None else turn
+
+    def rows(times: Floats) -> Floats:
+        key = float(times[0]), len(times)
+        if key not in known:
+            found = [test.at(float(t)) for t in times]
+            known[key] = np.array(
+                [np.r_[x.alpha + more, x.alpha_rate, x.beta, x.force, x.torque] for x in found]
+            )
+        return known[key]
+
+    # as many as a run takes, or it would sample the last ones anew
+    count = int(np.floor(duration / dt + 1e-9))
+    for first in range(0, count, trajectory.CHUNK):
+        steps = np.arange(first, min(first + trajectory.CHUNK, count))
+        rows(((steps[:, None] + make_scheme("sdirk3", dt).times) * dt).ravel())
+    return rows
 
 
 def divided(test: Release, dt: float, nodes: int, duration: float, tolerance: float = 1e-7) -> Path:
     """The release at the default scheme, the steps around the cut divided there."""
     model = Model(release_robot(), nodes=nodes)
+    rows = sampled(test, dt, duration)
     begin = time.perf_counter()
     done = trajectory.run(
-        model, make_scheme("sdirk3", dt), model.parameters, lambda times: _input_rows(test, times), duration, tolerance=tolerance,
-        events=test.events,
+        model, make_scheme("sdirk3", dt), model.parameters, rows, duration, tolerance=tolerance, events=test.events
     )  # fmt: skip
     wall = time.perf_counter() - begin
     return Path(dt, done.tip[:, :3], wall, 3 * (len(done.t) - 1), done.sweeps, 0, done.failure)
