@@ -50,6 +50,7 @@ MAX_FAILURES = 10  # steps in a row that may fail before the model starts anew a
 SAME_COURSE = (
     8  # steps: joints no later than that move the robot so little that the covariance need not be moved again
 )
+LOAD_BEND = 0.02  # of the force or moment that bends the robot: a change of the load's slope that adds more within a step divides the step
 MAX_BEHIND = 1000  # steps to catch up at once; beyond, the model starts anew
 
 
@@ -119,6 +120,8 @@ class Estimator:
             for i in range(self.model.n)
             if f"encoder_offset.tube{i + 1}" in self.fusion.uncertainty.names
         ]
+        unit = self.model.scale
+        self._load_bend = LOAD_BEND / dt * np.array([*unit[:3], *unit[3:4], *unit[3:4], *unit[3:4]])
         self._load_delay_ns = round(self.setup.load_shift * 1e9)
         # share of the rates of beta that the model's own velocities hold already
         self._inserted = (
@@ -129,6 +132,7 @@ class Estimator:
             None  # s of every step, where someone sets an array to be filled
         )
         self._reported: deque[Innovation] = deque(maxlen=200)
+        self._unjudged: deque[Innovation] = deque()  # by the misfit monitor
         self._clear()
         self.health = Health(misfit=misfit_monitor(settings, robot.tracker.noise.position.value))
         self.health.fusing = self._fusing = bool(settings["filter.enabled"])
@@ -398,8 +402,10 @@ class Estimator:
         return outputs
 
     def use_pause(self) -> None:
-        """A part of the work that no output waits for: a look at the stability, or a part of the modes' refresh."""
+        """A part of the work that no output waits for: the misfit monitor's, and a look at the stability or a part of the modes' refresh."""
         self._unpaused = 0
+        while self._unjudged:
+            self.health.misfit.add(self._unjudged.popleft())
         if self._fused is None:
             return
         if self._watch_due:
@@ -410,7 +416,9 @@ class Estimator:
 
     def finish(self) -> list[StepOutput]:
         """Steps up to the last joint stamp."""
-        return self.advance(None)
+        outputs = self.advance(None)
+        self.use_pause()
+        return outputs
 
     def reset(self) -> None:
         """Forget everything and wait for the next complete joint state. Counters stay."""
@@ -420,6 +428,7 @@ class Estimator:
         self.health.problem = "waiting for the first complete joint state"
         self.health.recent.clear()
         self.health.misfit.clear()
+        self._unjudged.clear()
 
     def set_fusion(self, on: bool) -> None:
         """Use tracker samples, or let the model run alone; samples are compared all the same."""
@@ -524,10 +533,13 @@ class Estimator:
             - 3.0 * (a.earlier[0] - f.earlier[0])
             + (a.earlier[1] - f.earlier[1])
         )
-        result = self.simulator.step(f, before, self._inputs(True), record=False if track else "end")
+        events = self._load_events(k)
+        result = self.simulator.step(
+            f, before, self._inputs(True), record=False if track else "end", events=events
+        )
         # the actuators' noise moves both runs alike: what lies between their unknowns is smooth, so a parabola meets it
         start = f.unknowns + apart if result.ok else None
-        alone = self.reference.step(a, before, self._inputs(False), start=start)
+        alone = self.reference.step(a, before, self._inputs(False), start=start, events=events)
         if not alone.ok:
             return alone
         self._keep_alone_tip(t)
@@ -548,6 +560,15 @@ class Estimator:
         if keep or k % KEEP_EVERY == 0:
             self._keep(k)
         return result
+
+    def _load_events(self, k: int) -> list[float]:
+        """Times (s) within step ``k`` at which the load bends sharply."""
+        assert self.t0_ns is not None
+        if len(self._load.stamps) < 2:
+            return []
+        end_ns = self.t0_ns + k * DT_NS
+        bends = self._load.bends(end_ns - DT_NS, end_ns, self._load_bend)
+        return [(stamp - self.t0_ns) * 1e-9 for stamp in bends]
 
     def _start_filter(self, k: int) -> None:
         """Start the filter anew from the model alone at step ``k``: a correction has led the fused run astray."""
@@ -738,9 +759,10 @@ class Estimator:
     def _thaw(self, counters: tuple, innovations: int, k: int) -> None:
         """Samples that were counted when they were first fused are not counted again."""
         h = self.health
-        repeated = {i.stamp_ns for i in self._reported}
-        fresh = [i for i in self._innovations[innovations:] if i.stamp_ns not in repeated]
+        again = self._innovations[innovations:]
         del self._innovations[innovations:]
+        repeated = {i.stamp_ns for i in self._reported} if again else set()
+        fresh = [i for i in again if i.stamp_ns not in repeated]
         (
             h.nis_count,
             h.nis_sum,
@@ -769,8 +791,7 @@ class Estimator:
     def _take_innovations(self) -> list[Innovation]:
         innovations, self._innovations = self._innovations, []
         self._reported.extend(innovations)
-        for innovation in innovations:
-            self.health.misfit.add(innovation)
+        self._unjudged.extend(innovations)
         return innovations
 
     def _invalid(self, k: int, reason: str) -> StepOutput:

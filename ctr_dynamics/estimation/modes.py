@@ -47,7 +47,6 @@ class ModalBasis:
         direction: (m, 3) unit, main direction of the tip's motion in ``ctr_base``.
     """
 
-    key: tuple
     frequency_hz: Floats
     damping: Floats
     exponent: NDArray[np.complex128]
@@ -206,7 +205,6 @@ def modal_parts(
     chosen = mu[order].astype(complex)
     rows = np.concatenate([np.real(readout), np.imag(readout)])
     yield ModalBasis(
-        equilibrium.key,
         np.abs(chosen.imag) / (2 * np.pi),
         -chosen.real / np.abs(chosen),
         chosen,

@@ -68,6 +68,21 @@ class Signal:
         return values[-1] + rate * (ahead * 1e-9), rate
 
 
+    def bends(self, after_ns: float, until_ns: float, least: Floats) -> list[int]:
+        """Stamps between two times at which the rate changes by more than ``least`` (size,), 1/s, in some component."""
+        stamps, values = self.stamps, self.values
+        found = []
+        for i in range(bisect.bisect_right(stamps, after_ns), bisect.bisect_left(stamps, until_ns)):
+            change = np.zeros(self.size)
+            if i > 0:
+                change += (values[i] - values[i - 1]) * (1e9 / (stamps[i] - stamps[i - 1]))
+            if i + 1 < len(stamps):
+                change -= (values[i + 1] - values[i]) * (1e9 / (stamps[i + 1] - stamps[i]))
+            if np.any(np.abs(change) > least):
+                found.append(stamps[i])
+        return found
+
+
 class Drives(Signal):
     """Actuators (alpha rad, beta m of every tube) from drives whose angles reach the tubes through play and a delay.
 

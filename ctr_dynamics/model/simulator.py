@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 from typing import Literal
 
 import numpy as np
@@ -36,6 +37,8 @@ class Inputs:
     force: np.ndarray = field(default_factory=lambda: np.zeros(3))
     torque: np.ndarray = field(default_factory=lambda: np.zeros(3))
 
+
+SHORTEST_PART = 0.02  # of a step: events closer than that to its ends, or to one another, are not worth a part of their own
 
 InputsAt = Callable[[float], Inputs]
 """Inputs at a time in s. One that also has ``stages(times)``, which returns what :func:`stage_inputs` does, is asked for all stages at once."""
@@ -94,6 +97,17 @@ class State:
             self.key, self.mesh, self.bank.copy(), self.unknowns.copy(), self.earlier.copy(), self.inverse.copy(), self.usable,
             self.nodes.copy(), self.inputs,
         )  # fmt: skip
+
+    def become(self, other: State) -> None:
+        """Take over all that ``other`` holds, to go on with a fresh Jacobian."""
+        for name in ("key", "mesh", "bank", "unknowns", "earlier", "inverse", "nodes", "inputs"):
+            setattr(self, name, getattr(other, name))
+        self.usable = False
+
+    def forget_course(self) -> None:
+        """Look for the next unknowns where the last step ended."""
+        self.unknowns[:] = self.unknowns[-1]
+        self.earlier[:] = self.unknowns[-1]
 
     @property
     def fields(self) -> np.ndarray:
@@ -164,13 +178,19 @@ class Simulator:
         *,
         record: bool | Literal["end"] = False,
         start: np.ndarray | None = None,
+        events: Sequence[float] = (),
     ) -> StepResult:
         """Advance ``state`` from t to t + dt (s) in place; ``inputs_at`` gives actuators and load at any time in between.
 
         A step that fails is tried again with a fresh Jacobian and, for one-step schemes, in up to 32 substeps. With ``record`` the result
         carries what the tangent of the step needs; with "end", of its last stage alone, and the record holds until the state is written
-        to. ``start`` (stages, 5 + N): where to look for the unknowns, in place of their extrapolation.
+        to. ``start`` (stages, 5 + N): where to look for the unknowns, in place of their extrapolation. ``events``: s, times at which the
+        inputs jump or bend; one-step schemes divide the step there, since a step across one is of first order only.
         """
+        if events and self.scheme.one_step:
+            divided = self._divided(state, t, inputs_at, record, events)
+            if divided is not None:
+                return divided
         result = self._attempt(state, self.scheme, t, inputs_at, not state.usable, record, start)
         if result.ok:
             return result
@@ -183,9 +203,8 @@ class Simulator:
         ] + [(2**halving, None) for halving in range(1, 6) if self.scheme.one_step]
         for count, start in retries:
             trial = state.copy()
-            if start is None:  # from where the last step ended
-                trial.unknowns[:] = trial.unknowns[-1]
-                trial.earlier[:] = trial.unknowns[-1]
+            if start is None:
+                trial.forget_course()
             scheme = make_scheme(self.scheme.name, self.scheme.dt / count) if count > 1 else self.scheme
             records: list[Record] = []
             for part in range(count):
@@ -196,12 +215,46 @@ class Simulator:
                 if not result.ok:
                     break
             if result.ok:
-                for name in ("key", "mesh", "bank", "unknowns", "earlier", "inverse", "nodes", "inputs"):
-                    setattr(state, name, getattr(trial, name))
-                state.usable = False
+                state.become(trial)
                 how = f"{count} substeps" if count > 1 else "fresh start"
                 return StepResult(True, how, totals[0], totals[1], totals[2], count, tuple(records))
         return StepResult(False, result.reason, totals[0], totals[1], totals[2])
+
+    def _divided(
+        self,
+        state: State,
+        t: float,
+        inputs_at: InputsAt,
+        record: bool | Literal["end"],
+        events: Sequence[float],
+    ) -> StepResult | None:
+        """The step in parts that end at the ``events`` within it; None where there is none, or a part fails."""
+        dt = self.scheme.dt
+        least = SHORTEST_PART * dt
+        times = [t]
+        for event in sorted(events):
+            if event - times[-1] > least and t + dt - event > least:
+                times.append(event)
+        if len(times) == 1:
+            return None
+        trial = state.copy()
+        trial.forget_course()
+        parts = []
+        for begin, end in pairwise([*times, t + dt]):
+            scheme = make_scheme(self.scheme.name, end - begin)
+            part = self._attempt(trial, scheme, begin, inputs_at, True, record)
+            if not part.ok:
+                return None
+            parts.append(part)
+        state.become(trial)
+        return StepResult(
+            True,
+            "divided at an event",
+            sum(p.iterations for p in parts),
+            sum(p.sweeps for p in parts),
+            sum(p.jacobians for p in parts),
+            records=tuple(r for p in parts for r in p.records),
+        )
 
     def _attempt(
         self,

@@ -317,9 +317,10 @@ def _mix(weights, stored, first, base, values, epsilon):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _keep(tubes, stored, stage, last, first, c0, base, values, slopes, found, epsilon, dx, column):
-    """After a stage, from its swept history ``values`` and fields ``found`` (rows, 8): the columns of its rates, and after the ``last`` those of
-    the fields, into ``stored`` (slots, fields, 8) from field ``first`` on."""
+def _keep(tubes, stored, stage, last, one_step, first, c0, base, values, slopes, found, epsilon, dx, column):
+    """After a stage, from its swept history ``values`` and fields ``found`` (rows, 8): the columns of its rates, or after the ``last`` those of the
+    fields, into ``stored`` (slots, fields, 8) from field ``first`` on. What a ``one_step`` scheme never reads is not written: the columns of many
+    nodes exceed the cache."""
     H = lane_count(unknown_lanes(tubes))
     scale = 1.0 / epsilon
     plain, slope = rows((), base, 0, 1), rows((), slopes, 0, 1)
@@ -331,8 +332,11 @@ def _keep(tubes, stored, stage, last, first, c0, base, values, slopes, found, ep
         for k in range(5 + len(tubes)):
             field = fma(follow[k], slope[i * H + 1 + k], field)
         value = fma(field, c0, (given[i] - plain[i]) * scale)
-        rate[first + i] = value
-        if last:
+        if not last:
+            rate[first + i] = value
+        elif one_step:
+            now[first + i] = field
+        else:
             before[first + i] = now[first + i]
             now[first + i] = field
             newest[first + i] = value
@@ -346,13 +350,14 @@ def step_tangent(tubes, lanes, mesh, c0, weights, par, inputs, found, before, ra
     ``before`` (slots, fields): stored fields before the step; ``rates`` (stages, fields): the stages' rates; ``found`` (stages, m): their
     unknowns; ``inputs`` as in :func:`ctr_dynamics.model.step.step`, ``dinputs`` (stages, inputs, r) their columns, added to those of the
     parameters ``dpar`` (NP, r); r is a multiple of 8. ``dbank`` (r / 8, 3 + stages, fields, 8): columns of the stored fields, advanced in
-    place like the fields themselves. ``work`` = (hist, histb, bank (3 + stages, fields), dpar of a stage (NP, r)). ``lanes``, ``big``: as for
+    place like the fields themselves; slots that the scheme does not read are left as they are. ``work`` = (hist, histb, bank (3 + stages, fields), dpar of a stage (NP, r)). ``lanes``, ``big``: as for
     :func:`linearise`. ``dnodes`` (rows, r): columns of the last ``rows`` numbers of the node states. Returns False where a stage cannot be
     linearised.
     """
     hist, histb, bank, dstage = work
     fields, stages, main = dbank.shape[2], len(c0), len(hist)
     near, far = _halves(tubes, lanes, big)
+    one_step = not np.any(weights[:, Y_BEFORE : RATE_NOW + 1])
     for i in range(fields):
         for slot in range(RATES):
             bank[slot, i] = before[slot, i]
@@ -395,23 +400,11 @@ def step_tangent(tubes, lanes, mesh, c0, weights, par, inputs, found, before, ra
             if not _boundary(near[9], far[9], 0, column, PACK, epsilon, inverse, dx):
                 return False
             _keep(
-                tubes, stored, stage, last, 0, c0[stage], hist, far[4], near[6], far[6], epsilon, dx, column
-            )
+                tubes, stored, stage, last, one_step, 0, c0[stage], hist, far[4], near[6], far[6], epsilon, dx, column
+            )  # fmt: skip
             _keep(
-                tubes,
-                stored,
-                stage,
-                last,
-                main,
-                c0[stage],
-                histb,
-                far[5],
-                near[7],
-                far[7],
-                epsilon,
-                dx,
-                column,
-            )
+                tubes, stored, stage, last, one_step, main, c0[stage], histb, far[5], near[7], far[7], epsilon, dx, column
+            )  # fmt: skip
             if last:
                 _combine(tubes, near[8], far[8], 0, PACK, epsilon, dx, column, dnodes)
     return True

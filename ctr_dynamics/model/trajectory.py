@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 from numba import njit
@@ -20,7 +19,7 @@ from ctr_dynamics.model.lanes import PACK
 from ctr_dynamics.model.mesh import Key, Mesh, fits
 from ctr_dynamics.model.model import Model
 from ctr_dynamics.model.newton import CONVERGED, aligned_zeros, lanes_for
-from ctr_dynamics.model.scheme import RATES, Scheme, make_scheme
+from ctr_dynamics.model.scheme import RATES, Scheme
 from ctr_dynamics.model.simulator import Inputs, Record, Simulator, State, remap_columns
 from ctr_dynamics.model.step import RENEW, extrapolate, remember, step
 from ctr_dynamics.model.tangent import linearise, step_tangent
@@ -280,28 +279,26 @@ def run(
             if hard > PATIENCE:
                 failure = f"step at {k * dt:.4f} s: more than {PATIENCE} steps did not converge at once"
                 break
-            parts = [k * dt, *divided.get(k, ()), (k + 1) * dt]
-            for begin, end in pairwise(parts):
-                mesh, before = state.mesh, state.inputs.beta
-                key = state.key
-                simulator.scheme = scheme if len(parts) == 2 else make_scheme(scheme.name, end - begin)
-                result = simulator.step(
-                    state, begin, lambda t: to_inputs(n, inputs(np.array([t]))[0]), record=columns is not None
-                )
-                sweeps += result.sweeps
-                if not result.ok:
-                    failure = f"step at {begin:.4f} s failed: {result.reason}"
-                    break
-                if columns is not None:
-                    for record in result.records:
-                        if record.key != key:
-                            columns.remap(mesh, before, record.mesh, record.inputs[-1, 2 * n : 3 * n])
-                            key = record.key
-                        if not columns.follow(record, parameters):
-                            failure = f"step at {begin:.4f} s could not be linearised"
-                if failure:
-                    break
-            simulator.scheme = scheme
+            mesh, before = state.mesh, state.inputs.beta
+            key = state.key
+            result = simulator.step(
+                state,
+                k * dt,
+                lambda t: to_inputs(n, inputs(np.array([t]))[0]),
+                record=columns is not None,
+                events=divided.get(k, ()),
+            )
+            sweeps += result.sweeps
+            if not result.ok:
+                failure = f"step at {k * dt:.4f} s failed: {result.reason}"
+                break
+            if columns is not None:
+                for record in result.records:
+                    if record.key != key:
+                        columns.remap(mesh, before, record.mesh, record.inputs[-1, 2 * n : 3 * n])
+                        key = record.key
+                    if not columns.follow(record, parameters):
+                        failure = f"step at {k * dt:.4f} s could not be linearised"
             if failure:
                 break
             if columns is not None and out is not None:

@@ -193,8 +193,11 @@ def simulate(scenario: Scenario, robot: Robot, progress: Progress | None = None)
     state = simulator.rest(at(0.0))
     tips = [state.nodes[-1, :7].copy()]
     failure = ""
+    shift = model.setup.load_shift
+    corners = [t + shift * load.known for load in scenario.loads for t, _ in load.corners()]
     for k in range(steps):
-        result = simulator.step(state, k * dt, at)
+        events = [t for t in corners if k * dt < t < (k + 1) * dt]
+        result = simulator.step(state, k * dt, at, events=events)
         if not result.ok:
             failure = f"step at {k * dt:.4f} s failed: {result.reason}"
             break

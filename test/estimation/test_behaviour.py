@@ -1,6 +1,7 @@
 """What the filter does with masks, outliers, geometry of the tracker, switched-off fusion; and that it repeats itself."""
 
 import copy
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -121,6 +122,19 @@ def test_fusion_can_be_switched_while_running(release):
     difference = [np.linalg.norm(out.tip_position - out.predicted_position) for out in outputs]
     assert max(difference[:230]) < 1e-6
     assert max(difference[240:]) > 0.3e-3
+
+
+def test_steps_are_divided_where_the_known_load_bends(release, plain):
+    """The weight falls off from 1.000 to 1.010 s, within the steps 334 and 337; a load cell's noise divides nothing."""
+    divided = [out.k for out in plain.outputs if out.solver.outcome == "divided at an event"]
+    assert divided == [334, 337]
+    rng = np.random.default_rng(5)
+    early = [m for m in release if m.stamp < 0.9e9]
+    noisy = [
+        m if m.kind != "load" else replace(m, content=(rng.normal(m.content[0], 0.002), *m.content[1:]))
+        for m in early
+    ]
+    assert not any(out.solver.outcome.startswith("divided") for out in play(noisy).outputs)
 
 
 def test_two_runs_are_the_same_bytes(release, plain):

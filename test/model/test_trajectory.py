@@ -216,3 +216,35 @@ def test_steps_are_divided_at_events():
     assert np.abs(divided.columns[:, :3, 0] - expected).max() < 1e-3 * np.abs(expected).max()
     met = follow(DT, (0.102, 0.3))  # events at the ends of steps divide nothing
     np.testing.assert_array_equal(met.tip[:, :3], whole)
+
+
+def test_a_step_is_divided_at_events_and_whole_where_a_part_fails():
+    model = Model(ROBOT, nodes=12)
+    inputs = inputs_of(model)
+
+    def at(t):
+        return to_inputs(model.n, inputs(np.array([t]))[0])
+
+    def follow(scheme, events, at=at):
+        simulator = Simulator(model, make_scheme(scheme, DT), 1e-9, model.parameters)
+        state = simulator.rest(at(0.0))
+        for k in range(33):
+            assert simulator.step(state, k * DT, at).ok
+        result = simulator.step(state, 33 * DT, at, record=True, events=events)
+        assert result.ok
+        return result, state
+
+    cut = (0.102, 0.1)  # in any order; the second stands at a step's end
+    divided, state = follow("sdirk3", cut)
+    assert divided.reason == "divided at an event"
+    assert [r.scheme.dt for r in divided.records] == pytest.approx([0.001, 0.002], abs=1e-12)
+    np.testing.assert_array_equal(divided.records[-1].after, state.fields)
+    assert len(follow("sdirk3", (0.0990001, 0.100, 0.1000001))[0].records) == 2  # too close to divide twice
+    for scheme, events in (("sdirk3", (0.099, 0.102)), ("bdf2", cut)):
+        whole, _ = follow(scheme, events)
+        assert whole.reason == "ok"
+        assert len(whole.records) == 1
+    # one part meets a load that is no number: the step as a whole, whose stages do not, is taken
+    whole, state = follow("sdirk3", cut, lambda t: at(t) if abs(t - 0.1) > 1e-9 else at(np.nan))
+    assert whole.reason == "ok"
+    assert np.isfinite(state.fields).all()
