@@ -126,7 +126,9 @@ def test_steps_are_divided_where_loads_begin_and_end():
         return simulate(Scenario(**content), load_robot("till2020_tissue")).position
 
     fine = tips(0.0005, 0.1)[::6]
-    shifts = [np.abs(tips(0.003, end) - fine).max() for end in (0.1, 0.099, 0.102)]  # the latter two at the step's ends
+    shifts = [
+        np.abs(tips(0.003, end) - fine).max() for end in (0.1, 0.099, 0.102)
+    ]  # the latter two at the step's ends
     assert shifts[0] < 0.2 * min(shifts[1:])
 
 

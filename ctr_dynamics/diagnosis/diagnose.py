@@ -249,7 +249,9 @@ def _decide(
     if best.members:
         note("separability")
         forms_once = [s.candidate for s in distinct(found.screened)]
-        result.at_best = linearise(problem, best.fit.point, forms_once, workers, again=best.fit)
+        result.at_best = found.at_best or linearise(
+            problem, best.fit.point, forms_once, workers, again=best.fit
+        )
         lin = result.at_best or found.linearised
         result.members = [_member(problem, found, best, c, lin) for c in best.members]
     apart = not any(m.rivals or m.separation < FITTED for m in result.members if m.separation is not None)

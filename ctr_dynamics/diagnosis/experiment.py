@@ -6,7 +6,7 @@ quantities that move the model go through the tangent of every step; those of th
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -27,6 +27,7 @@ Point = Mapping[
 ]  # coordinates of quantities that are not at their off-values, by (effect, name)
 NODES = 10  # from plate to tip: the error in space is then far below that in time (numerics.py measures both)
 FRACTION = 1e-3  # of a quantity's unit, for differences of what is cheap to evaluate
+GAP = 0.05  # s between joint states beyond which nothing is known of the motion between them
 AVERAGE_POINTS = np.array([0.04691008, 0.23076534, 0.5, 0.76923466, 0.95308992])
 AVERAGE_WEIGHTS = np.array([0.11846344, 0.23931434, 0.28444444, 0.23931434, 0.11846344])
 _INPUTS = ("gain", "offset", "backlash", "beta_offset", "actuator_delay", "load_shift", "tip_force")
@@ -85,19 +86,15 @@ class Experiment:
                 alpha[:, i] = play(np.ascontiguousarray(alpha[:, i]), setup.backlash[i])
         beta = joints[:, 1 + n : 1 + 2 * n] + setup.beta_offset
         steps = np.diff(t)
-        rates = np.diff(alpha, axis=0) / steps[:, None]
+        turned = smooth(t, alpha)
         slides = np.diff(beta, axis=0) / steps[:, None]
         width = (4 if extended else 3) * n + 6
 
         def rows(times: Floats) -> Floats:
             out = np.zeros((len(times), width))
-            late = times - setup.actuator_delay
+            out[:, :n], out[:, n : 2 * n] = turned(times - setup.actuator_delay)
             for i in range(n):
-                out[:, i] = np.interp(late, t, alpha[:, i])
                 out[:, 2 * n + i] = np.interp(times, t, beta[:, i])
-            interval = np.clip(np.searchsorted(t, late, side="left") - 1, 0, len(steps) - 1)
-            moving = ((late > t[0]) & (late <= t[-1]))[:, None]
-            out[:, n : 2 * n] = np.where(moving, rates[interval], 0.0)
             if len(load):
                 for i in range(6):
                     out[:, 3 * n + i] = np.interp(times - setup.load_shift, load[:, 0], load[:, 1 + i])
@@ -141,8 +138,24 @@ class Experiment:
             setup.block,
             self.inputs(setup, extended),
             self.recording.duration,
+            events=self._events(setup),
             **columns,  # type: ignore[arg-type]
         )
+
+    def _events(self, setup: Setup) -> list[float]:
+        """Times in s at which the load bends sharply.
+
+        A step across such a bend would make the error of the prediction depend on where in the step it lies, and the misfit a rough function of
+        every delay.
+        """
+        load = self.recording.load
+        if len(load) < 2:
+            return []
+        slopes = np.diff(load[:, 1:], axis=0) / np.diff(load[:, :1], axis=0)
+        changes = np.diff(slopes, axis=0, prepend=np.zeros((1, 6)), append=np.zeros((1, 6)))
+        sharp = np.any(np.abs(changes) * self.scheme.dt > self._models[False].load_kink, axis=1)
+        shifted: list[float] = (load[sharp, 0] + setup.load_shift).tolist()
+        return shifted
 
     def residual(self, prediction: Prediction) -> Floats:
         """(s, 6) reading minus prediction: position in m in the tracker's axes, rotation vector in rad in the sensor's axes."""
@@ -266,6 +279,33 @@ def at_times(values: Floats, t: Floats, times: Floats) -> Floats:
     for k, w in enumerate(weights):
         out += w * values[np.minimum(i + k - 1, last)]
     return out
+
+
+def smooth(t: Floats, values: Floats) -> Callable[[Floats], tuple[Floats, Floats]]:
+    """Values and rates at any times (k,) of samples (s, n) at ``t`` (s,): cubic between samples with the slope of the two neighbours at each (Catmull
+    and Rom), a straight line across gaps, held outside.
+
+    Encoders scatter. A straight line from sample to sample has a bend at each, which steps in time of much the same length meet or miss; the
+    misfit would be a rough function of every delay.
+    """
+    h = np.diff(t)[:, None]
+    secants = np.diff(values, axis=0) / h
+    slopes = np.vstack(
+        [secants[:1], (h[:-1] * secants[1:] + h[1:] * secants[:-1]) / (h[:-1] + h[1:]), secants[-1:]]
+    )
+    gap = h > GAP
+    first, last = (np.where(gap, secants, s) for s in (slopes[:-1], slopes[1:]))
+
+    def at(times: Floats) -> tuple[Floats, Floats]:
+        i = np.clip(np.searchsorted(t, times, side="left") - 1, 0, len(h) - 1)
+        x = np.clip((times - t[i]) / h[i, 0], 0.0, 1.0)[:, None]
+        a, b, d = first[i] - secants[i], last[i] - secants[i], secants[i]
+        value = values[i] + h[i] * x * (d + (1.0 - x) * ((1.0 - x) * a - x * b))
+        rate = d + (1.0 - x) * (1.0 - 3.0 * x) * a - x * (2.0 - 3.0 * x) * b
+        inside = (times > t[0]) & (times <= t[-1])
+        return value, np.where(inside[:, None], rate, 0.0)
+
+    return at
 
 
 def _window(setup: Setup) -> list[tuple[float, float]]:

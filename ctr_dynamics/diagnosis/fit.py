@@ -25,6 +25,7 @@ from .recording import Recording
 Floats = NDArray[np.float64]
 Key = tuple[str, str]
 INSIDE = 2.9  # tolerances: an error beyond is not one of tolerance, and needs a cause
+REACH = 4.0  # tolerances: no fit takes a nuisance farther at first. The misfit of a large cause would carry them all away, and hide it
 WIDENING = 1.5  # of posterior deviations: errors of tuning cases were larger than stated by that much
 DIFFERENCE = 0.02  # of the scale, for columns by differences
 # how many times over a fit may gain what its columns promise, at its first steps and later: beyond, it cannot reach its limit
@@ -90,6 +91,7 @@ class Problem:
         experiments, whiteners: one for each recording.
         nuisances: quantities with a tolerance. numerics: (m, d) whitened directions of the solver's own error.
         offset: (m,) whitened correction of the residual towards the finer solution.
+        reach: tolerances that fits take a nuisance at most.
     """
 
     robot: Robot
@@ -98,6 +100,7 @@ class Problem:
     nuisances: tuple[Quantity, ...]
     numerics: Floats
     offset: Floats
+    reach: float = REACH
 
     @property
     def size(self) -> int:
@@ -271,9 +274,11 @@ class _Descent:
         self.problem, self.causes = problem, tuple(causes)
         self.active, self.variance = variances(problem.nuisances, causes)
         self.off = np.array([q.off for q in self.active])
-        self.low = np.array([q.low for q in self.active])
-        self.high = np.array([q.high for q in self.active])
-        self.values = np.array([start.get(q.key, q.off) for q in self.active])
+        free = {q.key for q in causes}
+        reach = np.array([math.inf if q.key in free else problem.reach * q.tolerance for q in self.active])
+        self.low = np.maximum([q.low for q in self.active], self.off - reach)
+        self.high = np.minimum([q.high for q in self.active], self.off + reach)
+        self.values = np.clip([start.get(q.key, q.off) for q in self.active], self.low, self.high)
         self.residual, self.columns = np.zeros(0), np.zeros((0, 0))
         self.cost, self.travelled, self.exact = math.inf, 0.0, False
         self.unseen: list[int] = []

@@ -18,21 +18,27 @@ from numpy.typing import NDArray
 from ctr_dynamics.effects import EFFECTS, quantities
 
 from .candidates import Candidate, causes_of, log_prior
-from .fit import Fit, Key, Local, Problem, fit
-from .signatures import Linearisation, Scored, linearise, screen
+from .fit import Fit, Key, Local, Problem, fit, posterior, variances
+from .signatures import Linearisation, Scored, linearise, screen, separation
 
 Floats = NDArray[np.float64]
 TEMPERATURE = 1.6  # of the log evidence: a judgement against overconfidence, not fitted to cases
 SHORTLIST = 8  # candidates that are fitted
 BATCH = 2  # fits between which the best is looked at; fixed, so that the outcome does not depend on the number of workers
 SECOND = 4  # second causes that are fitted beside a first
+MUCH = 4.0  # deviations of the noise that an explanation may leave before more is tried
 HOPELESS = 0.3  # of the misfit: two causes that leave more are not made right by a third
 SECOND_EVIDENCE = 5.0  # log evidence that a further cause must add
+FAR = 80.0  # deviations of the noise in the misfit from which large sizes of a cause are looked at too
 MIN_SCREEN = 1.0  # log evidence by the linear estimate below which a candidate is not worth a fit
 CONTENDERS, CONTEND = (
     3,
     6.0,
 )  # explanations that are finished with exact columns, and the log evidence to the best within which they may be
+STAND_IN, STAND_INS = (
+    12.0,
+    3,
+)  # separation from the best explanation's cause within which another is fitted in its place, and how many
 CONTENDER = 8.0  # deviations by which the cost may exceed the best one's: beyond, a fit is given up
 
 
@@ -53,7 +59,7 @@ class Explanation:
     @property
     def keys(self) -> frozenset[Key]:
         """Free parameters of its causes."""
-        return frozenset().union(*(c.keys for c in self.members)) if self.members else frozenset()
+        return keys_of(self.members)
 
 
 @dataclass
@@ -63,6 +69,7 @@ class Search:
     Attributes:
         explanations: all fitted, likeliest first, with ``score``; the clean one is among them.
         probabilities: of each. clean: the recalibrated fit. linearised: at the recalibrated point. screened: linear gains there.
+        at_best: signatures at the likeliest explanation; None where there was no need of them.
     """
 
     explanations: list[Explanation]
@@ -71,6 +78,7 @@ class Search:
     linearised: Linearisation
     screened: list[Scored]
     pool: list[Candidate]
+    at_best: Linearisation | None = None
 
     @property
     def best(self) -> Explanation:
@@ -81,10 +89,32 @@ class Search:
 def search(
     problem: Problem, pool: list[Candidate], clean: Fit, note: Callable[[str], None], workers: int = 2
 ) -> Search | None:
-    """Find the explanations that deserve probability, from the recalibrated fit ``clean`` on."""
+    """Find the explanations that deserve probability, from the recalibrated fit ``clean`` on.
+
+    Where nothing explains the data, all is tried again with nuisances that may go as far as they like: on the way to several causes they stand
+    in for those that are not there yet.
+    """
+    found = _search(problem, pool, clean, note, workers)
+    if found is None or _leftover(problem, found.best.fit) <= MUCH:
+        return found
+    note("once more, with nuisances beyond their tolerances")
+    free = replace(problem, reach=math.inf)
+    far = fit(free, (), clean.point, polish=False)
+    other = None if far is None else _search(free, pool, far, note, workers)
+    if other is None:
+        return found
+    both = found.explanations + [e for e in other.explanations if e.members]
+    _score(both, pool)
+    at_best = next((s.at_best for s in (found, other) if s.best is both[0]), None)
+    return replace(found, explanations=both, probabilities=_probabilities(both, problem), at_best=at_best)
+
+
+def _search(
+    problem: Problem, pool: list[Candidate], clean: Fit, note: Callable[[str], None], workers: int
+) -> Search | None:
     base = Explanation((), clean)
     note("signatures of all candidates")
-    lin = linearise(problem, clean.point, pool, workers)
+    lin = linearise(problem, clean.point, pool, workers, far=_leftover(problem, clean) > FAR)
     if lin is None:
         return None
     screened = screen(problem, lin, clean, (), pool)
@@ -101,6 +131,32 @@ def search(
         _score(found, pool)
         found += _fewer(problem, found, note, workers)
         _score(found, pool)
+    _finish_contenders(problem, found, pool, clean)
+    at_best = None
+    for _ in range(2):  # a stand-in may take the first place
+        best = found[0]
+        if not best.members or best.fit.cost > _hopeless(problem, clean):
+            break
+        note(f"what could stand in for {', '.join(best.effects)}")
+        at_best = linearise(
+            problem, best.fit.point, [s.candidate for s in distinct(screened)], workers, again=best.fit
+        )
+        new = [] if at_best is None else _stand_ins(problem, found, at_best, workers)
+        if not new:
+            break
+        found += new
+        _score(found, pool)
+        _finish_contenders(problem, found, pool, clean)
+        if found[0] is best:
+            break
+        at_best = None
+    return Search(found, _probabilities(found, problem), base, lin, screened, pool, at_best)
+
+
+def _finish_contenders(
+    problem: Problem, found: list[Explanation], pool: Sequence[Candidate], clean: Fit
+) -> None:
+    """Exact columns for the explanations that may be the likeliest."""
     for _ in range(CONTENDERS):  # finishing one may put another first
         near = [e for e in found if e.members and not e.finished and e.fit.cost < _limit(problem, found)]
         near = [
@@ -110,7 +166,78 @@ def search(
             break
         finish(problem, near[0])
         _score(found, pool)
-    return Search(found, _probabilities(found, problem), base, lin, screened, pool)
+
+
+def _stand_ins(
+    problem: Problem, found: Sequence[Explanation], lin: Linearisation, workers: int
+) -> list[Explanation]:
+    """The best explanation with each of its causes replaced by those that look much like it there, where nobody has tried.
+
+    Screening looks from the re-calibrated model; a large effect looks different from there, and its place may have been taken by a likeness.
+    """
+    best = found[0]
+    tried = {e.keys for e in found}
+    jobs = []
+    for member in best.members:
+        rest = tuple(m for m in best.members if m is not member)
+        taken = {m.effect for m in best.members}
+        near = sorted(
+            (
+                (separation(problem, best.fit, member, rival, lin), i, rival)
+                for i, rival in enumerate(lin.signatures)
+                if rival.effect not in taken
+            ),
+            key=lambda item: item[:2],
+        )
+        wanted = [
+            (*rest, rival) for d, _, rival in near if d < STAND_IN and keys_of((*rest, rival)) not in tried
+        ][:STAND_INS]
+        tried.update(keys_of(members) for members in wanted)
+        jobs += [(members, member) for members in wanted]
+    limit = _limit(problem, found)
+    fits = Parallel(workers, prefer="threads")(
+        delayed(_replaced)(problem, best, members, gone, lin, limit) for members, gone in jobs
+    )
+    return [e for e in fits if e is not None]
+
+
+def _replaced(
+    problem: Problem,
+    best: Explanation,
+    members: tuple[Candidate, ...],
+    gone: Candidate,
+    lin: Linearisation,
+    limit: float,
+) -> Explanation | None:
+    """Fit of ``members`` from where the columns of ``lin`` say that the newest of them does the work of the ``gone`` one."""
+    own, causes = with_nuisances(problem, members), causes_of(members)
+    active, variance = variances(own.nuisances, causes)
+    known = {**lin.columns, **lin.own(members[-1]), **best.fit.by_key}
+    point = {key: value for key, value in best.fit.point.items() if key not in gone.keys}
+    departure = np.array([point.get(q.key, q.off) - q.off for q in active])
+    without = sum(
+        best.fit.columns[:, i] * (best.fit.values[i] - q.off)
+        for i, q in enumerate(best.fit.active)
+        if q.key in gone.keys
+    )
+    nothing = np.zeros(len(best.fit.residual))
+    columns = np.stack([known.get(q.key, nothing) for q in active], axis=1)
+    wanted, _, _ = posterior(best.fit.residual + without, columns, departure, variance, problem.numerics)
+    start = dict(members[-1].start)
+    start.update(
+        {
+            q.key: float(np.clip(q.off + d, q.low, q.high))
+            for q, d in zip(active, wanted, strict=True)
+            if q.key not in start
+        }
+    )
+    result = fit(own, causes, start, limit=limit)
+    return None if result is None else Explanation(members, result)
+
+
+def keys_of(members: Sequence[Candidate]) -> frozenset[Key]:
+    """Free parameters of a set of candidates."""
+    return frozenset().union(*(c.keys for c in members)) if members else frozenset()
 
 
 @dataclass(frozen=True)
@@ -171,7 +298,7 @@ def _further(
     hopeless = _hopeless(problem, clean)
     tried: set[frozenset[str]] = set()
     leaders = [e for e in found if e.members][:2]
-    much = _leftover(problem, leaders[0].fit) > 4.0
+    much = _leftover(problem, leaders[0].fit) > MUCH
     leaders = [e for e in leaders if e.score > leaders[0].score - (20.0 if much else 3.0)]
     for _ in range(2):
         new: list[Explanation] = []

@@ -68,10 +68,12 @@ def linearise(
     workers: int,
     *,
     again: Fit | None = None,
+    far: bool = False,
 ) -> Linearisation | None:
     """Columns of nuisances and all candidates at ``point``; those without a derivative by finite probes.
 
     Args:
+        far: whether to probe those at large sizes whose derivative says little of these.
         again: the fit whose ``point`` it is, when signatures are only compared with it: its columns serve, and one probe of each candidate.
     Returns:
         None where the model cannot be simulated at ``point``.
@@ -113,6 +115,7 @@ def linearise(
         for c in rough
         for size in EFFECTS[c.effect].probes[: 1 if again else None]
     ]
+    probes += [(c, size, back) for back in places for c in pool if far for size in EFFECTS[c.effect].far]
     jobs = [
         delayed(columns)(at, wanted, first)
     ]  # together: what has no room in one simulation has it in another
@@ -139,7 +142,7 @@ def linearise(
         if new is not None and reference is not None:
             result.probes.setdefault(c, []).append(Probe(shift, residual + new - reference))
     for c in pool:
-        if c in result.probes:
+        if c in rough and c in result.probes:
             (q,), first_probe = c.quantities, result.probes[c][0]
             secant = (residual - first_probe.residual) / (first_probe.shift[q.key] - q.off)
             result.signatures[c] = secant[:, None]

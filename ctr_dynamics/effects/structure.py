@@ -52,6 +52,7 @@ register(
         _youngs,
         "A tube is stiffer or softer than the robot file says.",
         "Till et al. (2020), (16): E I",
+        far=(-1.5, 1.5),
     )
 )
 register(
@@ -130,6 +131,7 @@ register(
         _added,
         "The payload is heavier or lighter, as by a point mass at the tip.",
         "Till et al. (2020), (21)",
+        far=(-1.5, 1.5),
     )
 )
 
@@ -156,6 +158,7 @@ register(
         _inertia,
         "The payload resists rotation more or less than its mass says.",
         "Till et al. (2020), (21): H",
+        far=(-0.8, 0.8),
     )
 )
 

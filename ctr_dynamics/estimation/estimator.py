@@ -50,7 +50,6 @@ MAX_FAILURES = 10  # steps in a row that may fail before the model starts anew a
 SAME_COURSE = (
     8  # steps: joints no later than that move the robot so little that the covariance need not be moved again
 )
-LOAD_BEND = 0.02  # of the force or moment that bends the robot: a change of the load's slope that adds more within a step divides the step
 MAX_BEHIND = 1000  # steps to catch up at once; beyond, the model starts anew
 
 
@@ -120,8 +119,6 @@ class Estimator:
             for i in range(self.model.n)
             if f"encoder_offset.tube{i + 1}" in self.fusion.uncertainty.names
         ]
-        unit = self.model.scale
-        self._load_bend = LOAD_BEND / dt * np.array([*unit[:3], *unit[3:4], *unit[3:4], *unit[3:4]])
         self._load_delay_ns = round(self.setup.load_shift * 1e9)
         # share of the rates of beta that the model's own velocities hold already
         self._inserted = (
@@ -567,7 +564,7 @@ class Estimator:
         if len(self._load.stamps) < 2:
             return []
         end_ns = self.t0_ns + k * DT_NS
-        bends = self._load.bends(end_ns - DT_NS, end_ns, self._load_bend)
+        bends = self._load.bends(end_ns - DT_NS, end_ns, self.model.load_kink / (DT_NS * 1e-9))
         return [(stamp - self.t0_ns) * 1e-9 for stamp in bends]
 
     def _start_filter(self, k: int) -> None:

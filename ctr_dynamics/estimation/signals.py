@@ -67,7 +67,6 @@ class Signal:
             return values[-1] + rate * (extrapolate_ns * 1e-9), np.zeros(self.size)
         return values[-1] + rate * (ahead * 1e-9), rate
 
-
     def bends(self, after_ns: float, until_ns: float, least: Floats) -> list[int]:
         """Stamps between two times at which the rate changes by more than ``least`` (size,), 1/s, in some component."""
         stamps, values = self.stamps, self.values

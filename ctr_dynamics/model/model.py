@@ -21,6 +21,7 @@ from ctr_dynamics.model.newton import buffers, lanes_for
 from ctr_dynamics.model.workspace import workspace_rows
 from ctr_dynamics.robot import Robot
 
+LOAD_KINK = 0.02  # of the force and moment that bend the robot
 PLAY_MOMENT = 0.01  # N m at which 70 % of a tube's play is taken up
 
 
@@ -37,6 +38,7 @@ class Model:
         setup: what a prediction needs besides, extensions included. parameters: its block.
         scale: (5 + N,) N and N m, unit of each shooting residual; step: (5 + N,) perturbation of each unknown for Newton's
             method; tangent_step: a smaller one, for tangents.
+        load_kink: (6,) N and N m: a change of a load's slope that adds more than this within a step is worth dividing the step.
         nodes: requested nodes from plate to tip.
     """
 
@@ -88,6 +90,7 @@ class Model:
         stiffness = robot.tubes[0].bending_stiffness
         force, moment = stiffness / reach**2, stiffness / reach
         self.scale = np.array([force] * 3 + [moment] * (2 + n))
+        self.load_kink = LOAD_KINK * np.array([force] * 3 + [moment] * 3)
         self.step = np.array([moment] * n + [force] * 3 + [moment] * 2) * 1e-6
         self.tangent_step = 0.1 * self.step
         self._meshes: dict[Key, Mesh] = {}

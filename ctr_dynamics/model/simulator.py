@@ -38,7 +38,9 @@ class Inputs:
     torque: np.ndarray = field(default_factory=lambda: np.zeros(3))
 
 
-SHORTEST_PART = 0.02  # of a step: events closer than that to its ends, or to one another, are not worth a part of their own
+# of a step: events closer than that to its ends, or to one another, do not divide it. They matter little there, and the shorter the part, the
+# worse is the shooting's condition
+SHORTEST_PART = 0.2
 
 InputsAt = Callable[[float], Inputs]
 """Inputs at a time in s. One that also has ``stages(times)``, which returns what :func:`stage_inputs` does, is asked for all stages at once."""

@@ -350,9 +350,9 @@ def step_tangent(tubes, lanes, mesh, c0, weights, par, inputs, found, before, ra
     ``before`` (slots, fields): stored fields before the step; ``rates`` (stages, fields): the stages' rates; ``found`` (stages, m): their
     unknowns; ``inputs`` as in :func:`ctr_dynamics.model.step.step`, ``dinputs`` (stages, inputs, r) their columns, added to those of the
     parameters ``dpar`` (NP, r); r is a multiple of 8. ``dbank`` (r / 8, 3 + stages, fields, 8): columns of the stored fields, advanced in
-    place like the fields themselves; slots that the scheme does not read are left as they are. ``work`` = (hist, histb, bank (3 + stages, fields), dpar of a stage (NP, r)). ``lanes``, ``big``: as for
-    :func:`linearise`. ``dnodes`` (rows, r): columns of the last ``rows`` numbers of the node states. Returns False where a stage cannot be
-    linearised.
+    place like the fields themselves; slots that the scheme does not read are left as they are. ``work`` = (hist, histb, bank
+    (3 + stages, fields), dpar of a stage (NP, r)). ``lanes``, ``big``: as for :func:`linearise`. ``dnodes`` (rows, r): columns of the last
+    ``rows`` numbers of the node states. Returns False where a stage cannot be linearised.
     """
     hist, histb, bank, dstage = work
     fields, stages, main = dbank.shape[2], len(c0), len(hist)
