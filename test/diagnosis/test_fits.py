@@ -1,12 +1,17 @@
 """Predictions, derivatives and fits on one second of a motion whose truth is known."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from ctr_dynamics.diagnosis import numerics
+from ctr_dynamics.diagnosis.candidates import candidates, causes_of
 from ctr_dynamics.diagnosis.experiment import NODES, Experiment
-from ctr_dynamics.diagnosis.fit import fit, make_problem
+from ctr_dynamics.diagnosis.fit import REACH, fit, make_problem
 from ctr_dynamics.diagnosis.recording import Recording
+from ctr_dynamics.diagnosis.search import Explanation, _stand_ins
+from ctr_dynamics.diagnosis.signatures import linearise, screen
 from ctr_dynamics.effects import quantities
 from ctr_dynamics.robot import load_robot
 
@@ -80,3 +85,84 @@ def test_more_nodes_where_the_data_can_see_them(recording, robot, monkeypatch):
     assert problem.experiments[0].nodes == numerics.MOST_NODES
     assert finer["space_error_m"] < 0.3 * errors["space_error_m"]
     assert finer["time_error_m"] == pytest.approx(errors["time_error_m"], rel=0.2)
+
+
+def test_the_misfit_is_a_smooth_function_of_delays(robot, known):
+    """Drives and load later by as much as the tracker is earlier is the same experiment, wherever in the steps their samples fall."""
+    rng = np.random.default_rng(2)
+    t = np.arange(101) / 100.0
+    turn = 0.3 * (1.0 - np.cos(np.pi * np.clip(t / 0.3, 0.0, 1.0)))[:, None] + 5e-4 * rng.standard_normal((101, 2))
+    joints = np.column_stack([t, robot.rest.alpha.value + turn, np.tile(robot.rest.beta.value, (len(t), 1))])
+    load = np.zeros((4, 7))
+    load[:, 0], load[:, 2] = (0.0, 0.5, 0.51, 1.0), (-0.3, -0.3, 0.0, 0.0)
+    stamps = np.arange(2, 39) / 40.0
+    nothing = np.zeros((len(stamps), 3))
+    recording = Recording(
+        "", "", {}, joints, load, stamps, nothing, np.tile([1.0, 0, 0, 0], (len(stamps), 1)), ()
+    )
+    experiment = Experiment(recording, robot)
+
+    def seen(drives, tracker):
+        later = {("actuator_latency", "delay_s"): drives, ("load_time", "delay_s"): drives}
+        return experiment.predict({**later, ("tracker_latency", "delay_s"): tracker}).position
+
+    base, moved = seen(0.0, 0.004), seen(0.0, 0.0)
+    shifts = [seen(d, 0.004 - d) for d in (0.0003, 0.0007, 0.0013, 0.0019, 0.0026, 0.004)]
+    assert max(np.abs(shift - base).max() for shift in shifts) < 0.02 * np.abs(moved - base).max()
+
+
+def test_nuisances_stay_near_their_tolerances_unless_they_may_go_far(recording, robot, known):
+    nuisance = known["registration_translation", "tx_m"]
+    there = replace(recording, position=recording.position + [0.002, 0.0, 0.0])  # ten tolerances
+    problem = make_problem(robot, [there], [nuisance], np.ones(6, bool))
+    near, far = fit(problem, (), {}), fit(replace(problem, reach=np.inf), (), {})
+    cause = fit(problem, [nuisance], {})
+    assert near is not None
+    assert far is not None
+    assert cause is not None
+    assert near.values[0] == pytest.approx(REACH * nuisance.tolerance)
+    assert 7 < far.values[0] / nuisance.tolerance < 11
+    assert 7 < cause.values[0] / nuisance.tolerance < 11
+
+
+def test_large_sizes_are_looked_at_where_the_misfit_is_large(recording, robot, known):
+    heavy = ("payload_inertia", "scale")
+    seen = Experiment(recording, robot).predict({heavy: 0.5})
+    there = replace(recording, position=seen.position, quaternion=seen.quaternion)
+    problem = make_problem(robot, [there], [known["encoder_offset", "tube1.offset_rad"]], np.ones(6, bool))
+    pool = [
+        c
+        for c in candidates(list(known.values()), there.position)
+        if c.effect in ("payload_inertia", "density")
+    ]
+    clean = fit(problem, (), {})
+    near, far = (linearise(problem, {}, pool, 1, far=far) for far in (False, True))
+    assert clean is not None
+    assert near is not None
+    assert far is not None
+    assert not near.probes
+    (inertia,) = [c for c in pool if c.effect == "payload_inertia"]
+    assert [p.shift[heavy] for p in far.probes[inertia]] == pytest.approx([0.6, 1.4])
+    np.testing.assert_array_equal(near.signatures[inertia], far.signatures[inertia])
+    best = screen(problem, far, clean, (), pool)[0]
+    assert best.candidate is inertia
+
+
+def test_what_looks_like_a_cause_is_fitted_in_its_place(recording, robot, known):
+    nuisances = [known["encoder_offset", "tube1.offset_rad"], known["registration_translation", "ty_m"]]
+    problem = make_problem(robot, [recording], nuisances, np.ones(6, bool))
+    pool = [
+        c
+        for c in candidates(list(known.values()), recording.position)
+        if c.effect in ("payload_mass", "density")
+    ]
+    other = next(c for c in pool if c.effect == "density")
+    wrong = fit(problem, causes_of([other]), {})
+    assert wrong is not None
+    found = [Explanation((other,), wrong)]
+    lin = linearise(problem, wrong.point, pool, 1, again=wrong)
+    assert lin is not None
+    new = _stand_ins(problem, found, lin, 1)
+    (right,) = [e for e in new if e.effects == ("payload_mass",)]
+    assert right.fit.cost < wrong.cost - 1.0
+    assert not [e for e in _stand_ins(problem, found + new, lin, 1) if e.effects == ("payload_mass",)]

@@ -8,7 +8,7 @@ import pytest
 from ctr_dynamics.cli.main import spread
 from ctr_dynamics.diagnosis.candidates import candidates
 from ctr_dynamics.diagnosis.checks import block_bootstrap
-from ctr_dynamics.diagnosis.experiment import at_times, play, product, rotate, to_vectors
+from ctr_dynamics.diagnosis.experiment import at_times, play, product, rotate, smooth, to_vectors
 from ctr_dynamics.diagnosis.fit import posterior
 from ctr_dynamics.diagnosis.noise import Whitener
 from ctr_dynamics.effects import EFFECTS, quantities
@@ -74,6 +74,26 @@ def test_interpolation_is_exact_for_cubics_and_held_outside():
     at = np.array([0.0, 0.0041, 0.02, 0.0559])
     np.testing.assert_allclose(at_times(values, t, at), np.stack([at**3 - at, 2 * at**2], axis=1), atol=1e-14)
     np.testing.assert_allclose(at_times(values, t, np.array([9.0])), values[-1:], atol=1e-14)
+
+
+def test_joints_are_smooth_between_samples_straight_across_gaps_and_held_outside():
+    t = np.concatenate([0.01 * np.arange(6), 0.2 + 0.01 * np.arange(4)])
+    values = np.stack([3.0 * t**2 - t, np.cos(40.0 * t)], axis=1)
+    at = smooth(t, values)
+    np.testing.assert_allclose(at(t)[0], values, atol=1e-14)
+    inner = np.linspace(0.0101, 0.0399, 50)
+    np.testing.assert_allclose(at(inner)[0][:, 0], 3.0 * inner**2 - inner, atol=1e-14)  # parabolas exactly
+    times, h = np.linspace(0.001, 0.0489, 400), 1e-7
+    numbers = (at(times + h)[0] - at(times - h)[0]) / (2 * h)
+    np.testing.assert_allclose(at(times)[1], numbers, atol=2e-3)
+    assert (
+        np.abs(np.diff(at(times)[1], axis=0)).max() < 2.0 * 40.0**2 * np.diff(times).max()
+    )  # no jump at a sample
+    gap = np.array([0.08, 0.11, 0.14])
+    assert np.ptp(at(gap)[1], axis=0).max() < 1e-12
+    value, rate = at(np.array([-1.0, 0.0, 1.0]))
+    np.testing.assert_array_equal(value, values[[0, 0, -1]])
+    assert not rate.any()
 
 
 def test_rotations_by_rows():
