@@ -346,11 +346,11 @@ class Fusion:
 
     def tip_estimate(self) -> TipEstimate:
         """Fused tip now."""
-        i = (self.tips.count - 1) % self.tips.size
+        tip = self.tips.last
         pose, covariance = np.empty(7), np.empty((12, 12))
         finite = registered_rows(
-            self.tips.means[i],
-            self.tips.columns[i],
+            tip.mean,
+            tip.columns,
             self.tracker.rotation,
             self.tracker.lever,
             self.bias,
@@ -358,7 +358,7 @@ class Fusion:
             pose,
             covariance,
         )
-        return TipEstimate(pose[:3], pose[3:], self.tips.means[i, 7:13].copy(), covariance, finite)
+        return TipEstimate(pose[:3], pose[3:], tip.mean[7:13].copy(), covariance, finite)
 
     # -- roll-back --
 
@@ -371,16 +371,21 @@ class Fusion:
 
     def restore(self, snapshot: tuple) -> None:
         """Return to a snapshot."""
-        theta, bias, pi, self.unreduced, self.force_sigma, course, columns, tips = snapshot
+        self._restore(snapshot)
+        self.tips.restore(snapshot[-1])
+
+    def _restore(self, snapshot: tuple) -> None:
+        """All but the tips."""
+        theta, bias, pi, self.unreduced, self.force_sigma, course, columns, _ = snapshot
         self._refused, self._skipped, self._followed = course
         self.theta, self.bias, self.pi = theta.copy(), bias.copy(), pi.copy()
         self.columns.restore(columns)
-        self.tips.restore(tips)
         self._apply_theta()
 
     def follow(self, snapshot: tuple, state: State) -> None:
         """After a step that was taken again with slightly other inputs: the covariance as it was after that step in ``snapshot``, around the
         tips of the steps taken now. Good while no reading has been fused since the first of them."""
-        means = self.tips.means
-        self.restore(snapshot)
-        self.tips.replace_means(means, state.nodes[-1], float(state.inputs.beta_rate[0]))
+        self._restore(snapshot)
+        self.tips.follow(
+            snapshot[-1], state.nodes[-1], float(state.inputs.beta_rate[0]) * (1.0 - self.inserted)
+        )

@@ -44,7 +44,13 @@ class Tip:
 
 
 class TipWindow:
-    """The tips of the last steps with their columns, so that a late sample is compared with the tip of its own time."""
+    """The tips of the last steps with their columns, so that a late sample is compared with the tip of its own time.
+
+    Rows lie one after the other in arrays with room for more, so that a snapshot holds references and not copies: later steps write behind what
+    it sees. Where room ends, the window moves to new arrays.
+    """
+
+    MORE = 64  # rows of room
 
     def __init__(self, steps: int) -> None:
         self.size = steps
@@ -52,78 +58,92 @@ class TipWindow:
 
     def clear(self, columns: int) -> None:
         """Forget all tips; further ones have ``columns`` columns."""
-        self.count = 0
-        self.stamps = np.zeros(self.size)
-        self.means = np.zeros((self.size, 13))  # position, quaternion, velocity, rate
-        self.columns = np.zeros((self.size, 12, columns))
+        self.end = 0
+        self._rooms(columns)
+
+    def _rooms(self, columns: int) -> None:
+        room = self.size + self.MORE
+        self.stamps = np.zeros(room)
+        self.means = np.zeros((room, 13))  # position, quaternion, velocity, rate
+        self.columns = np.zeros((room, 12, columns))
+
+    @property
+    def begin(self) -> int:
+        """The oldest row."""
+        return max(0, self.end - self.size)
 
     def append(self, stamp: float, node: Floats, dnode: Floats, insertion_rate: float) -> None:
         """Add the tip of the last node's state (S,) with columns (S, r); the oldest goes when the window is full. Rate d beta_1 / dt in m/s."""
-        i = self.count % self.size
+        if self.end == len(self.stamps):
+            keep = slice(self.end - self.size, self.end)
+            old = self.stamps[keep], self.means[keep], self.columns[keep]
+            self._rooms(self.columns.shape[2])
+            self.end = self.size
+            self.stamps[: self.end], self.means[: self.end], self.columns[: self.end] = old
+        i = self.end
         self.stamps[i] = stamp
         tip_rows(node, dnode, insertion_rate, self.means[i], self.columns[i])
-        self.count += 1
+        self.end += 1
 
     @property
     def last(self) -> Tip:
         """The newest tip."""
-        i = (self.count - 1) % self.size
+        i = self.end - 1
         return Tip(self.stamps[i], self.means[i], self.columns[i])
 
     def at(self, time: float, dt: float, columns: bool = True) -> Tip | None:
         """Tip at ``time`` (s), at most one step ``dt`` ahead of the newest, if asked for with its columns; None outside the window."""
-        if not self.count:
+        if not self.end:
             return None
-        first = max(0, self.count - self.size)
-        start = self.stamps[first % self.size]
-        if time < start - 1e-6 or time > self.stamps[(self.count - 1) % self.size] + dt:
+        begin = self.begin
+        start = self.stamps[begin]
+        if time < start - 1e-6 or time > self.stamps[self.end - 1] + dt:
             return None
-        if self.count - first == 1:
+        if self.end - begin == 1:
             return self.last
-        i = min(max(int((time - start) / dt), 0), self.count - first - 2) + first
-        while (
-            i > first and self.stamps[i % self.size] > time
-        ):  # steps that failed are missing from the window
+        i = min(max(int((time - start) / dt), 0), self.end - begin - 2) + begin
+        while i > begin and self.stamps[i] > time:  # steps that failed are missing from the window
             i -= 1
-        a, b = i % self.size, (i + 1) % self.size
-        step = self.stamps[b] - self.stamps[a]
+        step = self.stamps[i + 1] - self.stamps[i]
         tip = Tip(time, np.empty(13), np.empty((12, self.columns.shape[2] if columns else 0)))
         tip_between(
-            self.means[a], self.means[b], self.columns[a], self.columns[b], (time - self.stamps[a]) / step, step, tip.mean, tip.columns
+            self.means[i], self.means[i + 1], self.columns[i], self.columns[i + 1], (time - self.stamps[i]) / step, step, tip.mean, tip.columns
         )  # fmt: skip
         return tip
 
     def interpolate(self) -> None:
         """Give the tip before the newest the mean of its neighbours' columns."""
-        if self.count > 2:
-            before, at, after = ((self.count - back) % self.size for back in (3, 2, 1))
-            self.columns[at] = 0.5 * (self.columns[before] + self.columns[after])
+        if self.end > 2:
+            self.columns[self.end - 2] = 0.5 * (self.columns[self.end - 3] + self.columns[self.end - 1])
 
     def transform(self, T: Floats) -> None:
         """Replace all columns V by V T; columns that have been appended since do not move the past."""
-        size, rows, r = self.columns.shape
-        self.columns = (self.columns.reshape(size * rows, r) @ T[:r]).reshape(size, rows, -1)
+        old = self.columns[self.begin : self.end]
+        _, rows, r = old.shape
+        self.columns = np.zeros((len(self.stamps), rows, T.shape[1]))
+        self.columns[self.begin : self.end] = (old.reshape(-1, r) @ T[:r]).reshape(len(old), rows, T.shape[1])
 
     def shift(self, a: Floats) -> None:
         """Move every kept tip by the columns times ``a`` (r,)."""
-        shift_tips(self.columns, a, self.means)
-
-    def replace_means(self, means: Floats, node: Floats, insertion_rate: float) -> None:
-        """Put ``means`` (size, 13) in place of the kept tips, and the last node's state (S,) in that of the newest; columns stay."""
-        self.means = means
-        tip_rows(
-            node,
-            np.zeros((len(node), 1)),
-            insertion_rate,
-            means[(self.count - 1) % self.size],
-            np.empty((12, 1)),
-        )
+        shift_tips(self.columns[self.begin : self.end], a, self.means[self.begin : self.end])
 
     def snapshot(self) -> tuple:
-        """What :meth:`restore` needs."""
-        return self.count, self.stamps.copy(), self.means.copy(), self.columns.copy()
+        """What :meth:`restore` needs. The last two rows of columns may change yet (:meth:`interpolate`), the means with every correction."""
+        recent = self.columns[max(0, self.end - 2) : self.end].copy()
+        return self.end, self.stamps, self.means[self.begin : self.end].copy(), self.columns, recent
 
     def restore(self, snapshot: tuple) -> None:
         """Go back to an earlier snapshot."""
-        self.count = snapshot[0]
-        self.stamps, self.means, self.columns = (x.copy() for x in snapshot[1:])
+        self.end, self.stamps, means, self.columns, recent = snapshot
+        self.means[self.begin : self.end] = means
+        self.columns[self.end - len(recent) : self.end] = recent
+
+    def follow(self, snapshot: tuple, node: Floats, insertion_rate: float) -> None:
+        """Take the columns of ``snapshot``, which is one step ahead, with the own means, and as the newest tip the last node's state (S,)."""
+        own = self.means[self.begin : self.end].copy()
+        self.restore(snapshot)
+        i = self.end - 1
+        count = min(len(own), i - self.begin)
+        if count:
+            self.means[i - count : i] = own[-count:]
+        tip_rows(node, np.zeros((len(node), 1)), insertion_rate, self.means[i], np.empty((12, 1)))

@@ -91,7 +91,9 @@ def test_the_misfit_is_a_smooth_function_of_delays(robot, known):
     """Drives and load later by as much as the tracker is earlier is the same experiment, wherever in the steps their samples fall."""
     rng = np.random.default_rng(2)
     t = np.arange(101) / 100.0
-    turn = 0.3 * (1.0 - np.cos(np.pi * np.clip(t / 0.3, 0.0, 1.0)))[:, None] + 5e-4 * rng.standard_normal((101, 2))
+    turn = 0.3 * (1.0 - np.cos(np.pi * np.clip(t / 0.3, 0.0, 1.0)))[:, None] + 5e-4 * rng.standard_normal(
+        (101, 2)
+    )
     joints = np.column_stack([t, robot.rest.alpha.value + turn, np.tile(robot.rest.beta.value, (len(t), 1))])
     load = np.zeros((4, 7))
     load[:, 0], load[:, 2] = (0.0, 0.5, 0.51, 1.0), (-0.3, -0.3, 0.0, 0.0)

@@ -1,5 +1,7 @@
 """Tip kinematics, the window of kept tips, and the tracker's sensitivities against finite differences."""
 
+import copy
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -285,3 +287,47 @@ def test_a_step_without_columns_of_its_own_gets_the_mean_of_its_neighbours():
     first, _, last = (window.at(k * DT, DT).columns for k in (1, 2, 3))
     window.interpolate()
     assert np.allclose(window.at(2 * DT, DT).columns, 0.5 * (first + last))
+
+
+def test_snapshots_by_reference_are_as_good_as_copies():
+    """Going back and forth past the end of the room, with columns reduced, interpolated and shifted on the way."""
+    rng, step = np.random.default_rng(4), 0.003
+    window = TipWindow(6)
+    window.clear(COLUMNS)
+    kept: list[tuple] = []
+    k = 0
+
+    def seen(w):
+        rows = slice(w.begin, w.end)
+        return w.stamps[rows].copy(), w.means[rows].copy(), w.columns[rows].copy()
+
+    for _ in range(400):
+        action = rng.choice(["step", "reduce", "shift", "back"], p=[0.7, 0.1, 0.1, 0.1])
+        if action == "step":
+            window.append(step * k, node_at(step * k), rng.normal(size=(22, COLUMNS)), 0.0)
+            k += 1
+            if rng.random() < 0.5:
+                window.interpolate()
+            kept.append((k, window.snapshot(), copy.deepcopy(window)))
+        elif action == "reduce" and k:
+            window.transform(rng.normal(size=(COLUMNS + 3, COLUMNS)))
+        elif action == "shift" and k:
+            window.shift(1e-3 * rng.normal(size=COLUMNS))
+        elif action == "back" and len(kept) > 5:
+            del kept[-int(rng.integers(1, 5)) :]
+            k, snapshot, copied = kept[-1]
+            window.restore(snapshot)
+            for a, b in zip(seen(window), seen(copied), strict=True):
+                np.testing.assert_array_equal(a, b)
+    assert k > 100  # the room ended at least once
+
+
+def test_window_follows_columns_of_another_course_around_its_own_tips():
+    there, here = filled(DT * np.arange(10)), filled(DT * np.arange(9))
+    here.means[: here.end, 0] += 0.5
+    node = node_at(DT * 9.0) + np.eye(22)[1]
+    here.follow(there.snapshot(), node, 0.0)
+    assert (here.end, here.last.stamp) == (10, there.last.stamp)
+    np.testing.assert_array_equal(here.columns, there.columns)
+    np.testing.assert_allclose(here.means[:9, 0], there.means[:9, 0] + 0.5)
+    np.testing.assert_allclose(here.last.position, node[:3])
