@@ -32,6 +32,8 @@ COLLECT_NS = 1_000_000_000
 COLLECT_SLACK_NS = 1_500_000
 LONGEST_WAIT_NS = 2_400_000
 """Inputs wait no longer than this for a step: one that has just been published leaves about as long until the next."""
+GATHER_NS = 8_000_000
+"""So long after the first joints the model starts: a load of the same time comes a moment later, and starting takes longer than that."""
 PAUSE_NS = 1_000_000
 """What the estimator does in a pause takes about as long."""
 
@@ -110,6 +112,7 @@ class StepLoop(threading.Thread):
         timing: the account of punctuality.
         log_error: takes one line for the log.
         wall: whether that clock runs at the rate of the wall clock, so that one may sleep until a stamp.
+        gather_ns: how long the first inputs are gathered.
     """
 
     def __init__(
@@ -121,6 +124,7 @@ class StepLoop(threading.Thread):
         timing: StepTiming,
         log_error: Callable[[str], Any],
         wall: bool = True,
+        gather_ns: int = GATHER_NS,
     ) -> None:
         super().__init__(name="stepping", daemon=True)
         self.estimator = estimator
@@ -135,11 +139,13 @@ class StepLoop(threading.Thread):
         self._clock_ns = clock_ns
         self._log_error = log_error
         self._wall = wall
+        self._gather_ns = gather_ns
         self._took_steps = False
         self._correction_ns = 0  # what going back has cost lately
         self._wake = threading.Event()
         self._stopping = False
         self._last: tuple[int, int] | None = None  # k and stamp of the last step taken
+        self._joints_since_ns: int | None = None  # monotonic time since when a start has been possible
         self._next_collection_ns = 0
 
     # Called from other threads.
@@ -184,12 +190,14 @@ class StepLoop(threading.Thread):
     def swap(self, estimator: Steps) -> None:
         """Go on with another estimator, which starts at its next joint state."""
         self.estimator = estimator
-        self._last = None
-        self.timing.restarted()
+        self._forget()
 
     def reset(self) -> None:
         self.estimator.reset()
-        self._last = None
+        self._forget()
+
+    def _forget(self) -> None:
+        self._last = self._joints_since_ns = None
         self.timing.restarted()
 
     def run(self) -> None:
@@ -247,6 +255,8 @@ class StepLoop(threading.Thread):
 
     def _advance(self, corrects: bool) -> None:
         """Take what is due; `corrects`: inputs have come, going back may be part of it."""
+        if self._gathering_ns() > 0:
+            return
         for _ in range(SLICE_STEPS):
             until_ns, more = self._until(self._now_ns())
             begin = time.perf_counter_ns()
@@ -270,6 +280,15 @@ class StepLoop(threading.Thread):
             if self._stopping or not more or not steps:
                 return
         self._wake.set()  # there is more to take, after a look at the inbox
+
+    def _gathering_ns(self) -> int:
+        """How much longer the first inputs are gathered before the model starts; 0 once it may."""
+        if self._last is not None or self.estimator.t0_ns is None:
+            return 0
+        now_ns = time.monotonic_ns()
+        if self._joints_since_ns is None:
+            self._joints_since_ns = now_ns
+        return max(self._joints_since_ns + self._gather_ns - now_ns, 0)
 
     def _use_pause(self) -> None:
         """Let the estimator do what no output waits for when there is time before the next step; when there never is, it helps itself."""
@@ -303,7 +322,7 @@ class StepLoop(threading.Thread):
     def _sleep(self) -> None:
         if self._stopping or self._wake.is_set():
             return
-        wait_ns = IDLE_NS
+        wait_ns = self._gathering_ns() or IDLE_NS
         due_ns = self._next_due_ns()
         if due_ns is not None and self._wall:
             wait_ns = min(due_ns - self._now_ns(), IDLE_NS)

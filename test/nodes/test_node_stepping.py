@@ -43,7 +43,7 @@ class Scripted:
         self.t0_ns, self.k = None, 0
 
 
-def make_loop(estimator, clock, policy="predict", publish=None):
+def make_loop(estimator, clock, policy="predict", publish=None, gather_ns=0):
     """A loop whose rounds the test calls itself; `published` holds the stamps."""
     published = []
     errors = []
@@ -59,6 +59,7 @@ def make_loop(estimator, clock, policy="predict", publish=None):
         lambda: clock.now,
         StepTiming(policy, 100 * MS),
         errors.append,
+        gather_ns=gather_ns,
     )
     return loop, published, errors
 
@@ -77,6 +78,27 @@ def test_inputs_are_taken_in_together_before_the_step(clock):
     loop._round()
     assert order == ["joints", "tracker"]
     assert published == [clock.now]
+
+
+def test_the_first_inputs_are_gathered_before_the_model_starts(clock):
+    estimator = Scripted()
+    loop, published, _ = make_loop(estimator, clock, gather_ns=20 * MS)
+    loop._round()
+    assert estimator.asked == [clock.now]  # nothing to gather for
+    loop.put(lambda: setattr(estimator, "t0_ns", clock.now))
+    loop._round()
+    order = []
+    loop.put(lambda: order.append("load"))
+    loop._wake.clear()
+    loop._round()
+    assert (len(estimator.asked), order, published) == (1, ["load"], [])
+    loop._sleep()  # until it may start
+    loop._round()
+    assert published == [clock.now]
+    loop.reset()
+    estimator.t0_ns = clock.now
+    loop._round()
+    assert len(published) == 1
 
 
 def test_pauses_are_used_after_steps_are_out_and_not_while_inputs_wait(clock):
