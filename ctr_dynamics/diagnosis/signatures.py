@@ -103,7 +103,8 @@ def linearise(
     probing = problem if again else problem.with_step(PROBE_STEP)
 
     def probe(c: Candidate, size: float, back: Mapping[Key, float]) -> tuple[dict[Key, float], Floats | None]:
-        shift = {**back, **dict(c.start), **{q.key: q.off + size * q.scale for q in c.quantities}}
+        q = c.quantities[0]
+        shift = {**back, **dict(c.start), q.key: q.off + size * q.scale}
         return shift, probing.residual({**point, **shift})
 
     # nuisances that have left their tolerances imitate a cause: then it is tried beside nominal ones too
@@ -143,7 +144,7 @@ def linearise(
             result.probes.setdefault(c, []).append(Probe(shift, residual + new - reference))
     for c in pool:
         if c in rough and c in result.probes:
-            (q,), first_probe = c.quantities, result.probes[c][0]
+            q, first_probe = c.quantities[0], result.probes[c][0]
             secant = (residual - first_probe.residual) / (first_probe.shift[q.key] - q.off)
             result.signatures[c] = secant[:, None]
         elif c not in shaped and c not in rough:
@@ -184,9 +185,9 @@ def screen(
     def evidence_at(probe: Probe, c: Candidate) -> float:
         there = np.array([{**lin.point, **probe.shift}.get(q.key, q.off) - q.off for q in active])
         departure, spread, evidence = posterior(probe.residual, columns, there, variance, problem.numerics)
-        (q,) = c.quantities
+        q = c.quantities[0]
         evidence -= 0.5 * ((probe.shift[q.key] - q.off) / q.scale) ** 2
-        evidence -= math.log1p(q.scale * float(np.linalg.norm(lin.signatures[c])))  # the size is free
+        evidence -= math.log1p(q.scale * float(np.linalg.norm(lin.signatures[c][:, 0])))  # the size is free
         return evidence + inside(active, {x.key for x in fixed}, departure, spread)
 
     taken = {c.effect + tube_of(c.quantities[0]) for c in members}

@@ -77,8 +77,8 @@ class Effect:
         text: what it models, one sentence. source: where the physics comes from.
         extended: whether it needs the extended kernels.
         probes: sizes, in scales, at which it is tried where its derivative at the off-value says little; empty where that serves.
-        far: sizes, in scales, at which it is tried besides where the misfit is large: it changes a frequency, and in time a phase, beyond what its
-            derivative says.
+        far: sizes, in scales, at which its first parameter is tried besides where the misfit is large: it changes a frequency, and in time a
+            phase, beyond what its derivative says.
         joint: parameters that are only tried together (a vector); else each is a variant of its own.
         presets: values of the shape parameters from which a search starts, by name; several are tried.
         nuisance: not a cause by itself: it widens what others may explain, and is not in the catalogue of findings.

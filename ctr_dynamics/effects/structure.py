@@ -52,7 +52,7 @@ register(
         _youngs,
         "A tube is stiffer or softer than the robot file says.",
         "Till et al. (2020), (16): E I",
-        far=(-1.5, 1.5),
+        far=(-2.0, -1.0, 1.0, 2.0),
     )
 )
 register(
@@ -131,7 +131,7 @@ register(
         _added,
         "The payload is heavier or lighter, as by a point mass at the tip.",
         "Till et al. (2020), (21)",
-        far=(-1.5, 1.5),
+        far=(-2.0, -1.0, 1.0, 2.0),
     )
 )
 
@@ -158,7 +158,7 @@ register(
         _inertia,
         "The payload resists rotation more or less than its mass says.",
         "Till et al. (2020), (21): H",
-        far=(-0.8, 0.8),
+        far=(-0.9, -0.5, 0.5, 0.9, 1.4),
     )
 )
 

@@ -88,6 +88,7 @@ register(
         "The tip hangs on something elastic, such as tissue.",
         "Kelvin-Voigt element: F = k (anchor - p) - c v",
         extended=True,
+        far=(0.2, 0.5, 1.0, 2.0),
         joint=True,
     )
 )
