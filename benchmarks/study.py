@@ -74,8 +74,8 @@ def one(stratum: str, seed: int) -> dict[str, Any]:
 def separations(result: Any, answer: dict[str, Any]) -> dict[str, float]:
     """d_sep of every true cause, from the true effects fitted to the data, against the nearest rival."""
     from ctr_dynamics.diagnosis.candidates import causes_of
+    from ctr_dynamics.diagnosis.explanations import with_nuisances
     from ctr_dynamics.diagnosis.fit import fit
-    from ctr_dynamics.diagnosis.search import with_nuisances
     from ctr_dynamics.diagnosis.signatures import linearise, separation
 
     problem, found = result.problem, result.search

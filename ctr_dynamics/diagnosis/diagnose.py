@@ -20,11 +20,12 @@ from ctr_dynamics.robot import Robot
 
 from .candidates import Candidate, candidates
 from .checks import Whiteness, block_bootstrap, rms, whiteness
+from .explanations import Explanation
 from .fit import Fit, Local, Problem, fit, make_problem
 from .mistakes import find_mistake
 from .numerics import add_numerics
 from .recording import Recording
-from .search import Explanation, Search, distinct, search
+from .search import Search, distinct, search
 from .signatures import Linearisation, linearise, observable, separation
 from .unexplained import Unexplained, unexplained
 

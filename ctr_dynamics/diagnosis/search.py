@@ -15,10 +15,9 @@ import numpy as np
 from joblib import Parallel, delayed
 from numpy.typing import NDArray
 
-from ctr_dynamics.effects import EFFECTS, quantities
-
-from .candidates import Candidate, causes_of, log_prior
-from .fit import Fit, Key, Local, Problem, fit, posterior, variances
+from .candidates import Candidate, log_prior
+from .explanations import Explanation, Job, finish, fit_all, keys_of, reduced, replaced
+from .fit import Fit, Key, Problem, fit
 from .signatures import Linearisation, Scored, linearise, screen, separation
 
 Floats = NDArray[np.float64]
@@ -31,35 +30,11 @@ HOPELESS = 0.3  # of the misfit: two causes that leave more are not made right b
 SECOND_EVIDENCE = 5.0  # log evidence that a further cause must add
 FAR = 80.0  # deviations of the noise in the misfit from which large sizes of a cause are looked at too
 MIN_SCREEN = 1.0  # log evidence by the linear estimate below which a candidate is not worth a fit
-CONTENDERS, CONTEND = (
-    3,
-    6.0,
-)  # explanations that are finished with exact columns, and the log evidence to the best within which they may be
-STAND_IN, STAND_INS = (
-    12.0,
-    3,
-)  # separation from the best explanation's cause within which another is fitted in its place, and how many
+# explanations that are finished with exact columns, and the log evidence to the best within which they may be
+CONTENDERS, CONTEND = 3, 6.0
+# separation from the best explanation's cause within which another is fitted in its place, and how many
+STAND_IN, STAND_INS = 12.0, 3
 CONTENDER = 8.0  # deviations by which the cost may exceed the best one's: beyond, a fit is given up
-
-
-@dataclass
-class Explanation:
-    """A set of candidates with its fit."""
-
-    members: tuple[Candidate, ...]
-    fit: Fit
-    score: float = 0.0  # log posterior, up to a constant
-    finished: bool = False  # with exact columns
-
-    @property
-    def effects(self) -> tuple[str, ...]:
-        """Sorted effect IDs."""
-        return tuple(sorted({c.effect for c in self.members}))
-
-    @property
-    def keys(self) -> frozenset[Key]:
-        """Free parameters of its causes."""
-        return keys_of(self.members)
 
 
 @dataclass
@@ -124,7 +99,7 @@ def _search(
     # likeliest first: what cannot win against those before it is given up
     for begin in range(0, len(first), BATCH):
         jobs = [Job((), s, clean, lin) for s in first[begin : begin + BATCH]]
-        found += _fits(problem, jobs, _limit(problem, found), workers)
+        found += fit_all(problem, jobs, _limit(problem, found), workers)
         _score(found, pool)
     if found[0].members:
         found += _further(problem, pool, found, clean, lin, note, workers)
@@ -196,92 +171,9 @@ def _stand_ins(
         jobs += [(members, member) for members in wanted]
     limit = _limit(problem, found)
     fits = Parallel(workers, prefer="threads")(
-        delayed(_replaced)(problem, best, members, gone, lin, limit) for members, gone in jobs
+        delayed(replaced)(problem, best, members, gone, lin, limit) for members, gone in jobs
     )
     return [e for e in fits if e is not None]
-
-
-def _replaced(
-    problem: Problem,
-    best: Explanation,
-    members: tuple[Candidate, ...],
-    gone: Candidate,
-    lin: Linearisation,
-    limit: float,
-) -> Explanation | None:
-    """Fit of ``members`` from where the columns of ``lin`` say that the newest of them does the work of the ``gone`` one."""
-    own, causes = with_nuisances(problem, members), causes_of(members)
-    active, variance = variances(own.nuisances, causes)
-    known = {**lin.columns, **lin.own(members[-1]), **best.fit.by_key}
-    point = {key: value for key, value in best.fit.point.items() if key not in gone.keys}
-    departure = np.array([point.get(q.key, q.off) - q.off for q in active])
-    without = sum(
-        best.fit.columns[:, i] * (best.fit.values[i] - q.off)
-        for i, q in enumerate(best.fit.active)
-        if q.key in gone.keys
-    )
-    nothing = np.zeros(len(best.fit.residual))
-    columns = np.stack([known.get(q.key, nothing) for q in active], axis=1)
-    wanted, _, _ = posterior(best.fit.residual + without, columns, departure, variance, problem.numerics)
-    start = dict(members[-1].start)
-    start.update(
-        {
-            q.key: float(np.clip(q.off + d, q.low, q.high))
-            for q, d in zip(active, wanted, strict=True)
-            if q.key not in start
-        }
-    )
-    result = fit(own, causes, start, limit=limit)
-    return None if result is None else Explanation(members, result)
-
-
-def keys_of(members: Sequence[Candidate]) -> frozenset[Key]:
-    """Free parameters of a set of candidates."""
-    return frozenset().union(*(c.keys for c in members)) if members else frozenset()
-
-
-@dataclass(frozen=True)
-class Job:
-    """A candidate to be fitted beside ``members``, from their fit ``start``, where ``lin`` stands."""
-
-    members: tuple[Candidate, ...]
-    new: Scored
-    start: Fit
-    lin: Linearisation
-
-
-def explain(problem: Problem, job: Job, limit: float = math.inf) -> Explanation | None:
-    """Fit of a set of candidates; ``limit``: cost beyond which it is given up. None where no simulation succeeds."""
-    members = (*job.members, job.new.candidate)
-    causes = causes_of(members)
-    point = {**dict(job.new.candidate.start), **job.start.point}
-    residual: Floats | None = job.lin.residual
-    if job.new.probe is not None:
-        point.update(job.new.probe.shift)
-        residual = problem.residual(point)
-    if residual is None:
-        return None
-    known = Local(residual, {**job.lin.own(job.new.candidate), **job.start.by_key, **job.lin.columns})
-    own = with_nuisances(problem, members)
-    result = fit(own, causes, point, known, renewals=1, limit=limit, polish=False)
-    return None if result is None else Explanation(members, result)
-
-
-def with_nuisances(problem: Problem, members: Sequence[Candidate]) -> Problem:
-    """``problem`` with the nuisances of the model's form that come with ``members``."""
-    names = {name for c in members for name in EFFECTS[c.effect].form}
-    if not names:
-        return problem
-    form = tuple(q for q in quantities(problem.robot) if q.effect in names)
-    return replace(problem, nuisances=problem.nuisances + form)
-
-
-def finish(problem: Problem, found: Explanation) -> None:
-    """Fit again with exact columns."""
-    better = fit(with_nuisances(problem, found.members), found.fit.causes, found.fit.point)
-    if better is not None and better.cost <= found.fit.cost + 1e-6:
-        found.fit = better
-    found.finished = True
 
 
 def _further(
@@ -314,7 +206,7 @@ def _further(
                     tried.add(names)
                     jobs.append(Job(leader.members, s, leader.fit, here))
             enough = leader.fit.log_evidence + SECOND_EVIDENCE
-            new += [e for e in _fits(problem, jobs, hopeless, workers) if e.fit.log_evidence > enough]
+            new += [e for e in fit_all(problem, jobs, hopeless, workers) if e.fit.log_evidence > enough]
         if not new:
             break
         out += new
@@ -339,7 +231,7 @@ def _fewer(
     while len(best.members) > 1:
         note(f"whether each of {', '.join(best.effects)} is needed")
         sets = [tuple(m for m in best.members if m is not c) for c in best.members]
-        fits = Parallel(workers, prefer="threads")(delayed(_from)(problem, rest, best.fit) for rest in sets)
+        fits = Parallel(workers, prefer="threads")(delayed(reduced)(problem, rest, best.fit) for rest in sets)
         smaller = [e for e in fits if e is not None]
         out += smaller
         better = max(smaller, key=lambda e: e.fit.log_evidence, default=None)
@@ -347,15 +239,6 @@ def _fewer(
             break
         best = better
     return out
-
-
-def _from(problem: Problem, members: tuple[Candidate, ...], start: Fit) -> Explanation | None:
-    """Fit of ``members`` from that of a larger set."""
-    causes = causes_of(members)
-    own = with_nuisances(problem, members)
-    free = {q.key for q in (*own.nuisances, *causes)}
-    result = fit(own, causes, {key: value for key, value in start.point.items() if key in free}, renewals=1)
-    return None if result is None else Explanation(members, result)
 
 
 def _hopeless(problem: Problem, clean: Fit) -> float:
@@ -367,11 +250,6 @@ def _leftover(problem: Problem, result: Fit) -> float:
     """Deviations by which the residual's squares exceed what noise gives."""
     dof = problem.size
     return (result.chi2 - dof) / math.sqrt(2.0 * dof)
-
-
-def _fits(problem: Problem, jobs: Sequence[Job], limit: float, workers: int) -> list[Explanation]:
-    results = Parallel(workers, prefer="threads")(delayed(explain)(problem, job, limit) for job in jobs)
-    return [e for e in results if e is not None]
 
 
 def distinct(found: Sequence[Scored]) -> list[Scored]:

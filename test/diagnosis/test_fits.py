@@ -8,9 +8,10 @@ import pytest
 from ctr_dynamics.diagnosis import numerics
 from ctr_dynamics.diagnosis.candidates import candidates, causes_of
 from ctr_dynamics.diagnosis.experiment import NODES, Experiment
+from ctr_dynamics.diagnosis.explanations import Explanation
 from ctr_dynamics.diagnosis.fit import REACH, fit, make_problem
 from ctr_dynamics.diagnosis.recording import Recording
-from ctr_dynamics.diagnosis.search import Explanation, _stand_ins
+from ctr_dynamics.diagnosis.search import _stand_ins
 from ctr_dynamics.diagnosis.signatures import linearise, screen
 from ctr_dynamics.effects import quantities
 from ctr_dynamics.robot import load_robot

@@ -1,0 +1,136 @@
+"""Fits of sets of causes: one more cause from the columns of a screening, one less, one in place of another."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from joblib import Parallel, delayed
+from numpy.typing import NDArray
+
+from ctr_dynamics.effects import EFFECTS, quantities
+
+from .candidates import Candidate, causes_of
+from .fit import Fit, Key, Local, Problem, fit, posterior, variances
+from .signatures import Linearisation, Scored
+
+Floats = NDArray[np.float64]
+
+
+@dataclass
+class Explanation:
+    """A set of candidates with its fit."""
+
+    members: tuple[Candidate, ...]
+    fit: Fit
+    score: float = 0.0  # log posterior, up to a constant
+    finished: bool = False  # with exact columns
+
+    @property
+    def effects(self) -> tuple[str, ...]:
+        """Sorted effect IDs."""
+        return tuple(sorted({c.effect for c in self.members}))
+
+    @property
+    def keys(self) -> frozenset[Key]:
+        """Free parameters of its causes."""
+        return keys_of(self.members)
+
+
+def keys_of(members: Sequence[Candidate]) -> frozenset[Key]:
+    """Free parameters of a set of candidates."""
+    return frozenset().union(*(c.keys for c in members)) if members else frozenset()
+
+
+def with_nuisances(problem: Problem, members: Sequence[Candidate]) -> Problem:
+    """``problem`` with the nuisances of the model's form that come with ``members``."""
+    names = {name for c in members for name in EFFECTS[c.effect].form}
+    if not names:
+        return problem
+    form = tuple(q for q in quantities(problem.robot) if q.effect in names)
+    return replace(problem, nuisances=problem.nuisances + form)
+
+
+@dataclass(frozen=True)
+class Job:
+    """A candidate to be fitted beside ``members``, from their fit ``start``, where ``lin`` stands."""
+
+    members: tuple[Candidate, ...]
+    new: Scored
+    start: Fit
+    lin: Linearisation
+
+
+def explain(problem: Problem, job: Job, limit: float = math.inf) -> Explanation | None:
+    """Fit of a set of candidates; ``limit``: cost beyond which it is given up. None where no simulation succeeds."""
+    members = (*job.members, job.new.candidate)
+    causes = causes_of(members)
+    point = {**dict(job.new.candidate.start), **job.start.point}
+    residual: Floats | None = job.lin.residual
+    if job.new.probe is not None:
+        point.update(job.new.probe.shift)
+        residual = problem.residual(point)
+    if residual is None:
+        return None
+    known = Local(residual, {**job.lin.own(job.new.candidate), **job.start.by_key, **job.lin.columns})
+    own = with_nuisances(problem, members)
+    result = fit(own, causes, point, known, renewals=1, limit=limit, polish=False)
+    return None if result is None else Explanation(members, result)
+
+
+def fit_all(problem: Problem, jobs: Sequence[Job], limit: float, workers: int) -> list[Explanation]:
+    results = Parallel(workers, prefer="threads")(delayed(explain)(problem, job, limit) for job in jobs)
+    return [e for e in results if e is not None]
+
+
+def reduced(problem: Problem, members: tuple[Candidate, ...], start: Fit) -> Explanation | None:
+    """Fit of ``members`` from that of a larger set."""
+    causes = causes_of(members)
+    own = with_nuisances(problem, members)
+    free = {q.key for q in (*own.nuisances, *causes)}
+    result = fit(own, causes, {key: value for key, value in start.point.items() if key in free}, renewals=1)
+    return None if result is None else Explanation(members, result)
+
+
+def replaced(
+    problem: Problem,
+    best: Explanation,
+    members: tuple[Candidate, ...],
+    gone: Candidate,
+    lin: Linearisation,
+    limit: float,
+) -> Explanation | None:
+    """Fit of ``members`` from where the columns of ``lin`` say that the newest of them does the work of the ``gone`` one."""
+    own, causes = with_nuisances(problem, members), causes_of(members)
+    active, variance = variances(own.nuisances, causes)
+    known = {**lin.columns, **lin.own(members[-1]), **best.fit.by_key}
+    point = {key: value for key, value in best.fit.point.items() if key not in gone.keys}
+    departure = np.array([point.get(q.key, q.off) - q.off for q in active])
+    without = sum(
+        best.fit.columns[:, i] * (best.fit.values[i] - q.off)
+        for i, q in enumerate(best.fit.active)
+        if q.key in gone.keys
+    )
+    nothing = np.zeros(len(best.fit.residual))
+    columns = np.stack([known.get(q.key, nothing) for q in active], axis=1)
+    wanted, _, _ = posterior(best.fit.residual + without, columns, departure, variance, problem.numerics)
+    start = dict(members[-1].start)
+    start.update(
+        {
+            q.key: float(np.clip(q.off + d, q.low, q.high))
+            for q, d in zip(active, wanted, strict=True)
+            if q.key not in start
+        }
+    )
+    result = fit(own, causes, start, limit=limit)
+    return None if result is None else Explanation(members, result)
+
+
+def finish(problem: Problem, found: Explanation) -> None:
+    """Fit again with exact columns."""
+    better = fit(with_nuisances(problem, found.members), found.fit.causes, found.fit.point)
+    if better is not None and better.cost <= found.fit.cost + 1e-6:
+        found.fit = better
+    found.finished = True
