@@ -26,6 +26,7 @@ register(
         _exposed,
         "A tube stands further out or in than its translation reads.",
         "Till et al. (2020), fig. 2: beta",
+        far=(-1.5, -0.7, 0.7, 1.5),
     )
 )
 

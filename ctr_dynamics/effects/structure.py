@@ -66,6 +66,7 @@ register(
         _scaled("torsional_stiffness"),
         "A tube is stiffer or softer in torsion.",
         "Till et al. (2020), (16): G J",
+        far=(-2.0, 2.0),
     )
 )
 register(
