@@ -68,15 +68,16 @@ def explain(problem: Problem, job: Job, limit: float = math.inf) -> Explanation 
     members = (*job.members, job.new.candidate)
     causes = causes_of(members)
     point = {**dict(job.new.candidate.start), **job.start.point}
-    residual: Floats | None = job.lin.residual
-    if job.new.probe is not None:
-        point.update(job.new.probe.shift)
-        residual = problem.residual(point)
-    if residual is None:
-        return None
-    known = Local(residual, {**job.lin.own(job.new.candidate), **job.start.by_key, **job.lin.columns})
     own = with_nuisances(problem, members)
-    result = fit(own, causes, point, known, renewals=1, limit=limit, polish=False)
+    if job.new.probe is not None:
+        # so far from where the columns are known that they are computed anew
+        point.update(job.new.probe.shift)
+        result = fit(own, causes, point, renewals=2, limit=limit, polish=False)
+    else:
+        known = Local(
+            job.lin.residual, {**job.lin.own(job.new.candidate), **job.start.by_key, **job.lin.columns}
+        )
+        result = fit(own, causes, point, known, renewals=1, limit=limit, polish=False)
     return None if result is None else Explanation(members, result)
 
 
