@@ -33,9 +33,8 @@ Floats = NDArray[np.float64]
 Note = Callable[[str], None]
 NOT_NOISE = 1e-4  # p below which what is left is no noise
 LEFT_SHARE = 0.03  # of the misfit beyond noise that a named cause may leave before it is called unknown
-PREDICTED = (
-    1.15  # NIS per degree of freedom on validation bags up to which they are predicted down to the noise
-)
+# NIS per degree of freedom on validation bags up to which they are predicted down to the noise
+PREDICTED = 1.15
 NAMED = 0.9  # probability from which a set of causes is named
 CLEAN_GAIN = 4.0  # log evidence, priors included, that a cause must gain over none
 SEPARATION = 5.0  # whitened units: linear signatures that are nearer cannot be told apart

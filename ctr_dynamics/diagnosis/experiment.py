@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctr_dynamics.effects import EFFECTS, Quantity, Setup, apply_effects, make_setup, play
+from ctr_dynamics.estimation.signals import Signal
 from ctr_dynamics.model.lanes import PACK
 from ctr_dynamics.model.model import Model
 from ctr_dynamics.model.scheme import make_scheme
@@ -59,6 +60,13 @@ class Experiment:
         self.scheme = make_scheme("sdirk3", dt)
         self._models = {False: Model(robot, nodes=nodes), True: Model(robot, nodes=nodes, extended=True)}
         self.nominal = make_setup(self._models[False])
+        load = Signal(6)
+        for time, *wrench in recording.load.tolist():
+            load.add(round(time * 1e9), np.array(wrench))
+        # a step across a sharp bend of the load would make the error of the prediction depend on where in the step it lies, and the misfit a
+        # rough function of every delay
+        bends = load.bends(-np.inf, np.inf, self._models[False].load_kink / dt)
+        self._load_events = 1e-9 * np.array(bends, dtype=float)
 
     def resolved(self, nodes: int, dt: float) -> Experiment:
         """The same at another resolution."""
@@ -138,24 +146,9 @@ class Experiment:
             setup.block,
             self.inputs(setup, extended),
             self.recording.duration,
-            events=self._events(setup),
+            events=(self._load_events + setup.load_shift).tolist(),
             **columns,  # type: ignore[arg-type]
         )
-
-    def _events(self, setup: Setup) -> list[float]:
-        """Times in s at which the load bends sharply.
-
-        A step across such a bend would make the error of the prediction depend on where in the step it lies, and the misfit a rough function of
-        every delay.
-        """
-        load = self.recording.load
-        if len(load) < 2:
-            return []
-        slopes = np.diff(load[:, 1:], axis=0) / np.diff(load[:, :1], axis=0)
-        changes = np.diff(slopes, axis=0, prepend=np.zeros((1, 6)), append=np.zeros((1, 6)))
-        sharp = np.any(np.abs(changes) * self.scheme.dt > self._models[False].load_kink, axis=1)
-        shifted: list[float] = (load[sharp, 0] + setup.load_shift).tolist()
-        return shifted
 
     def residual(self, prediction: Prediction) -> Floats:
         """(s, 6) reading minus prediction: position in m in the tracker's axes, rotation vector in rad in the sensor's axes."""

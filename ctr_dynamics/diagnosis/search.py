@@ -32,8 +32,8 @@ FAR = 80.0  # deviations of the noise in the misfit from which large sizes of a 
 MIN_SCREEN = 1.0  # log evidence by the linear estimate below which a candidate is not worth a fit
 # explanations that are finished with exact columns, and the log evidence to the best within which they may be
 CONTENDERS, CONTEND = 3, 6.0
-# separation from the best explanation's cause, and share of the cause's own size, within which another is fitted in its place; and how many
-STAND_IN, STAND_IN_SHARE, STAND_INS = 12.0, 0.3, 3
+# separation from the best explanation's cause within which another is fitted in its place, and how many
+STAND_IN, STAND_INS = 12.0, 3
 ADEQUATE = 1.5  # of the noise: an explanation that leaves more is not worth the search for stand-ins
 CONTENDER = 8.0  # deviations by which the cost may exceed the best one's: beyond, a fit is given up
 
@@ -156,12 +156,11 @@ def _stand_ins(
     jobs = []
     for member in best.members:
         rest = tuple(m for m in best.members if m is not member)
-        taken = {m.effect for m in best.members}
         near = sorted(
             (
                 (separation(problem, best.fit, member, rival, lin), i, rival)
                 for i, rival in enumerate(lin.signatures)
-                if rival.effect not in taken
+                if rival.effect not in best.effects
             ),
             key=lambda item: item[:2],
         )
