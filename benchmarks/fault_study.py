@@ -64,6 +64,7 @@ class Result:
     repeated_stamps: int
     exit_code: int
     recorded: int | None = None
+    not_recorded: int | None = None
     lost_s: float | None = None
     broken: list[str] = dataclasses.field(default_factory=list)
 
@@ -187,10 +188,11 @@ def judge(
         exit_code=code,
     )
     if recording.exists():
-        recorded = list(open_bag(recording).messages({topics.TIP_POSE}))
+        recorded = [cdr.decode_stamp(m.data) for m in open_bag(recording).messages({topics.TIP_POSE})]
         result.recorded = len(recorded)
+        result.not_recorded = len(set(marks) - set(recorded))
         if fault.startswith("kill") and marks and recorded:
-            result.lost_s = round((marks[-1] - recorded[-1].log_ns) * 1e-9, 3)
+            result.lost_s = round((marks[-1] - recorded[-1]) * 1e-9, 3)
     killed = fault.startswith("kill")
     if code != (-signal.SIGKILL if killed else 0):
         result.broken.append(f"exit code {code}")
@@ -202,6 +204,8 @@ def judge(
         result.broken.append("not valid again")
     if killed and (result.lost_s is None or result.lost_s > 1.0):
         result.broken.append("more than 1 s of the recording lost")
+    if result.not_recorded != 0 and not killed and fault != "disk full":
+        result.broken.append("published and not recorded")
     return result
 
 
@@ -270,11 +274,9 @@ def table(results: list[dict[str, Any]]) -> str:
     for r in results:
         tip = "-" if r["tip_rms_m"] is None else f"{1e3 * r['tip_rms_m']:.2f}"
         back = "-" if r["back_after_s"] is None else f"{max(r['back_after_s'], 0):.3f}"
-        kept = (
-            "all"
-            if r["recorded"] is not None and r["lost_s"] is None
-            else f"all but the last {r['lost_s']} s"
-        )
+        kept = f"all but {r['not_recorded']}" if r["not_recorded"] else "all"
+        if r["lost_s"] is not None:
+            kept = f"all but the last {r['lost_s']} s"
         if r["fault"] == "disk full":
             kept = f"{r['recorded']} poses, to the limit"
         lines.append(
