@@ -106,7 +106,7 @@ def separations(result: Any, answer: dict[str, Any]) -> dict[str, float]:
     out = {}
     for member in members:
         rivals = [c for c in lin.signatures if c.effect not in own]
-        out[member.effect] = min(separation(problem, best, member, rival, lin) for rival in rivals)
+        out[member.effect] = min(separation(problem, best, (member,), rival, lin) for rival in rivals)
     return out
 
 

@@ -373,7 +373,7 @@ def test_extensions_of_the_catalogue_are_taken_and_checked(tissue):
         ({"youngs_modulus": {"all.scale": "1.1"}}, ["'1.1' is not a number"]),
         ({"clearance": {"play_rad": math.nan}}, ["not finite"]),
         ({"clearance": {"play_rad": -0.003}}, ["'play_rad' is -0.003 rad", "between 0 and inf"]),
-        ({"ovality": {"tube1.ratio": 0.2}}, ["'tube1.ratio' is 0.2 1", "between 0.3 and inf"]),
+        ({"ovality": {"tube1.ratio": 0.2}}, ["'tube1.ratio' is 0.2 1", "between 1 and inf"]),
         ({"softening": {"tube1.curvature_1_per_m": 0.0}}, ["must be above 0", "leave it out"]),
         ({"drivetrain_compliance": {"tube1.stiffness_Nm_per_rad": math.inf}}, ["not finite"]),
     ):

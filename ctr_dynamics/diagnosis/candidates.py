@@ -89,6 +89,11 @@ def causes_of(members: Sequence[Candidate]) -> tuple[Quantity, ...]:
     return tuple(q for c in members for q in c.quantities + c.shapes)
 
 
+def keys_of(members: Sequence[Candidate]) -> frozenset[Key]:
+    """Free parameters of a set of candidates."""
+    return frozenset().union(*(c.keys for c in members)) if members else frozenset()
+
+
 def tube_of(q: Quantity) -> str:
     """Tube of a quantity, empty where it belongs to none."""
     return q.name.split(".")[0] if q.name.startswith("tube") else ""

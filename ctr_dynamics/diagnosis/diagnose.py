@@ -284,7 +284,7 @@ def _member(problem: Problem, found: Search, best: Explanation, c: Candidate, li
     own = {m.effect for m in best.members}
     for rival in lin.signatures:
         if rival.effect not in own:
-            d = separation(problem, best.fit, c, rival, lin)
+            d = separation(problem, best.fit, (c,), rival, lin)
             near[rival.effect] = min((d, SEPARATION), near.get(rival.effect, (math.inf, SEPARATION)))
     rest = best.keys - c.keys
     fitted: dict[str, tuple[float, float]] = {}
@@ -299,7 +299,7 @@ def _member(problem: Problem, found: Search, best: Explanation, c: Candidate, li
     )
     rivals = sorted((d, name) for name, (d, needed) in near.items() if d < needed)
     nearest = min((d for d, _ in near.values()), default=math.inf)
-    alone = separation(problem, best.fit, c, None, lin)
+    alone = separation(problem, best.fit, (c,), None, lin)
     return Member(c, c.effect, probability, min(nearest, alone), [name for _, name in rivals])
 
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ctr_dynamics.effects import EFFECTS, quantities
 
-from .candidates import Candidate, causes_of
+from .candidates import Candidate, causes_of, keys_of
 from .fit import Fit, Key, Local, Problem, fit, posterior, variances
 from .signatures import Linearisation, Scored
 
@@ -37,11 +37,6 @@ class Explanation:
     def keys(self) -> frozenset[Key]:
         """Free parameters of its causes."""
         return keys_of(self.members)
-
-
-def keys_of(members: Sequence[Candidate]) -> frozenset[Key]:
-    """Free parameters of a set of candidates."""
-    return frozenset().union(*(c.keys for c in members)) if members else frozenset()
 
 
 def with_nuisances(problem: Problem, members: Sequence[Candidate]) -> Problem:
@@ -99,20 +94,21 @@ def replaced(
     problem: Problem,
     best: Explanation,
     members: tuple[Candidate, ...],
-    gone: Candidate,
+    gone: Sequence[Candidate],
     lin: Linearisation,
     limit: float,
 ) -> Explanation | None:
-    """Fit of ``members`` from where the columns of ``lin`` say that the newest of them does the work of the ``gone`` one."""
+    """Fit of ``members`` from where the columns of ``lin`` say that the newest of them does the work of the ``gone``."""
+    left = keys_of(gone)
     own, causes = with_nuisances(problem, members), causes_of(members)
     active, variance = variances(own.nuisances, causes)
     known = {**lin.columns, **lin.own(members[-1]), **best.fit.by_key}
-    point = {key: value for key, value in best.fit.point.items() if key not in gone.keys}
+    point = {key: value for key, value in best.fit.point.items() if key not in left}
     departure = np.array([point.get(q.key, q.off) - q.off for q in active])
     without = sum(
         best.fit.columns[:, i] * (best.fit.values[i] - q.off)
         for i, q in enumerate(best.fit.active)
-        if q.key in gone.keys
+        if q.key in left
     )
     nothing = np.zeros(len(best.fit.residual))
     columns = np.stack([known.get(q.key, nothing) for q in active], axis=1)

@@ -42,6 +42,8 @@ def parameters(fit: Fit, member: Member, inflation: float) -> dict[str, Any]:
     for q, value, sigma in zip(fit.active, fit.values, fit.sigma * inflation, strict=True):
         if q.key not in member.candidate.keys:
             continue
+        if q.parameter.period:
+            value %= q.parameter.period
         shown = q.parameter.value(float(value))
         nominal = q.parameter.value(q.off)
         out[q.name] = {

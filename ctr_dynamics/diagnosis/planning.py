@@ -77,7 +77,7 @@ def plan(diagnosis: Diagnosis) -> Plan | None:
     if not rivals:
         return None
     rival = rivals[0]
-    before = separation(d.problem, d.best, member.candidate, rival, d.at_best)
+    before = separation(d.problem, d.best, (member.candidate,), rival, d.at_best)
     best: Plan | None = None
     for name in LIBRARY:
         scenario = load_scenario(name)

@@ -173,7 +173,7 @@ def _rivals(page: Page, d: Diagnosis) -> None:
         for rival in d.at_best.signatures:
             if rival.effect != member.effect:
                 k = names.index(rival.effect)
-                value = separation(d.problem, best.fit, member, rival, d.at_best)
+                value = separation(d.problem, best.fit, (member,), rival, d.at_best)
                 table[i, k] = np.nanmin([table[i, k], value])
     figure = Figure(figsize=(10, 1.8 + 0.3 * len(members)), layout="constrained")
     ax = figure.subplots()

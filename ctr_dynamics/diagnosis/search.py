@@ -10,13 +10,14 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
 
 import numpy as np
 from joblib import Parallel, delayed
 from numpy.typing import NDArray
 
-from .candidates import Candidate, log_prior
-from .explanations import Explanation, Job, finish, fit_all, keys_of, reduced, replaced
+from .candidates import Candidate, keys_of, log_prior
+from .explanations import Explanation, Job, finish, fit_all, reduced, replaced
 from .fit import Fit, Key, Problem, fit
 from .signatures import Linearisation, Scored, linearise, screen, separation
 
@@ -147,20 +148,22 @@ def _finish_contenders(
 def _stand_ins(
     problem: Problem, found: Sequence[Explanation], lin: Linearisation, workers: int
 ) -> list[Explanation]:
-    """The best explanation with each of its causes replaced by those that look much like it there, where nobody has tried.
+    """The best explanation with each of its causes, and each two, replaced by one that looks much like them there, where nobody has tried.
 
-    Screening looks from the re-calibrated model; a large effect looks different from there, and its place may have been taken by a likeness.
+    Screening looks from the re-calibrated model; a large effect looks different from there, and its place may have been taken by a likeness or
+    by two.
     """
     best = found[0]
     tried = {e.keys for e in found}
     jobs = []
-    for member in best.members:
-        rest = tuple(m for m in best.members if m is not member)
+    for gone in (*combinations(best.members, 1), *combinations(best.members, 2)):
+        rest = tuple(m for m in best.members if m not in gone)
+        kept = {m.effect for m in rest} if len(gone) > 1 else set(best.effects)
         near = sorted(
             (
-                (separation(problem, best.fit, member, rival, lin), i, rival)
+                (separation(problem, best.fit, gone, rival, lin), i, rival)
                 for i, rival in enumerate(lin.signatures)
-                if rival.effect not in best.effects
+                if rival.effect not in kept
             ),
             key=lambda item: item[:2],
         )
@@ -168,7 +171,7 @@ def _stand_ins(
             (*rest, rival) for d, _, rival in near if d < STAND_IN and keys_of((*rest, rival)) not in tried
         ][:STAND_INS]
         tried.update(keys_of(members) for members in wanted)
-        jobs += [(members, member) for members in wanted]
+        jobs += [(members, gone) for members in wanted]
     limit = _limit(problem, found)
     fits = Parallel(workers, prefer="threads")(
         delayed(replaced)(problem, best, members, gone, lin, limit) for members, gone in jobs

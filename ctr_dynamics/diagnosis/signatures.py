@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ctr_dynamics.effects import EFFECTS, Quantity
 
-from .candidates import Candidate, causes_of, tube_of
+from .candidates import Candidate, causes_of, keys_of, tube_of
 from .fit import INSIDE, Fit, Key, Problem, inside, posterior, prior_variance, variances
 
 Floats = NDArray[np.float64]
@@ -219,10 +219,11 @@ def screen(
 
 
 def separation(
-    problem: Problem, fit: Fit, member: Candidate, rival: Candidate | None, lin: Linearisation
+    problem: Problem, fit: Fit, members: Sequence[Candidate], rival: Candidate | None, lin: Linearisation
 ) -> float:
-    """d_sep of one cause: the size of its signature, whitened, with nuisances, other causes and the rival projected out."""
-    own = {q.key for q in member.quantities}
+    """d_sep of a cause, or of several together: the size of what they do, whitened, with nuisances, other causes and the rival projected out."""
+    own = {q.key for c in members for q in c.quantities}
+    gone = keys_of(members)
     departure = np.array(
         [v - q.off if q.key in own else 0.0 for q, v in zip(fit.active, fit.values, strict=True)]
     )
@@ -230,7 +231,7 @@ def separation(
     parts = [
         fit.columns[:, i] * math.sqrt(prior_variance(q, q.key in wide))
         for i, q in enumerate(fit.active)
-        if q.key not in member.keys
+        if q.key not in gone
     ]
     if rival is not None and rival in lin.signatures:
         parts += [lin.signatures[rival][:, k] * q.scale for k, q in enumerate(rival.quantities)]

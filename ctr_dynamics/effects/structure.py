@@ -230,8 +230,8 @@ register(
                 "1",
                 1.0,
                 0.15,
-                low=0.3,
-                text="bending stiffness about one principal axis over that about the other",
+                low=1.0,  # below, the other axis is the stiffer one: the same tube, described twice
+                text="bending stiffness about the stiffer principal axis over that about the other",
             ),
             Parameter(
                 "tubeN.axis_rad",
@@ -239,6 +239,7 @@ register(
                 0.3,
                 0.8,
                 shape=True,
+                period=math.pi,
                 text="angle of the stiffer axis in the tube's frame",
             ),
         ),
@@ -246,7 +247,7 @@ register(
         "A tube's cross-section is oval: it bends more easily about one axis, twice a turn.",
         "Timoshenko, Strength of Materials: unsymmetrical bending",
         extended=True,
-        presets=({"axis_rad": 0.0}, {"axis_rad": math.pi / 4}),
+        presets=tuple({"axis_rad": k * math.pi / 4} for k in range(4)),
     )
 )
 

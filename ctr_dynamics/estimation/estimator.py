@@ -10,7 +10,7 @@ import math
 import time
 from array import array
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -44,12 +44,14 @@ WAITING_SAMPLES = 200  # poses kept until the first joint state
 STABILITY_EVERY = 33  # steps between looks at the elastic stability
 KEEP_EVERY = 8  # steps between kept states that late inputs return to
 MODES_EVERY = 132  # steps between refreshes of the vibration modes
-MOST_UNPAUSED = 8  # steps before what waits for a pause is done without one
+MOST_UNPAUSED = 66  # steps before what waits for a pause is done without one
 RETRY_EVERY = 33  # steps between starts while there is no equilibrium: looking for one in vain takes long
 MAX_FAILURES = 10  # steps in a row that may fail before the model starts anew at rest
 SAME_COURSE = (
     8  # steps: joints no later than that move the robot so little that the covariance need not be moved again
 )
+MOST_BEFORE_REDONE = 32  # steps: a course that waits for its correction is not continued farther than this
+MARGIN = 2.0  # times the mean cost of a step: so much time must be left for taking one again
 MAX_BEHIND = 1000  # steps to catch up at once; beyond, the model starts anew
 
 
@@ -66,13 +68,14 @@ class Sample:
 
 @dataclass(frozen=True)
 class Kept:
-    """The whole estimator after step ``k``."""
+    """The whole estimator after step ``k``; ``taken``: by the stamp (ns) of a tracker sample, the step after which it was fused."""
 
     k: int
     fused: State
     alone: State
     fusion: tuple
     alone_tips: tuple
+    taken: dict[int, int]
 
 
 class Estimator:
@@ -144,6 +147,7 @@ class Estimator:
         self._kept: deque[Kept] = deque()
         self._return_to: int | None = None  # ns: inputs from here on have changed
         self._joints_only = True  # and nothing but joints
+        self._redo_s = 1e-3  # what stepping again costs in the mean, a step
         self._fused: State | None = None
         self._alone: State | None = None
         self._alone_tips = TipWindow(self.fusion.tips.size)
@@ -374,21 +378,25 @@ class Estimator:
             return False
         return stamp <= now_ns if self._predicting else stamp <= now_ns - self._timeout_ns
 
-    def advance(self, now_ns: int | None = None) -> list[StepOutput]:
+    def advance(
+        self, now_ns: int | None = None, spare_s: Callable[[], float] | None = None
+    ) -> list[StepOutput]:
         """Take every step that is due. ``now_ns``: time on the stamps' clock; None takes only steps that the joints cover.
 
+        ``spare_s``: tells the time (s) until the next step falls due. Given it, a correction by late inputs goes only as far as there is time;
+        steps on time are then taken on the course that is not yet corrected, and later calls go on with the correction.
         Once the outputs are on their way, :meth:`use_pause` does what they need not wait for.
         """
         if self.t0_ns is None:
             return []
         self._skip_ahead(now_ns)
         outputs: list[StepOutput] = []
-        if self._return_to is not None and self._predicting and not self._due(self.k + 1, now_ns):
-            self._go_back()  # now, while nothing waits for it
+        if self.correcting and not self._due(self.k + 1, now_ns):
+            self._go_back(spare_s)  # now, while nothing waits for it
         while self._due(self.k + 1, now_ns):
             begin = time.perf_counter()
-            if self._return_to is not None:
-                self._go_back()
+            if self._return_to is not None and (spare_s is None or not self._may_wait()):
+                self._go_back(spare_s)
             self.k += 1
             outputs.append(self._take(self.k))
             if self.step_times_s is not None:
@@ -397,6 +405,18 @@ class Estimator:
             if self._unpaused >= MOST_UNPAUSED:
                 self.use_pause()
         return outputs
+
+    @property
+    def correcting(self) -> bool:
+        """Whether inputs have changed steps that are out already, and the correction is not done."""
+        return self._return_to is not None and self._predicting
+
+    def _may_wait(self) -> bool:
+        """Whether the next step may be taken before the correction that is due."""
+        assert self.t0_ns is not None and self._return_to is not None
+        begun = bool(self._kept) and self._kept[-1].k == self.k
+        behind = self.k - (self._return_to - self.t0_ns) // DT_NS
+        return self._predicting and begun and behind < MOST_BEFORE_REDONE
 
     def use_pause(self) -> None:
         """A part of the work that no output waits for: the misfit monitor's, and a look at the stability or a part of the modes' refresh."""
@@ -664,14 +684,19 @@ class Estimator:
 
     # -- roll-back --
 
-    def _keep(self, k: int) -> None:
+    def _keep(self, k: int, always: bool = False) -> None:
         """Remember the whole state after step ``k``, for as long as inputs may come late."""
-        if not self._predicting and k % KEEP_EVERY:
+        if not (always or self._predicting) and k % KEEP_EVERY:
             return
         assert self._fused is not None and self._alone is not None
         self._kept.append(
             Kept(
-                k, self._fused.copy(), self._alone.copy(), self.fusion.snapshot(), self._alone_tips.snapshot()
+                k,
+                self._fused.copy(),
+                self._alone.copy(),
+                self.fusion.snapshot(),
+                self._alone_tips.snapshot(),
+                {s.stamp_ns: s.fused_k for s in self._samples if s.fused_k is not None},
             )
         )
         oldest = k - self.window_ns // DT_NS - 9
@@ -682,14 +707,28 @@ class Estimator:
         self._joints.forget(horizon)
         self._load.forget(horizon)
 
-    def _go_back(self) -> None:
-        """Return to the last kept state before the changed inputs and step again, silently, to where the estimator was."""
+    def _return(self, kept: Kept) -> None:
+        """Be where the estimator was at ``kept``."""
+        self._fused, self._alone = kept.fused.copy(), kept.alone.copy()
+        self.fusion.restore(kept.fusion)
+        self._alone_tips.restore(kept.alone_tips)
+        for sample in self._samples:
+            sample.fused_k = kept.taken.get(sample.stamp_ns)
+
+    def _go_back(self, spare_s: Callable[[], float] | None = None) -> None:
+        """Return to the last kept state before the changed inputs and step again, silently, to where the estimator was.
+
+        With ``spare_s``, only while there is time: what has been corrected is kept, and the course goes on where it was.
+        """
+        if spare_s is not None and self._may_wait() and spare_s() < MARGIN * self._redo_s:
+            return
         from_ns, self._return_to = self._return_to, None
         joints_only, self._joints_only = self._joints_only, True
         assert from_ns is not None and self.t0_ns is not None
         reached = self.k
         usable = [kept for kept in self._kept if self.t0_ns + kept.k * DT_NS <= from_ns]
-        tracks: dict[int, Kept] = {}
+        course: dict[int, Kept] = {}  # the steps that are taken again, as they were
+        changed = 0.0  # first of them whose covariance is another now
         if not usable and self._kept and self._kept[0].k == 0:
             if self._start(0):
                 return
@@ -698,32 +737,52 @@ class Estimator:
             kept = usable[-1] if usable else self._kept[0]
             k = kept.k
             while self._kept and self._kept[-1].k > k:
-                track = self._kept.pop()
-                tracks[track.k] = track
-            changed = self._first_fusion(k) if joints_only and reached - k <= SAME_COURSE else 0
-            tracks = {again: track for again, track in tracks.items() if again < changed}
-            self._fused, self._alone = kept.fused.copy(), kept.alone.copy()
-            self.fusion.restore(kept.fusion)
-            self._alone_tips.restore(kept.alone_tips)
-            for sample in self._samples:
-                if sample.fused_k is not None and sample.fused_k > k:
-                    sample.fused_k = None
+                once = self._kept.pop()
+                course[once.k] = once
+            if joints_only and reached - k <= SAME_COURSE:
+                changed = self._first_fusion(k)
+            self._return(kept)
         else:
             return
-        before = (len(self._innovations), self.health.nis_sum)
+        before = len(self._innovations)
         counters = self._frozen()
         # the next joints will return to the last step that these cover; what comes later than it should, to one of every eighth
         covered = (self._joints.stamps[-1] - self.t0_ns) // DT_NS
+        done = True
         for again in range(k + 1, reached + 1):
+            if (
+                spare_s is not None
+                and reached in course
+                and reached - again < MOST_BEFORE_REDONE
+                and spare_s() < MARGIN * self._redo_s
+            ):
+                self._put_off(again - 1, course, joints_only and again <= changed)
+                done = False
+                break
+            begin = time.perf_counter()
             self.health.rolled_back += 1
-            result = self._step(again, tracks.get(again), keep=again >= covered)
+            result = self._step(again, course.get(again) if again < changed else None, keep=again >= covered)
             if not result.ok:
-                tracks.clear()
+                changed = 0.0
                 self.health.failed(result.reason)
                 if self._alone_tips.last.stamp < again * DT_NS * 1e-9 - 1e-9:  # the model alone failed too
                     self._fused = None
                     break
-        self._thaw(counters, before[0], k)
+            self._redo_s += 0.1 * (time.perf_counter() - begin - self._redo_s)
+        self._thaw(counters, before, done)
+
+    def _put_off(self, corrected: int, course: dict[int, Kept], same: bool) -> None:
+        """Leave the correction at the step ``corrected``, to be gone on with from there, and return to the end of the ``course`` as it was.
+
+        ``same``: the covariance is that of the course still.
+        """
+        assert self.t0_ns is not None
+        if self._kept[-1].k != corrected:
+            self._keep(corrected, always=True)
+        self._kept.extend(course[k] for k in sorted(course) if k > corrected)
+        self._return(self._kept[-1])
+        self._return_to = self.t0_ns + corrected * DT_NS
+        self._joints_only = same
 
     def _first_fusion(self, k: int) -> float:
         """The first step after ``k`` at which a sample has been fused or now will be; up to there the covariance knows no other course."""
@@ -753,10 +812,10 @@ class Estimator:
             self._residuals,
         )
 
-    def _thaw(self, counters: tuple, innovations: int, k: int) -> None:
-        """Samples that were counted when they were first fused are not counted again."""
+    def _thaw(self, counters: tuple, innovations: int, done: bool) -> None:
+        """Samples that were counted when they were first fused are not counted again; none while the correction is not ``done``."""
         h = self.health
-        again = self._innovations[innovations:]
+        again = self._innovations[innovations:] if done else []
         del self._innovations[innovations:]
         repeated = {i.stamp_ns for i in self._reported} if again else set()
         fresh = [i for i in again if i.stamp_ns not in repeated]

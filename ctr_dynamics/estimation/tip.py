@@ -130,12 +130,14 @@ class TipWindow:
     def snapshot(self) -> tuple:
         """What :meth:`restore` needs. The last two rows of columns may change yet (:meth:`interpolate`), the means with every correction."""
         recent = self.columns[max(0, self.end - 2) : self.end].copy()
-        return self.end, self.stamps, self.means[self.begin : self.end].copy(), self.columns, recent
+        rows = slice(self.begin, self.end)
+        return self.end, self.stamps[rows].copy(), self.means[rows].copy(), self.columns, recent
 
     def restore(self, snapshot: tuple) -> None:
         """Go back to an earlier snapshot."""
-        self.end, self.stamps, means, self.columns, recent = snapshot
-        self.means[self.begin : self.end] = means
+        self.end, stamps, means, self.columns, recent = snapshot
+        rows = slice(self.begin, self.end)
+        self.stamps[rows], self.means[rows] = stamps, means
         self.columns[self.end - len(recent) : self.end] = recent
 
     def follow(self, snapshot: tuple, node: Floats, insertion_rate: float) -> None:

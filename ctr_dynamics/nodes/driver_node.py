@@ -29,8 +29,8 @@ from ctr_dynamics.nodes.naming import NAMESPACE, message_class, node_topic
 from ctr_dynamics.nodes.playback import load, pace, shifted
 from ctr_dynamics.nodes.spinning import stop_on_signals
 
-LEAD_NS = 200_000_000
-"""From the match of the topics to the first message."""
+LEAD_NS = 500_000_000
+"""From the match of the topics, as the publishers see it, to the first message: on a busy machine subscribers see it that much later."""
 
 PARAMETERS: dict[str, tuple[Any, str]] = {
     "bag": ("", "Bag to play: an .mcap file or a folder with one."),

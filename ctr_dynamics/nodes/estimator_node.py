@@ -27,6 +27,7 @@ from ctr_dynamics.messages.cdr import CdrError, decode_joint_state, decode_pose_
 from ctr_dynamics.messages.encode import StepEncoder
 from ctr_dynamics.nodes import diagnostics, qos
 from ctr_dynamics.nodes.declaration import declare, watch
+from ctr_dynamics.nodes.memory import keep_memory
 from ctr_dynamics.nodes.naming import NAME, NAMESPACE, message_class, node_topic
 from ctr_dynamics.nodes.outputs import Outputs
 from ctr_dynamics.nodes.recorder import Recorder
@@ -348,6 +349,7 @@ class EstimatorNode(Node):
 def main(args: list[str] | None = None) -> int:
     """Run the node; returns 0 after SIGINT or SIGTERM, 2 when it cannot start with what it was given."""
     sys.setswitchinterval(SWITCH_INTERVAL_S)
+    keep_memory()
     return run_node("estimator", EstimatorNode, EstimatorNode.close, args)
 
 

@@ -8,6 +8,7 @@ and the thread sleeps until the next one is, or until a message wakes it.
 from __future__ import annotations
 
 import gc
+import math
 import threading
 import time
 import traceback
@@ -30,8 +31,6 @@ IDLE_NS = 50_000_000
 RETRY_NS = 1_000_000
 COLLECT_NS = 1_000_000_000
 COLLECT_SLACK_NS = 1_500_000
-LONGEST_WAIT_NS = 2_400_000
-"""Inputs wait no longer than this for a step: one that has just been published leaves about as long until the next."""
 GATHER_NS = 8_000_000
 """So long after the first joints the model starts: a load of the same time comes a moment later, and starting takes longer than that."""
 PAUSE_NS = 1_000_000
@@ -43,7 +42,11 @@ class Steps(Protocol):
 
     @property
     def t0_ns(self) -> int | None: ...
-    def advance(self, now_ns: int | None = None) -> Sequence[Any]: ...
+    @property
+    def correcting(self) -> bool: ...
+    def advance(
+        self, now_ns: int | None = None, spare_s: Callable[[], float] | None = None
+    ) -> Sequence[Any]: ...
     def use_pause(self) -> None: ...
     def reset(self) -> None: ...
 
@@ -141,7 +144,7 @@ class StepLoop(threading.Thread):
         self._wall = wall
         self._gather_ns = gather_ns
         self._took_steps = False
-        self._correction_ns = 0  # what going back has cost lately
+        self._pause_due = False
         self._wake = threading.Event()
         self._stopping = False
         self._last: tuple[int, int] | None = None  # k and stamp of the last step taken
@@ -218,12 +221,9 @@ class StepLoop(threading.Thread):
     def _round(self) -> None:
         self._took_steps = False
         try:
-            if self._step_first():
-                self._advance(corrects=False)
-            corrects = bool(self.inbox)
             while self.inbox:
                 self.inbox.popleft()()
-            self._advance(corrects)
+            self._advance()
         except Exception as error:
             # The node stays up whatever a message provokes: the fault is shown, the estimator starts anew.
             self.faults += 1
@@ -232,43 +232,37 @@ class StepLoop(threading.Thread):
                 f"fault in the stepping thread, the estimator starts anew\n{traceback.format_exc()}"
             )
             self.reset()
-        if self._took_steps and not self.inbox:
-            self._use_pause()
+        if self._took_steps:
+            self._pause_due = True
+        if not self.estimator.correcting:
+            if self._pause_due and not self.inbox and self._spare_s() * 1e9 > PAUSE_NS:
+                self._pause_due = False
+                self.estimator.use_pause()
+        elif self._took_steps:
+            self._wake.set()  # now there is time for it
         self._housekeeping(self._clock_ns())
         self._collect()
 
-    def _step_first(self) -> bool:
-        """Whether the step on time goes before what has arrived.
-
-        Under `predict` an input means going back some steps. When that could not be done before the next step
-        is due, the step is taken on time first, and the inputs, all together, in the pause behind it.
-        """
+    def _spare_s(self) -> float:
+        """Time until the next step falls due, s; infinite where nothing tells."""
         due_ns = self._next_due_ns()
-        if self.timing.policy != "predict" or not self._wall or due_ns is None or not self.inbox:
-            return False
-        wait_ns = due_ns - self._now_ns()
-        if wait_ns > min(self._correction_ns, LONGEST_WAIT_NS):
-            return False
-        if wait_ns > 0:
-            time.sleep(wait_ns * 1e-9)
-        return True
+        return math.inf if due_ns is None or not self._wall else (due_ns - self._now_ns()) * 1e-9
 
-    def _advance(self, corrects: bool) -> None:
-        """Take what is due; `corrects`: inputs have come, going back may be part of it."""
+    def _advance(self) -> None:
+        """Take what is due, and correct what inputs have changed while there is time."""
         if self._gathering_ns() > 0:
             return
         for _ in range(SLICE_STEPS):
             until_ns, more = self._until(self._now_ns())
+            corrects = self.estimator.correcting
             begin = time.perf_counter_ns()
-            steps = self.estimator.advance(until_ns)
+            steps = self.estimator.advance(until_ns, self._spare_s)
             spent_ns = time.perf_counter_ns() - begin
             if steps:
                 self._took_steps = True
                 self.timing.stepped(len(steps), spent_ns)
             elif corrects:
                 self.timing.corrected(spent_ns)
-                self._correction_ns = max(spent_ns, self._correction_ns * 9 // 10)
-            corrects = False
             for step in steps:
                 if self._last is not None and step.k <= self._last[0]:
                     self.timing.restarted()  # the estimator has started anew by itself
@@ -289,12 +283,6 @@ class StepLoop(threading.Thread):
         if self._joints_since_ns is None:
             self._joints_since_ns = now_ns
         return max(self._joints_since_ns + self._gather_ns - now_ns, 0)
-
-    def _use_pause(self) -> None:
-        """Let the estimator do what no output waits for when there is time before the next step; when there never is, it helps itself."""
-        due_ns = self._next_due_ns()
-        if not self._wall or due_ns is None or due_ns - self._now_ns() > PAUSE_NS:
-            self.estimator.use_pause()
 
     def _now_ns(self) -> int:
         """Time on the clock of the stamps; 0 while there is no clock."""

@@ -1,5 +1,6 @@
 """The stepping thread and its account, against scripted estimators and clocks."""
 
+import math
 import threading
 from functools import partial
 from types import SimpleNamespace
@@ -23,12 +24,15 @@ class Scripted:
         self.asked = []
         self.resets = self.pauses = 0
         self.fault = None
+        self.correcting = False
+        self.spare_s = None
 
     def use_pause(self):
         self.pauses += 1
 
-    def advance(self, now_ns=None):
+    def advance(self, now_ns=None, spare_s=None):
         self.asked.append(now_ns)
+        self.spare_s = spare_s()
         if self.fault is not None:
             fault, self.fault = self.fault, None
             raise fault
@@ -173,22 +177,30 @@ def test_a_fault_is_shown_and_the_estimator_starts_anew(clock):
     assert "ZeroDivisionError" in errors[0]
 
 
-def test_a_step_that_is_due_goes_before_inputs_that_cost_too_much(clock):
+def test_corrections_are_told_how_much_time_there_is(clock):
     estimator = Scripted(clock.now)
     loop, published, _ = make_loop(estimator, clock)
     loop._round()
-    loop._correction_ns = 10 * MS
-    seen = []
-    clock.now += STEP_NS
-    loop.put(lambda: seen.append(len(published)))
-    loop._round()
-    assert seen == [2]
-    # With time to spare, inputs come first.
+    assert estimator.spare_s == math.inf  # before the first step nothing is due
     clock.now += STEP_NS // 4
-    loop.put(lambda: seen.append(len(published)))
-    loop._correction_ns = 0
     loop._round()
-    assert seen == [2, 2]
+    assert estimator.spare_s == pytest.approx(0.75 * STEP_NS * 1e-9)
+    clock.now += STEP_NS
+    loop._round()
+    assert estimator.spare_s == pytest.approx(-0.25 * STEP_NS * 1e-9)
+    assert len(published) == 2
+
+
+def test_a_correction_that_waits_goes_before_the_pause(clock):
+    estimator = Scripted(clock.now)
+    loop, _, _ = make_loop(estimator, clock)
+    loop._round()
+    assert estimator.pauses == 1
+    estimator.correcting = True
+    clock.now += STEP_NS
+    loop._round()
+    assert estimator.pauses == 1
+    assert loop._wake.is_set()  # the next round begins at once
 
 
 def test_calls_run_in_the_thread_and_hand_back_result_or_error(clock):
