@@ -2,7 +2,8 @@
 
 The estimator and a driver run as two processes of this machine; nobody but this script's own listener (with
 --listen) hears the outputs. Bags are played one after the other, each run with a fresh estimator, until the
-asked time has been played. Figures go to standard output as JSON.
+asked time has been played. Figures go to standard output as JSON. Beside them stands the machine's own
+punctuality: how often a thread of this script that does nothing but sleep until the next 3 ms is as late.
 
     python benchmarks/live_run.py BAG [BAG ...] --seconds 60 --policy predict
 """
@@ -15,6 +16,7 @@ import json
 import os
 import sys
 import tempfile
+import threading
 import time
 from pathlib import Path
 from typing import Any
@@ -24,7 +26,35 @@ from ctr_dynamics.nodes.listener import Listener
 from ctr_dynamics.nodes.playback import load
 from ctr_dynamics.nodes.processes import DRIVER, ESTIMATOR, NodeProcess, free_domain
 
+STEP_NS = 3_000_000
 LIMITS = {"late_fraction": 0.001, "late_over_20ms": 0, "skipped": 0}
+
+
+class Sleeper(threading.Thread):
+    """Sleeps from one 3 ms deadline to the next and notes how late it wakes, in ms."""
+
+    def __init__(self) -> None:
+        super().__init__(daemon=True)
+        self.late_ms: list[float] = []
+        self._stopping = threading.Event()
+
+    def run(self) -> None:
+        due_ns = time.monotonic_ns() + STEP_NS
+        while not self._stopping.is_set():
+            time.sleep(max(0, due_ns - time.monotonic_ns()) * 1e-9)
+            self.late_ms.append((time.monotonic_ns() - due_ns) * 1e-6)
+            due_ns += STEP_NS
+
+    def stop(self) -> dict[str, Any]:
+        """End it; returns its figures, named like a node's."""
+        self._stopping.set()
+        self.join()
+        return {
+            "steps": len(self.late_ms),
+            "late_over_3ms": sum(late > 3.0 for late in self.late_ms),
+            "late_over_20ms": sum(late > 20.0 for late in self.late_ms),
+            "max_ms": max(self.late_ms, default=0.0),
+        }
 
 
 def run(bag: Path, settings: dict[str, Any], seconds: float, listen: bool) -> dict[str, Any]:
@@ -46,12 +76,20 @@ def run(bag: Path, settings: dict[str, Any], seconds: float, listen: bool) -> di
         before = processor_time(estimator.pid)
         played = {"bag": str(bag), "duration_s": seconds, "wait_s": 900.0}
         driver = stack.enter_context(NodeProcess(DRIVER, played, domain, folder / "driver.log"))
+        sleeper = Sleeper()
+        sleeper.start()
         while driver.code is None and estimator.code is None:
             time.sleep(0.2)
+        machine = sleeper.stop()
         used = processor_time(estimator.pid) - before
         if estimator.code is not None or driver.code != 0 or estimator.stop() != 0:
             raise SystemExit(f"{driver.output()}\n{estimator.output()}")
-        return {"bag": str(bag), **json.loads(report.read_text()), "processor_s": round(used, 2)}
+        return {
+            "bag": str(bag),
+            **json.loads(report.read_text()),
+            "processor_s": round(used, 2),
+            "machine": machine,
+        }
 
 
 def processor_time(pid: int) -> float:
@@ -93,6 +131,8 @@ def main() -> int:
         "late_fraction": sum(r["late_over_3ms"] for r in runs) / max(steps, 1),
         "late_over_20ms": sum(r["late_over_20ms"] for r in runs),
         "skipped": sum(r["skipped"] for r in runs),
+        "machine_late_fraction": sum(r["machine"]["late_over_3ms"] for r in runs)
+        / max(sum(r["machine"]["steps"] for r in runs), 1),
         "max_lateness_ms": max(r["lateness_ms"]["max"] for r in runs),
         "runs": runs,
     }

@@ -31,7 +31,7 @@ IDLE_NS = 50_000_000
 RETRY_NS = 1_000_000
 COLLECT_NS = 1_000_000_000
 COLLECT_SLACK_NS = 1_500_000
-GATHER_NS = 8_000_000
+GATHER_NS = 4_000_000
 """So long after the first joints the model starts: a load of the same time comes a moment later, and starting takes longer than that."""
 PAUSE_NS = 1_000_000
 """What the estimator does in a pause takes about as long."""
