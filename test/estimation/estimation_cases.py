@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import groupby
 from pathlib import Path
 from typing import Any
@@ -110,22 +111,25 @@ def play(
     *,
     tick: float = 0.0,
     robot: Any = "till2020_tissue",
+    spare: Callable[[Estimator], float] | None = None,
 ) -> Run:
     """Messages in the order of their arrival; the clock is that of the stamps.
 
     Args:
         tick: s between further calls of `advance`, as a live node makes them; 0 calls it at arrivals only.
+        spare: of the estimator, the time (s) until the next step, as `advance` asks for it.
     """
     made, outputs = estimator(settings, robot), []
+    spare_s = None if spare is None else partial(spare, made)
     now = None
     for arrival, group in groupby(sorted(messages, key=lambda m: m.arrival), key=lambda m: m.arrival):
         while tick and now is not None and now + round(tick * 1e9) < arrival:
             now += round(tick * 1e9)
-            outputs += made.advance(START_NS + now)
+            outputs += made.advance(START_NS + now, spare_s)
         for message in group:
             message.give(made)
         now = arrival
-        outputs += made.advance(START_NS + now)
+        outputs += made.advance(START_NS + now, spare_s)
     return Run(outputs + made.finish(), made)
 
 

@@ -1,5 +1,7 @@
 """Inputs that come late, out of order or early: roll-back, the window of kept tips, and the two output policies."""
 
+import math
+
 import numpy as np
 import pytest
 from estimation_cases import bag_messages, check_outputs, estimator, play
@@ -81,6 +83,60 @@ def test_late_joints_under_predict_end_as_in_time_under_wait(sweep, in_time):
     assert np.abs(run.last.predicted_position - last.predicted_position).max() < 1e-6
     # samples are counted once, however often they were fused again
     assert run.estimator.health.accepted == in_time.estimator.health.accepted
+
+
+def corrected_apart(a, b):
+    """Distances (m) of the tips, fused and of the model alone, after the last corrections: the last output may have been before them."""
+    return tuple(
+        float(np.linalg.norm(x.last.position - y.last.position))
+        for x, y in (
+            (a.estimator.fusion.tips, b.estimator.fusion.tips),
+            (a.estimator._alone_tips, b.estimator._alone_tips),
+        )
+    )
+
+
+@pytest.mark.parametrize("share", [0.3, 0.7])
+def test_corrections_without_time_are_put_off_and_end_the_same(sweep, in_time, share):
+    """Joints and poses come late, and now and then there is no time to go on with the correction."""
+    rng = np.random.default_rng(7)
+    late = [
+        m.late(0.030 if m.kind == "joints" else rng.uniform(0.0, 0.1)) if 0 < m.stamp < 1.0e9 else m
+        for m in sweep
+    ]
+    run = play(
+        late,
+        {"output.policy": "predict"},
+        tick=STEP,
+        spare=lambda made: math.inf if made.k > 350 or rng.random() < share else 0.0,
+    )
+    check_outputs(run)
+    assert [out.k for out in run.outputs] == list(range(len(run.outputs)))
+    assert all(out.valid for out in run.outputs)
+    assert not run.estimator.correcting
+    straight = play(late, {"output.policy": "predict"}, tick=STEP)
+    # put-off corrections are begun anew after what came meanwhile, never left out
+    assert run.estimator.health.rolled_back != straight.estimator.health.rolled_back
+    for reference in (straight, in_time):
+        fused, alone = corrected_apart(run, reference)
+        assert fused < 5e-6
+        assert alone < 2e-6
+    # samples are counted once, however often they were fused again
+    health = run.estimator.health
+    assert health.accepted + health.rejected == in_time.estimator.health.accepted
+    stamps = [i.stamp_ns for out in run.outputs for i in out.innovations]
+    assert len(stamps) == len(set(stamps))
+
+
+def test_a_course_without_time_for_its_correction_is_corrected_in_the_end(sweep, in_time):
+    """There is never any time: the correction then goes before the steps, and no further behind than it must."""
+    run = play(
+        sweep, {"output.policy": "predict"}, tick=STEP, spare=lambda made: math.inf if made.k > 380 else 0.0
+    )
+    check_outputs(run)
+    assert all(out.valid for out in run.outputs)
+    assert run.estimator.health.rolled_back > 100
+    assert corrected_apart(run, in_time)[1] < 1e-6
 
 
 def test_predict_with_joints_in_time_extrapolates_for_less_than_their_period(sweep, in_time):
