@@ -35,6 +35,7 @@ NOT_NOISE = 1e-4  # p below which what is left is no noise
 LEFT_SHARE = 0.03  # of the misfit beyond noise that a named cause may leave before it is called unknown
 # NIS per degree of freedom on validation bags up to which they are predicted down to the noise
 PREDICTED = 1.15
+PREDICTED_SHARE = 0.2  # of the misfit there that may be left
 NAMED = 0.9  # probability from which a set of causes is named
 CLEAN_GAIN = 4.0  # log evidence, priors included, that a cause must gain over none
 SEPARATION = 5.0  # whitened units: linear signatures that are nearer cannot be told apart
@@ -55,6 +56,12 @@ class Validation:
     nis_before: float
     nis_after: float
     bags: list[tuple[str, float, float]] = field(default_factory=list)
+
+    @property
+    def confirms(self) -> bool:
+        """Whether the extension predicts the bags down to the noise; a motion that hardly shows the misfit tells nothing of what removes it."""
+        misfit = self.nis_before - 1.0
+        return self.nis_after <= PREDICTED and self.nis_after - 1.0 <= PREDICTED_SHARE * misfit
 
 
 @dataclass
@@ -236,7 +243,7 @@ def _decide(
     if validation:
         note("validation")
         result.validation = validate(problem, clean.fit, best.fit, validation)
-    predicted = result.validation is not None and result.validation.nis_after <= PREDICTED
+    predicted = result.validation is not None and result.validation.confirms
     if not noise and (not best.members or (left > LEFT_SHARE and not predicted)):
         result.verdict = "unknown"
         result.members = [Member(None, "unknown", 0.95, None, [])]

@@ -124,7 +124,8 @@ register(
         "Coulomb friction is larger near rest (stick-slip where epsilon is small).",
         "Armstrong-Helouvry, Dupont, Canudas de Wit (1994): Gaussian Stribeck curve",
         extended=True,
-        presets=({"speed_rad_s": 0.5}, {"speed_rad_s": 5.0}),
+        presets=({"speed_rad_s": 0.5}, {"speed_rad_s": 1.6}, {"speed_rad_s": 5.0}),
+        far=(2.0,),
     )
 )
 

@@ -8,6 +8,7 @@ import pytest
 from ctr_dynamics.cli.main import spread
 from ctr_dynamics.diagnosis.candidates import candidates
 from ctr_dynamics.diagnosis.checks import block_bootstrap
+from ctr_dynamics.diagnosis.diagnose import Validation
 from ctr_dynamics.diagnosis.experiment import at_times, play, product, rotate, smooth, to_vectors
 from ctr_dynamics.diagnosis.fit import posterior
 from ctr_dynamics.diagnosis.noise import Whitener
@@ -126,3 +127,18 @@ def test_validate_takes_every_bag_up_to_the_next_option():
     assert spread(given, ("--validate",)) == [
         "diagnose", "a", "--validate", "b", "--validate", "c", "--robot", "r", "--validate", "d", "--json",
     ]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "confirmed"),
+    [
+        (30.0, 1.02, True),
+        (30.0, 1.2, False),
+        (1.26, 1.13, False),
+        (1.26, 1.03, True),
+        (1.0, 0.99, True),
+        (0.99, 1.05, False),
+    ],
+)
+def test_a_validation_confirms_what_removes_most_of_a_visible_misfit(before, after, confirmed):
+    assert Validation(1e-3, 1e-3, 0.0, (0.0, 0.0), before, after).confirms is confirmed
