@@ -25,14 +25,13 @@ from .fit import Fit, Local, Problem, fit, make_problem
 from .mistakes import find_mistake
 from .numerics import add_numerics
 from .recording import Recording
-from .search import Search, distinct, search
+from .search import LEFT_SHARE, Search, distinct, search
 from .signatures import Linearisation, linearise, observable, separation
 from .unexplained import Unexplained, unexplained
 
 Floats = NDArray[np.float64]
 Note = Callable[[str], None]
 NOT_NOISE = 1e-4  # p below which what is left is no noise
-LEFT_SHARE = 0.03  # of the misfit beyond noise that a named cause may leave before it is called unknown
 # NIS per degree of freedom on validation bags up to which they are predicted down to the noise
 PREDICTED = 1.15
 PREDICTED_SHARE = 0.2  # of the misfit there that may be left

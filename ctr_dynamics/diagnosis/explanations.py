@@ -3,20 +3,22 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from joblib import Parallel, delayed
 from numpy.typing import NDArray
+from scipy.optimize import minimize_scalar
 
-from ctr_dynamics.effects import EFFECTS, quantities
+from ctr_dynamics.effects import EFFECTS, Quantity, quantities
 
 from .candidates import Candidate, causes_of, keys_of
 from .fit import Fit, Key, Local, Problem, fit, posterior, variances
-from .signatures import Linearisation, Scored
+from .signatures import PROBE_STEP, Linearisation, Scored, strayed
 
 Floats = NDArray[np.float64]
+NEIGHBOURHOOD = (0.5, 1.7)  # of a probe's size: where the size that leaves least is looked for
 
 
 @dataclass
@@ -65,15 +67,39 @@ def explain(problem: Problem, job: Job, limit: float = math.inf) -> Explanation 
     point = {**dict(job.new.candidate.start), **job.start.point}
     own = with_nuisances(problem, members)
     if job.new.probe is not None:
-        # so far from where the columns are known that they are computed anew
-        point.update(job.new.probe.shift)
-        result = fit(own, causes, point, renewals=2, limit=limit, polish=False)
+        # so far from where the columns are known that they are computed anew; nuisances that have strayed lead astray, so nominal ones are tried too
+        starts = [{**point, **job.new.probe.shift}]
+        if strayed(problem, starts[0]):
+            starts.append({**starts[0], **{q.key: q.off for q in problem.nuisances}})
+        fits = []
+        for start in starts:
+            start.update(along(problem, start, job.new.candidate.quantities[0]))
+            fits.append(fit(own, causes, start, renewals=2, limit=limit, polish=False))
+        result = min((f for f in fits if f is not None), key=lambda f: f.cost, default=None)
     else:
         known = Local(
             job.lin.residual, {**job.lin.own(job.new.candidate), **job.start.by_key, **job.lin.columns}
         )
         result = fit(own, causes, point, known, renewals=1, limit=limit, polish=False)
     return None if result is None else Explanation(members, result)
+
+
+def along(problem: Problem, point: Mapping[Key, float], q: Quantity) -> dict[Key, float]:
+    """The size of ``q`` near ``point`` that leaves least, all else as it is. Where an effect changes a frequency, a phase runs away in time, and the
+    columns reach a few per cent far only; nuisances that follow them would settle in the wrong place."""
+    coarse = problem.with_step(PROBE_STEP)
+    departure = point[q.key] - q.off
+
+    def left(share: float) -> float:
+        size = float(np.clip(q.off + share * departure, q.low, q.high))
+        residual = coarse.residual({**point, q.key: size})
+        return math.inf if residual is None else float(residual @ residual)
+
+    found = minimize_scalar(
+        left, bounds=NEIGHBOURHOOD, method="bounded", options={"maxiter": 12, "xatol": 0.01}
+    )
+    share = float(found.x) if found.fun < left(1.0) else 1.0
+    return {q.key: float(np.clip(q.off + share * departure, q.low, q.high))}
 
 
 def fit_all(problem: Problem, jobs: Sequence[Job], limit: float, workers: int) -> list[Explanation]:

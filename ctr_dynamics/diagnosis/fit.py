@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import lsq_linear
 from scipy.special import log_ndtr
 
 from ctr_dynamics.effects import Quantity
@@ -30,6 +31,7 @@ WIDENING = 1.5  # of posterior deviations: errors of tuning cases were larger th
 DIFFERENCE = 0.02  # of the scale, for columns by differences
 # how many times over a fit may gain what its columns promise, at its first steps and later: beyond, it cannot reach its limit
 SURPRISE = (12.0, 6.0, 4.0)
+DAMPING = (1e2, 1e3, 1e4, 1e5)  # in units of the priors' precision
 SETTLED = 0.05  # of the cost: what is not worth a simulation
 
 LOG_INSIDE = float(log_ndtr(INSIDE))
@@ -244,7 +246,9 @@ def fit(
         if promise < SETTLED and not descent.unseen:
             break
         size = float(np.linalg.norm(descent.columns @ step))
-        moved = descent.move(step, parts=4 if promise > 1.0 else 1)
+        moved = descent.move(step, parts=2 if promise > 1.0 else 1)
+        if moved is None and promise > 1.0:
+            moved = descent.creep()
         if moved is None:  # not even a small part of the step is good: the columns are not
             stale = not descent.exact and renewals > 0
             if not stale:
@@ -320,22 +324,43 @@ class _Descent:
         seen, self.unseen = bool(self.unseen), []
         return seen
 
-    def step(self) -> Floats:
-        """Gauss-Newton step inside the bounds; the unseen stay."""
-        departure, numerics = self.values - self.off, self.problem.numerics
-        wanted, _, _ = posterior(self.residual, self.columns, departure, self.variance, numerics)
-        wanted += self.off
-        wanted[self.unseen] = self.values[self.unseen]
-        step = np.clip(wanted, self.low, self.high) - self.values
-        free = (wanted >= self.low) & (wanted <= self.high)
-        free[self.unseen] = False
-        if not free.all():  # the others move with these held
-            left = self.residual - self.columns[:, ~free] @ step[~free]
-            others, _, _ = posterior(
-                left, self.columns[:, free], departure[free], self.variance[free], numerics
-            )
-            step[free] = np.clip(self.off[free] + others, self.low[free], self.high[free]) - self.values[free]
-        return step
+    def step(self, damping: float = 0.0) -> Floats:
+        """Gauss-Newton step inside the bounds; the unseen stay. ``damping``: precision, in units of the prior's, with which the fit is held where
+        it stands (Levenberg-Marquardt)."""
+        seen = np.ones(len(self.values), bool)
+        seen[self.unseen] = False
+        sigma, departure = np.sqrt(self.variance[seen]), (self.values - self.off)[seen]
+        count = len(sigma)
+        J = np.hstack([self.columns[:, seen] * sigma, self.problem.numerics])
+        information = J.T @ J + np.eye(J.shape[1])
+        gradient = J.T @ self.residual
+        information[:count, :count] += damping * np.eye(count)
+        gradient[:count] -= departure / sigma
+        step = np.linalg.solve(information, gradient)[:count] * sigma
+        low, high = (self.low - self.values)[seen], (self.high - self.values)[seen]
+        if np.any(step < low) or np.any(step > high):
+            # bounds of the numerics directions: none
+            root = np.linalg.cholesky(information).T
+            wide = np.full(J.shape[1] - count, np.inf)
+            tiny = 1e-12  # the solver wants some room where a value stands at its bound
+            step = lsq_linear(
+                root,
+                np.linalg.solve(root.T, gradient),
+                (np.append(low / sigma - tiny, -wide), np.append(high / sigma + tiny, wide)),
+                method="bvls",
+            ).x[:count] * sigma  # fmt: skip
+        full = np.zeros(len(self.values))
+        full[seen] = np.clip(step, low, high)
+        return full
+
+    def creep(self) -> tuple[float, float, float] | None:
+        """:meth:`move` by the least damped step that lowers the cost: where the misfit is large, a phase in time is beyond what columns say."""
+        for damping in DAMPING:
+            moved = self.move(self.step(damping), parts=1)
+            if moved is not None:
+                error, gain, _ = moved
+                return error, gain, 0.0
+        return None
 
     def promise(self, step: Floats) -> float:
         """What ``step`` takes off the cost if the columns are right."""

@@ -26,6 +26,7 @@ TEMPERATURE = 1.6  # of the log evidence: a judgement against overconfidence, no
 SHORTLIST = 8  # candidates that are fitted
 BATCH = 2  # fits between which the best is looked at; fixed, so that the outcome does not depend on the number of workers
 SECOND = 4  # second causes that are fitted beside a first
+LEFT_SHARE = 0.03  # of the misfit beyond noise that an explanation may leave
 MUCH = 4.0  # deviations of the noise that an explanation may leave before more is tried
 HOPELESS = 0.3  # of the misfit: two causes that leave more are not made right by a third
 SECOND_EVIDENCE = 5.0  # log evidence that a further cause must add
@@ -73,6 +74,8 @@ def search(
     """
     found = _search(problem, pool, clean, note, workers)
     if found is None or _leftover(problem, found.best.fit) <= MUCH:
+        return found
+    if found.best.fit.chi2 - problem.size <= LEFT_SHARE * (clean.chi2 - problem.size):
         return found
     note("once more, with nuisances beyond their tolerances")
     free = replace(problem, reach=math.inf)

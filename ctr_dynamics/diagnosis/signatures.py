@@ -108,8 +108,9 @@ def linearise(
         return shift, probing.residual({**point, **shift})
 
     # nuisances that have left their tolerances imitate a cause: then it is tried beside nominal ones too
-    strayed = any(abs(point.get(q.key, q.off) - q.off) > INSIDE * q.tolerance for q in problem.nuisances)
-    places = [{}, {q.key: q.off for q in problem.nuisances}] if strayed and again is None else [{}]
+    places: list[dict[Key, float]] = [{}]
+    if again is None and strayed(problem, point):
+        places.append({q.key: q.off for q in problem.nuisances})
     probes = [
         (c, size, back)
         for back in places
@@ -150,6 +151,11 @@ def linearise(
         elif c not in shaped and c not in rough:
             result.signatures[c] = np.stack([result.columns[q.key] for q in c.quantities], axis=1)
     return result
+
+
+def strayed(problem: Problem, point: Mapping[Key, float]) -> bool:
+    """Whether a nuisance has left its tolerance: it then imitates a cause that is missing."""
+    return any(abs(point.get(q.key, q.off) - q.off) > INSIDE * q.tolerance for q in problem.nuisances)
 
 
 def _compatible(shaped: Sequence[Candidate]) -> list[tuple[dict[Key, float], list[Candidate]]]:

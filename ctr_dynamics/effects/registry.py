@@ -196,7 +196,8 @@ def apply_effects(setup: Setup, given: Mapping[str, Mapping[str, Any]]) -> None:
     Raises:
         KeyError: no such effect or parameter (robot files are checked when they are loaded).
     """
-    for name, values in given.items():
+    # what is uncertain in an effect's form comes after the effect
+    for name, values in sorted(given.items(), key=lambda item: EFFECTS[item[0]].nuisance):
         effect = EFFECTS[name]
         full: dict[str, float] = {}
         for p in effect.parameters:

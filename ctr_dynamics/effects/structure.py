@@ -248,6 +248,36 @@ register(
         "Timoshenko, Strength of Materials: unsymmetrical bending",
         extended=True,
         presets=tuple({"axis_rad": k * math.pi / 4} for k in range(4)),
+        far=(1.0,),
+        form=("oval_mean",),
+    )
+)
+
+
+def _oval_mean(setup: Setup, values: Values) -> None:
+    for i in range(setup.n):
+        e2 = sum(float(setup.block[setup.layout[group]][i]) ** 2 for group in ("oval_cos", "oval_sin"))
+        setup.scale("bending_stiffness", i, 1.0 + values["mean"] * e2)
+
+
+register(
+    Effect(
+        "oval_mean",
+        (
+            Parameter(
+                "mean",
+                "1",
+                0.0,
+                0.4,
+                lambda robot, i: 0.4,
+                text="change of the mean bending stiffness over the square of (ratio - 1) / (ratio + 1)",
+            ),
+        ),
+        _oval_mean,
+        "Model-form uncertainty of the ovality: an oval tube of the same perimeter has -0.3, the same geometric mean of the stiffnesses +0.5.",
+        "Timoshenko, Strength of Materials; perimeter and moments of inertia of a thin ellipse",
+        extended=True,
+        nuisance=True,
     )
 )
 

@@ -120,18 +120,25 @@ def test_bounds_priors_and_descriptions_are_sane(name):
 
 @pytest.mark.parametrize("name", sorted(EFFECTS))
 def test_one_scale_away_from_off_every_parameter_acts(name):
-    """A parameter that changes nothing would be found nowhere. Shapes act when their effect is on."""
+    """A parameter that changes nothing would be found nowhere. Shapes act when their effect is on, and what is uncertain in its form likewise."""
     effect = EFFECTS[name]
+    host = next((e.name for e in EFFECTS.values() if name in e.form), "")
     data = copy.deepcopy(robot_to_dict(ROBOT))
     data["gravity"]["value"] = [2.0, -9.0, 3.0]  # a turn about gravity's own axis does nothing
     model = Model(robot_from_dict(data), nodes=12)
     strengths = [q for q in quantities(ROBOT) if q.effect == name and not q.parameter.shape]
     assert strengths
+
+    def away(chosen):
+        return {chosen.effect: {chosen.name: chosen.parameter.value(chosen.off + chosen.scale)}}
+
+    on = next((away(q) for q in quantities(ROBOT) if q.effect == host), {})
     for q in strengths:
-        setup = make_setup(model)
-        apply_effects(setup, {name: {q.name: q.parameter.value(q.off + q.scale)}})
-        assert not same(setup, make_setup(model)), q.name
-        assert setup.extended == (effect.extended and not effect.nuisance), q.name
+        setup, without = make_setup(model), make_setup(model)
+        apply_effects(without, on)
+        apply_effects(setup, {**on, **away(q)})
+        assert not same(setup, without), q.name
+        assert setup.extended == (bool(on) or (effect.extended and not effect.nuisance)), q.name
 
 
 SIGNS = {
