@@ -104,7 +104,8 @@ def findings(diagnosis: Diagnosis, command: str, experiment: dict[str, Any] | No
             "schema": SCHEMA,
             "verdict": d.verdict,
             "causes": causes,
-            "cause_set95": [list(effects) for effects, _ in d.sets],
+            # clean is one explanation by contract; what small causes are possible stands in "probabilities"
+            "cause_set95": [[]] if d.verdict == "clean" else [list(effects) for effects, _ in d.sets],
             "tested": d.tested,
             "not_observable": d.not_observable,
             "numerics": {

@@ -72,7 +72,8 @@ def test_a_clean_bag_is_clean(outcomes):
     findings, _, _ = outcomes["clean"]
     assert findings["verdict"] == "clean"
     assert findings["causes"] == []
-    assert findings["cause_set95"][0] == []
+    assert findings["cause_set95"] == [[]]
+    assert findings["probabilities"][0]["effects"] == []
 
 
 def test_what_is_outside_the_catalogue_is_unknown(outcomes):
