@@ -21,18 +21,20 @@ from ctr_dynamics.errors import InputError
 from ctr_dynamics.model.mesh import node_points, node_positions
 from ctr_dynamics.model.model import Model
 from ctr_dynamics.model.scheme import make_scheme
-from ctr_dynamics.model.simulator import Inputs, Simulator, State, StepResult
+from ctr_dynamics.model.simulator import Simulator, State, StepResult
 from ctr_dynamics.parameters import Settings, axes_mask
 from ctr_dynamics.robot import Robot
 from ctr_dynamics.snap.stability import StabilityWatch
 
+from .actuation import Actuation, standing
 from .fusion import Fusion, FusionOptions
 from .health import Health
+from .intake import UNIT, Unusable, joint_values, pose_values, wrench_values
 from .kernels import backbone_rows, conjugate, from_vector, matrix
 from .misfit import misfit_monitor
 from .modes import ModeTracker
 from .outputs import Innovation, Modes, Moment, SolverStats, StepOutput
-from .signals import Drives, Signal, finite, joint_order
+from .signals import Drives, Signal
 from .tip import TipWindow
 from .tracker import ROTATION, TRANSLATION, registered, tracker_model
 
@@ -170,31 +172,10 @@ class Estimator:
 
     def add_joint_state(self, stamp_ns: int, names: Sequence[str], positions: Sequence[float]) -> None:
         """Take in a joint state: ``tubeN_rotation`` (rad) and ``tubeN_translation`` (m, negative) by name. Wrong ones are counted, not raised."""
-        order = joint_order(names, self.model.n)
-        if isinstance(order, str):
-            self.health.note("joints", "names", order)
-            return
-        if len(positions) < len(names):
-            self.health.note(
-                "joints",
-                "positions",
-                f"joint state has {len(positions)} positions for {len(names)} names; give one each",
-            )
-            return
-        value = np.array([positions[i] for i in order], dtype=float)
-        n = self.model.n
-        if not finite(value.tolist()):
-            self.health.note(
-                "joints",
-                "not finite",
-                f"joint state at {stamp_ns} ns holds a value that is not finite; it was left out",
-            )
-            return
-        value[:n] = self.setup.gain * value[:n] + self.setup.offset
-        value[n:] += self.setup.beta_offset
-        reason = self.robot.actuator_problem(value[n:], value[:n])
-        if reason:
-            self.health.note("joints", "out of range", f"{reason}; the joint state was left out")
+        try:
+            value = joint_values(self.setup, stamp_ns, names, positions)
+        except Unusable as problem:
+            self.health.note("joints", problem.kind, problem.text)
             return
         if self._joints.stamps and stamp_ns < self._joints.stamps[-1] - self.window_ns:
             self._backwards += 1
@@ -238,33 +219,13 @@ class Estimator:
     ) -> None:
         """Take in a tracker pose (m, x y z w) of its header's stamp."""
         frame = str(self.settings["output.frame_id"])
-        if frame_id and frame_id.lstrip("/") != frame:
-            self.health.note(
-                "tracker",
-                "other frame",
-                f"pose in frame '{frame_id}', expected '{frame}'; register the tracker or rename its frame",
-            )
+        try:
+            point, quaternion, norm = pose_values(stamp_ns, position, quaternion_xyzw, frame_id, frame)
+        except Unusable as problem:
+            self.health.note("tracker", problem.kind, problem.text)
             self.health.dropped += 1
             return
-        if not (finite(position) and finite(quaternion_xyzw)):
-            self.health.note(
-                "tracker",
-                "not finite",
-                f"pose at {stamp_ns} ns holds a value that is not finite; it was left out",
-            )
-            self.health.dropped += 1
-            return
-        x, y, z, w = quaternion_xyzw
-        norm = math.sqrt(x * x + y * y + z * z + w * w)
-        if not 0.9 <= norm <= 1.1:
-            self.health.note(
-                "tracker",
-                "quaternion",
-                f"norm {norm:.3g} is outside 0.9 to 1.1; send unit quaternions; the pose was left out",
-            )
-            self.health.dropped += 1
-            return
-        if abs(norm - 1.0) > 1e-3:
+        if abs(norm - 1.0) > UNIT:
             self.health.note("tracker", "quaternion normalised", f"norm {norm:.4f}, limit 1 +- 0.001")
         if any(s.stamp_ns == stamp_ns for s in self._samples[-50:]):
             self.health.note(
@@ -294,8 +255,7 @@ class Estimator:
             return
         if late > 2 * DT_NS * 1e-9:
             self.health.late += 1
-        quaternion = np.array([w, x, y, z]) / norm
-        self._samples.append(Sample(stamp_ns, np.array(position, dtype=float), quaternion, late))
+        self._samples.append(Sample(stamp_ns, point, quaternion, late))
         self._samples.sort(key=lambda s: s.stamp_ns)
         if self.t0_ns is None and len(self._samples) > WAITING_SAMPLES:
             del self._samples[0]
@@ -307,20 +267,13 @@ class Estimator:
     ) -> None:
         """Take in a known wrench on the tip (N, N m about the tip point, ``ctr_base`` axes)."""
         frame = str(self.settings["output.frame_id"])
-        if frame_id and frame_id.lstrip("/") != frame:
-            self.health.note(
-                "load", "other frame", f"load in frame '{frame_id}', expected '{frame}'; send it in base axes"
-            )
-            return
-        if not (finite(force) and finite(torque)):
-            self.health.note(
-                "load",
-                "not finite",
-                f"load at {stamp_ns} ns holds a value that is not finite; it was left out",
-            )
+        try:
+            value = wrench_values(stamp_ns, force, torque, frame_id, frame)
+        except Unusable as problem:
+            self.health.note("load", problem.kind, problem.text)
             return
         stamp_ns += self._load_delay_ns
-        kind = self._load.add(stamp_ns, np.array([*force, *torque], dtype=float))
+        kind = self._load.add(stamp_ns, value)
         if kind == "duplicate":
             self.health.note(
                 "load", "duplicate stamp", f"a second load of {stamp_ns} ns; the first one counts"
@@ -476,7 +429,7 @@ class Estimator:
 
     # -- steps --
 
-    def _inputs(self, corrected: bool) -> _Actuation:
+    def _inputs(self, corrected: bool) -> Actuation:
         """Actuators and load at a time (s from t0), with the estimated offsets and force for the fused run."""
         assert self.t0_ns is not None
         n = self.model.n
@@ -487,7 +440,7 @@ class Estimator:
                 shift[i] += self.fusion.theta[row]
             shift[3 * n : 3 * n + 3] += self.fusion.force
         extrapolate = self._timeout_ns if self._predicting else 0
-        return _Actuation(self.model, self.t0_ns, self._joints, self._load, extrapolate, shift, self._known)
+        return Actuation(self.model, self.t0_ns, self._joints, self._load, extrapolate, shift, self._known)
 
     def _start(self, k: int) -> str:
         """Both runs at rest at step ``k``; returns the reason when there is no equilibrium."""
@@ -500,7 +453,7 @@ class Estimator:
         except InputError as error:
             self._fused = self._alone = None
             return str(error)
-        self._fused.inputs = _standing(self._fused.inputs)
+        self._fused.inputs = standing(self._fused.inputs)
         self._alone = self._fused.copy()
         self.fusion.start(self._fused, t)
         self._alone_tips.clear(1)
@@ -992,65 +945,3 @@ class Estimator:
                 "steps_taken_again": h.rolled_back,
             },
         }
-
-
-_NO_LOAD = np.zeros(6)
-
-
-class _Actuation:
-    """Input signals with the corrections ``shift`` (inputs,) of one run, for the simulator.
-
-    ``known`` keeps the bare signals of one step, which both runs share.
-    """
-
-    def __init__(
-        self,
-        model: Model,
-        t0_ns: int,
-        joints: Signal,
-        load: Signal,
-        extrapolate_ns: int,
-        shift: Floats,
-        known: dict,
-    ) -> None:
-        self.n, self.count, self.t0_ns, self.joints, self.load = (
-            model.n,
-            model.input_count,
-            t0_ns,
-            joints,
-            load,
-        )
-        self.extrapolate_ns, self.shift, self.known = extrapolate_ns, shift, known
-
-    def __call__(self, t: float) -> Inputs:
-        return self.stages(np.array([t]))[1]
-
-    def stages(self, times: Floats) -> tuple[Floats, Inputs]:
-        """Inputs at all stages of a step; see :func:`ctr_dynamics.model.simulator.stage_inputs`."""
-        n = self.n
-        key = (float(times[0]), float(times[-1]))
-        if key not in self.known:
-            parts: list[Floats] = []
-            for t in times.tolist():
-                time_ns = self.t0_ns + round(t * 1e9)
-                value, rate = self.joints.at(time_ns, self.extrapolate_ns)
-                load = self.load.at(time_ns)[0] if self.load.stamps else _NO_LOAD
-                parts += [value[:n], rate[:n], value[n:], load, rate[n : self.count - 2 * n - 6]]
-            self.known[key] = np.concatenate(parts).reshape(len(times), self.count), rate[n:]
-        bare, beta_rate = self.known[key]
-        rows = bare + self.shift
-        last = rows[-1]
-        return rows, Inputs(
-            last[:n],
-            last[n : 2 * n],
-            last[2 * n : 3 * n],
-            beta_rate,
-            last[3 * n : 3 * n + 3],
-            last[3 * n + 3 : 3 * n + 6],
-        )
-
-
-def _standing(inputs: Inputs) -> Inputs:
-    """The same actuators at rest."""
-    zero = np.zeros_like(inputs.alpha)
-    return Inputs(inputs.alpha, zero, inputs.beta, zero, inputs.force, inputs.torque)
