@@ -10,9 +10,11 @@ from ctr_dynamics.diagnosis.candidates import candidates
 from ctr_dynamics.diagnosis.checks import block_bootstrap
 from ctr_dynamics.diagnosis.diagnose import Validation
 from ctr_dynamics.diagnosis.experiment import at_times, play, product, rotate, smooth, to_vectors
-from ctr_dynamics.diagnosis.fit import posterior
+from ctr_dynamics.diagnosis.explanations import along
+from ctr_dynamics.diagnosis.fit import _Descent, posterior
 from ctr_dynamics.diagnosis.noise import Whitener
-from ctr_dynamics.effects import EFFECTS, quantities
+from ctr_dynamics.diagnosis.signatures import PROBE_STEP
+from ctr_dynamics.effects import EFFECTS, Parameter, Quantity, quantities
 from ctr_dynamics.robot import load_robot
 
 
@@ -142,3 +144,62 @@ def test_validate_takes_every_bag_up_to_the_next_option():
 )
 def test_a_validation_confirms_what_removes_most_of_a_visible_misfit(before, after, confirmed):
     assert Validation(1e-3, 1e-3, 0.0, (0.0, 0.0), before, after).confirms is confirmed
+
+
+def quantity(name, low=-math.inf, high=math.inf, *, tolerance=0.0, scale=1.0, off=0.0):
+    """A coordinate of no effect of the catalogue."""
+    return Quantity("made_up", name, off, tolerance, scale, low, high, Parameter(name, "1", off, scale))
+
+
+class Vibration:
+    """A problem whose prediction is a decaying vibration; ``reach`` as in the real one, no numerics."""
+
+    reach = 2.0
+
+    def __init__(self, truth, nuisances=()):
+        self.t = np.linspace(0.0, 14.0, 500)
+        self.truth, self.nuisances, self.numerics = truth, nuisances, np.zeros((500, 0))
+        self.steps = []
+
+    def with_step(self, dt):
+        self.steps.append(dt)
+        return self
+
+    def predicted(self, point):
+        f = 5.0 * (1.0 + point.get(("made_up", "frequency"), 0.0))
+        return 40.0 * np.exp(-self.t) * np.cos(2 * math.pi * f * self.t)
+
+    def residual(self, point):
+        return self.predicted(self.truth) - self.predicted(point)
+
+
+def test_a_size_is_looked_for_beyond_the_reach_of_its_column():
+    """Half a turn of phase has run away before the vibration has decayed."""
+    frequency = quantity("frequency")
+    problem = Vibration({frequency.key: 0.4})
+    found = along(problem, {frequency.key: 0.3}, frequency)
+    assert found[frequency.key] == pytest.approx(0.4, abs=0.003)
+    assert problem.steps == [PROBE_STEP]
+
+
+def test_steps_are_the_best_inside_the_bounds():
+    rng = np.random.default_rng(3)
+    names = ("a", "b", "c", "d")
+    nuisances = tuple(quantity(n, tolerance=0.5) for n in names)
+    cause = quantity("size", low=0.0, scale=2.0)
+    descent = _Descent(Vibration({}, nuisances), (cause,), {})
+    descent.columns, descent.residual = rng.normal(size=(500, 5)), 3.0 * rng.normal(size=500)
+    descent.residual += descent.columns @ np.array([4.0, -3.0, 0.2, 0.1, -1.0])  # beyond the bounds of three
+    descent.cost = descent.cost_at(descent.residual, descent.values)
+    step = descent.step()
+    assert np.all(step >= descent.low - descent.values)
+    assert np.all(step <= descent.high - descent.values)
+    assert sum(np.isclose(step, (1.0, -1.0, 9.0, 9.0, 0.0))) == 3
+    best = descent.promise(step)
+    for _ in range(200):
+        other = np.clip(step + rng.normal(scale=0.1, size=5), descent.low, descent.high)
+        assert descent.promise(other) <= best + 1e-9
+    sizes = [np.linalg.norm(descent.step(damping)) for damping in (0.0, 1e3, 1e5)]
+    assert sizes == sorted(sizes, reverse=True)
+    assert sizes[-1] < 0.1 * sizes[0]
+    assert descent.promise(descent.step(1e5)) > 0.0
