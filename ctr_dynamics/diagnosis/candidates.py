@@ -25,12 +25,14 @@ class Candidate:
     Attributes:
         effect: ID. quantities: free parameters that have an effect from zero on. shapes: parameters that are free once there is one.
         start: coordinates of the shape parameters, and of the nuisances of its form, to begin with.
+        sizes: coordinates of the first quantity to begin with, where the data tell; empty where screening does.
     """
 
     effect: str
     quantities: tuple[Quantity, ...]
     shapes: tuple[Quantity, ...] = ()
     start: tuple[tuple[Key, float], ...] = ()
+    sizes: tuple[float, ...] = ()
 
     @property
     def label(self) -> str:

@@ -25,9 +25,10 @@ from .fit import Fit, Local, Problem, fit, make_problem
 from .mistakes import find_mistake
 from .numerics import add_numerics
 from .recording import Recording
-from .search import LEFT_SHARE, Search, distinct, search
+from .search import FAR, LEFT_NUMERICAL, LEFT_SHARE, Search, distinct, leftover, search
 from .signatures import Linearisation, linearise, observable, separation
 from .unexplained import Unexplained, unexplained
+from .wall import wall
 
 Floats = NDArray[np.float64]
 Note = Callable[[str], None]
@@ -184,6 +185,9 @@ def diagnose(
     pool = candidates(
         catalogue, np.concatenate([r.position[np.isfinite(r.position).all(axis=1)] for r in recordings])
     )
+    if leftover(problem, clean) > FAR:
+        found_wall = wall(problem, catalogue)
+        pool += [found_wall] if found_wall else []
     result.tested += sorted({c.effect for c in pool})
     result.white_before = whiteness(problem, clean.whitened, len(clean.active))
     found = search(problem, pool, clean, note, workers)
@@ -243,7 +247,8 @@ def _decide(
         note("validation")
         result.validation = validate(problem, clean.fit, best.fit, validation)
     predicted = result.validation is not None and result.validation.confirms
-    if not noise and (not best.members or (left > LEFT_SHARE and not predicted)):
+    unexplained_part = left > (LEFT_SHARE if best.resolved else LEFT_NUMERICAL)
+    if not noise and (not best.members or (unexplained_part and not predicted)):
         result.verdict = "unknown"
         result.members = [Member(None, "unknown", 0.95, None, [])]
         result.unexplained = unexplained(problem.experiments[0], clean.fit.point)
@@ -276,8 +281,12 @@ def _decide(
                 "the causes make the prediction of the validation bags worse: they are not named"
             )
         if not noise:
-            result.notes.append("something small is left that is not noise")
-            if not predicted:
+            result.notes.append(
+                "something small is left that is not noise"
+                if best.resolved
+                else "what is left is of the size of the model's own error in time"
+            )
+            if not predicted and best.resolved:
                 result.members.append(Member(None, "unknown", 0.6, None, []))
 
 

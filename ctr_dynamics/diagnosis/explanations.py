@@ -18,6 +18,9 @@ from .fit import Fit, Key, Local, Problem, fit, posterior, variances
 from .signatures import PROBE_STEP, Linearisation, Scored, strayed
 
 Floats = NDArray[np.float64]
+LEAVES_LITTLE = 2.0  # times the noise: then no other size is tried
+FINER = 2.0  # times the steps, to see the error in time
+NUMERICAL = 5.0  # times that difference's squares: what is left can be the error itself, which falls slowly with the step
 NEIGHBOURHOOD = (0.5, 1.7)  # of a probe's size: where the size that leaves least is looked for
 
 
@@ -29,6 +32,7 @@ class Explanation:
     fit: Fit
     score: float = 0.0  # log posterior, up to a constant
     finished: bool = False  # with exact columns
+    resolved: bool = True  # whether the model's error in time is small against what is left
 
     @property
     def effects(self) -> tuple[str, ...]:
@@ -66,7 +70,17 @@ def explain(problem: Problem, job: Job, limit: float = math.inf) -> Explanation 
     causes = causes_of(members)
     point = {**dict(job.new.candidate.start), **job.start.point}
     own = with_nuisances(problem, members)
-    if job.new.probe is not None:
+    if job.new.candidate.sizes:
+        nominal = {**point, **{q.key: q.off for q in problem.nuisances}}
+        first = job.new.candidate.quantities[0].key
+        result = None
+        for size in job.new.candidate.sizes:
+            new = fit(own, causes, {**nominal, first: size}, renewals=2, limit=limit, polish=False)
+            if new is not None and (result is None or new.cost < result.cost):
+                result = new
+            if result is not None and result.cost < LEAVES_LITTLE * problem.size:
+                break
+    elif job.new.probe is not None:
         # so far from where the columns are known that they are computed anew; nuisances that have strayed lead astray, so nominal ones are tried too
         starts = [{**point, **job.new.probe.shift}]
         if strayed(problem, starts[0]):
@@ -149,6 +163,17 @@ def replaced(
     )
     result = fit(own, causes, start, limit=limit)
     return None if result is None else Explanation(members, result)
+
+
+def look_closer(problem: Problem, found: Explanation) -> None:
+    """Whether what ``found`` leaves beyond noise is more than the model's own error in time at its best point, where there are impacts: they
+    excite what steps of this length do not follow, and a further cause would only imitate that."""
+    if not any(EFFECTS[m.effect].impacts for m in found.members):
+        return
+    finer = problem.with_step(problem.experiments[0].scheme.dt / FINER).residual(found.fit.point)
+    if finer is not None and len(finer) == len(found.fit.residual):
+        error = finer - found.fit.residual
+        found.resolved = found.fit.chi2 - problem.size > NUMERICAL * float(error @ error)
 
 
 def finish(problem: Problem, found: Explanation) -> None:

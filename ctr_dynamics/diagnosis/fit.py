@@ -63,8 +63,9 @@ class Fit:
 
     @property
     def sigma(self) -> Floats:
-        """(a,) posterior deviations of the coordinates, widened for what no model has (docs/diagnosis.md)."""
-        return WIDENING * np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
+        """(a,) posterior deviations of the coordinates, widened for what no model has (docs/diagnosis.md) and by what is left beyond noise."""
+        left = max(1.0, self.chi2 / max(len(self.whitened), 1))
+        return WIDENING * np.sqrt(left * np.maximum(np.diag(self.covariance), 0.0))
 
     @property
     def point(self) -> dict[Key, float]:

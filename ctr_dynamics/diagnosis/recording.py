@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -44,6 +44,18 @@ class Recording:
     def duration(self) -> float:
         """s of joints."""
         return float(self.joints[-1, 0])
+
+    def until(self, end: float) -> Recording:
+        """What was recorded up to ``end`` (s), and the joint state after."""
+        joints = self.joints[: int(np.searchsorted(self.joints[:, 0], end)) + 1]
+        seen = self.stamps <= end
+        return replace(
+            self,
+            joints=joints,
+            stamps=self.stamps[seen],
+            position=self.position[seen],
+            quaternion=self.quaternion[seen],
+        )
 
 
 def read_recording(path: str | Path, robot: Robot) -> Recording:

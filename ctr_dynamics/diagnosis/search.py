@@ -17,7 +17,7 @@ from joblib import Parallel, delayed
 from numpy.typing import NDArray
 
 from .candidates import Candidate, keys_of, log_prior
-from .explanations import Explanation, Job, finish, fit_all, reduced, replaced
+from .explanations import Explanation, Job, finish, fit_all, look_closer, reduced, replaced
 from .fit import Fit, Key, Problem, fit
 from .signatures import Linearisation, Scored, linearise, screen, separation
 
@@ -27,6 +27,7 @@ SHORTLIST = 8  # candidates that are fitted
 BATCH = 2  # fits between which the best is looked at; fixed, so that the outcome does not depend on the number of workers
 SECOND = 4  # second causes that are fitted beside a first
 LEFT_SHARE = 0.03  # of the misfit beyond noise that an explanation may leave
+LEFT_NUMERICAL = 0.15  # the same where the model's error in time is as large
 MUCH = 4.0  # deviations of the noise that an explanation may leave before more is tried
 HOPELESS = 0.3  # of the misfit: two causes that leave more are not made right by a third
 SECOND_EVIDENCE = 5.0  # log evidence that a further cause must add
@@ -73,7 +74,7 @@ def search(
     in for those that are not there yet.
     """
     found = _search(problem, pool, clean, note, workers)
-    if found is None or _leftover(problem, found.best.fit) <= MUCH:
+    if found is None or leftover(problem, found.best.fit) <= MUCH or not found.best.resolved:
         return found
     if found.best.fit.chi2 - problem.size <= LEFT_SHARE * (clean.chi2 - problem.size):
         return found
@@ -94,7 +95,7 @@ def _search(
 ) -> Search | None:
     base = Explanation((), clean)
     note("signatures of all candidates")
-    lin = linearise(problem, clean.point, pool, workers, far=_leftover(problem, clean) > FAR)
+    lin = linearise(problem, clean.point, pool, workers, far=leftover(problem, clean) > FAR)
     if lin is None:
         return None
     screened = screen(problem, lin, clean, (), pool)
@@ -196,7 +197,12 @@ def _further(
     hopeless = _hopeless(problem, clean)
     tried: set[frozenset[str]] = set()
     leaders = [e for e in found if e.members][:2]
-    much = _leftover(problem, leaders[0].fit) > MUCH
+    much = leftover(problem, leaders[0].fit) > MUCH
+    if much:
+        finish(problem, leaders[0])
+        look_closer(problem, leaders[0])
+        if not leaders[0].resolved:
+            return out
     leaders = [e for e in leaders if e.score > leaders[0].score - (20.0 if much else 3.0)]
     for _ in range(2):
         new: list[Explanation] = []
@@ -252,7 +258,7 @@ def _hopeless(problem: Problem, clean: Fit) -> float:
     return problem.size + HOPELESS * max(clean.cost - problem.size, problem.size)
 
 
-def _leftover(problem: Problem, result: Fit) -> float:
+def leftover(problem: Problem, result: Fit) -> float:
     """Deviations by which the residual's squares exceed what noise gives."""
     dof = problem.size
     return (result.chi2 - dof) / math.sqrt(2.0 * dof)

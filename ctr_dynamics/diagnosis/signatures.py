@@ -112,10 +112,7 @@ def linearise(
     if again is None and strayed(problem, point):
         places.append({q.key: q.off for q in problem.nuisances})
     probes = [
-        (c, size, back)
-        for back in places
-        for c in rough
-        for size in EFFECTS[c.effect].probes[: 1 if again else None]
+        (c, size, back) for back in places for c in rough for size in _probed(c)[: 1 if again else None]
     ]
     probes += [(c, size, back) for back in places for c in pool if far for size in EFFECTS[c.effect].far]
     jobs = [
@@ -151,6 +148,12 @@ def linearise(
         elif c not in shaped and c not in rough:
             result.signatures[c] = np.stack([result.columns[q.key] for q in c.quantities], axis=1)
     return result
+
+
+def _probed(c: Candidate) -> tuple[float, ...]:
+    """Finite sizes, in scales, at which a candidate without a derivative is looked at."""
+    q = c.quantities[0]
+    return tuple((size - q.off) / q.scale for size in c.sizes[:1]) or EFFECTS[c.effect].probes
 
 
 def strayed(problem: Problem, point: Mapping[Key, float]) -> bool:

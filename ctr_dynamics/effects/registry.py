@@ -84,6 +84,7 @@ class Effect:
         joint: parameters that are only tried together (a vector); else each is a variant of its own.
         presets: values of the shape parameters from which a search starts, by name; several are tried.
         nuisance: not a cause by itself: it widens what others may explain, and is not in the catalogue of findings.
+        impacts: whether it strikes the robot: steps in time follow that to a limited degree only.
         form: nuisances that are free only beside this effect, for what is uncertain in its form; presets may name their parameters.
     """
 
@@ -98,6 +99,7 @@ class Effect:
     joint: bool = False
     presets: tuple[Mapping[str, float], ...] = ({},)
     nuisance: bool = False
+    impacts: bool = False
     form: tuple[str, ...] = ()
 
     def accepts(self, name: str) -> bool:

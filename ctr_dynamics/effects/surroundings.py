@@ -121,5 +121,6 @@ register(
         extended=True,
         probes=(0.7,),
         joint=True,
+        impacts=True,
     )
 )

@@ -30,6 +30,7 @@ InputRows = Callable[[Floats], Floats]
 TIP_ROWS = 13  # p, h, q, omega
 CHUNK = 256  # steps between returns to Python
 PATIENCE = 40  # steps that may need more than the compiled loop before a run is given up
+SENSITIVE = 10.0  # m, of the tip by a quantity's unit: where a ten-thousandth of it moves the tip by a millimetre, no derivative tells of a change
 EPSILON = 1e-6  # of a column's unit: small against the curvature of the step, large against rounding
 
 
@@ -39,7 +40,8 @@ class Trajectory:
 
     Attributes:
         t: (K,) s. tip: (K, 13) p m, quaternion h (not unit), q m/s and omega rad/s in the tip frame, at every step.
-        columns: (K, 13, r) derivatives of ``tip``; None when not asked for.
+        columns: (K, 13, r) derivatives of ``tip``; None when not asked for. Zero from where they are too large to tell of any change (SENSITIVE),
+            as after many impacts.
         failure: why the run ended before its time; empty when it did not.
         sweeps: plain sweeps of the arc length, counted over all steps.
     """
@@ -270,9 +272,11 @@ def run(
             sweeps += spent
             if taken:
                 state.inputs = to_inputs(n, rows_now[taken - 1, -1])
-            if outcome == -1:
-                failure = f"step at {(k + taken) * dt:.4f} s could not be linearised"
-                break
+            if columns is not None and out is not None:
+                lost = _lost(out[k + 1 : k + 1 + taken]) if outcome != -1 else taken - 1
+                if lost < taken:
+                    out[k + 1 + lost :] = 0.0
+                    columns = None
         k += taken
         if taken < count:
             hard += taken < usable == min(count, plain)
@@ -298,11 +302,13 @@ def run(
                         columns.remap(mesh, before, record.mesh, record.inputs[-1, 2 * n : 3 * n])
                         key = record.key
                     if not columns.follow(record, parameters):
-                        failure = f"step at {k * dt:.4f} s could not be linearised"
-            if failure:
-                break
-            if columns is not None and out is not None:
-                out[k + 1] = columns.tip
+                        columns = None
+                        break
+                assert out is not None
+                if columns is None:
+                    out[k + 1 :] = 0.0
+                else:
+                    out[k + 1] = columns.tip
             tip[k + 1] = state.nodes[-1, :TIP_ROWS]
             k += 1
     done = k + 1
@@ -313,6 +319,12 @@ def run(
         failure,
         sweeps,
     )
+
+
+def _lost(columns: Floats) -> int:
+    """Number of steps until one of ``columns`` (K, 13, r) is beyond ``SENSITIVE``."""
+    beyond = np.abs(columns[:, :3]).max(axis=(1, 2)) > SENSITIVE
+    return int(np.argmax(beyond)) if beyond.any() else len(columns)
 
 
 def _divided(events: Sequence[float], dt: float) -> dict[int, list[float]]:
@@ -372,7 +384,9 @@ def _fast(
             EPSILON, many, work, columns.bank, before, columns.matrix, columns.dx, columns.dnodes, dtips,
         )  # fmt: skip
     tips[:taken] = last[:taken, :TIP_ROWS]
-    state.usable = outcome == CONVERGED
+    if outcome == -1:  # the step has been taken, and has no tangent
+        taken += 1
+    state.usable = outcome in (CONVERGED, -1)
     if taken:
-        state.nodes = nodes.reshape(-1, S).copy() if outcome == CONVERGED else state.nodes
+        state.nodes = nodes.reshape(-1, S).copy() if state.usable else state.nodes
     return taken, sweeps, outcome

@@ -5,6 +5,7 @@ import copy
 import numpy as np
 import pytest
 
+from ctr_dynamics.model import trajectory
 from ctr_dynamics.model.model import Model
 from ctr_dynamics.model.scheme import make_scheme
 from ctr_dynamics.model.simulator import Simulator
@@ -192,6 +193,30 @@ def test_sensitivities_of_an_extended_run():
         [(1, 0.01), (7, 0.01)],
         2e-3,
     )
+
+
+@pytest.mark.parametrize("slide", [0.0, 0.03], ids=["in the compiled loop", "in single steps"])
+def test_sensitivities_end_where_they_tell_nothing(monkeypatch, slide):
+    """The simulation goes on without them."""
+    model = Model(ROBOT, nodes=12)
+    effect = np.zeros((len(model.parameters), 1))
+    effect[model.layout["bending_stiffness"].start] = 0.02 * model.parameters[0]
+    given = (
+        model,
+        make_scheme("sdirk3", DT),
+        model.parameters,
+        inputs_of(model, slide),
+        0.3,
+    )
+    whole = run(*given, effect=effect)
+    size = np.abs(whole.columns[:, :3]).max(axis=(1, 2))
+    k = int(np.argmax(size > 1.5 * size[0]))
+    monkeypatch.setattr(trajectory, "SENSITIVE", 1.5 * size[0])
+    cut = run(*given, effect=effect)
+    np.testing.assert_array_equal(cut.tip, whole.tip)
+    np.testing.assert_array_equal(cut.columns[:k], whole.columns[:k])
+    assert not np.any(cut.columns[k + 1 :])
+    assert not cut.failure
 
 
 def test_steps_are_divided_at_events():

@@ -1,0 +1,147 @@
+"""Where a wall may be that the tip runs into: looked for in the data, from the moment at which measurement and model part.
+
+After an impact a model without the wall is out of step for good, and so is one with a wall in the wrong place: the misfit over a whole recording
+says little of where to go. The first moments do: up to the impact both agree, the first difference points along the normal, and the tip is at the
+plane. From there on plane and stiffness are fitted to a span of time that grows.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+
+from ctr_dynamics.effects import Quantity
+from ctr_dynamics.errors import InputError
+from ctr_dynamics.estimation.rotations import matrix
+
+from .candidates import Candidate
+from .experiment import Experiment
+from .fit import Key, Problem
+from .noise import noise_floor
+
+Floats = NDArray[np.float64]
+EFFECT = "contact"
+PARTED = 0.3  # of the large residuals: beyond, measurement and model have parted
+FIRST = 2.0  # of the noise: from there on the residual shows the way
+SUDDEN = 0.1  # s from there to the parting: what grows slower is no impact
+LEAD = 0.06  # s before the parting from which on the span counts
+FIRST_SPANS, SPANS = (0.05, 0.13), (0.25, 0.5, 1.0)  # s after it
+STIFFNESSES = (120.0, 400.0)  # N/m to begin with
+FACTORS = (1.0, 0.5, 2.0)  # on the stiffness that is found, for the fits with all nuisances
+SURE = 2e-3  # of the squares there: a wall that leaves no more needs no other start
+EXPLAINED = 0.9  # of the squared misfit in a span that a wall must explain there
+INSIDE_M = 2e-3  # m that the tip is behind the plane where it is noticed first
+FAILED = 1e3  # noise floors: residual where the model cannot be simulated
+EVALUATIONS = 12  # of the residual's derivatives, a span
+
+
+def wall(problem: Problem, known: Sequence[Quantity]) -> Candidate | None:
+    """A candidate whose plane explains the first moments after measurement and nominal model part; None where no wall does."""
+    own = [q for q in known if q.effect == EFFECT]
+    for experiment in problem.experiments:
+        try:
+            prediction = experiment.predict({})
+        except InputError:
+            continue
+        residual = experiment.residual(prediction)[:, :3]
+        found = None if prediction.failure else _search(experiment, residual, noise_floor(problem.robot))
+        if found is not None:
+            start = {(EFFECT, name): value for name, value in _values(found).items()}
+            shapes = tuple(replace(q, off=start[q.key]) for q in own if q.parameter.shape)
+            amplitudes = tuple(q for q in own if not q.parameter.shape)
+            stiffness = start[amplitudes[0].key]
+            return Candidate(
+                EFFECT,
+                amplitudes,
+                shapes,
+                tuple((q.key, start[q.key]) for q in shapes),
+                tuple(factor * stiffness for factor in FACTORS),
+            )
+    return None
+
+
+def _search(experiment: Experiment, residual: Floats, floor: float) -> Floats | None:
+    """Logarithm of the stiffness (N/m), normal (3,) and offset (cm) of a wall; None where there is none."""
+    recording = experiment.recording
+    good = np.isfinite(recording.position).all(axis=1)
+    sizes = np.where(good, np.linalg.norm(residual, axis=1), 0.0)
+    limit = max(PARTED * float(np.quantile(sizes, 0.95)), 5.0 * floor)
+    if not (sizes > limit).any():
+        return None
+    parted = int(np.argmax(sizes > limit))
+    first = parted
+    while first > 0 and sizes[first - 1] > FIRST * floor:
+        first -= 1
+    if recording.stamps[parted] - recording.stamps[first] > SUDDEN:
+        return None
+    back = matrix(experiment.nominal.rotation).T  # tracker's axes to base axes
+    calm = residual[max(first - 3, 0)] if first else np.zeros(3)
+    begin = recording.stamps[parted]
+    best: tuple[float, Floats] | None = None
+    for k, stiffness in product(dict.fromkeys((first, parted)), STIFFNESSES):
+        if best is not None and best[0] < SURE:
+            break
+        normal = back @ (residual[k] - calm)
+        normal = normal / max(float(np.linalg.norm(normal)), 1e-12)
+        near = slice(max(first - 1, 0), parted + 3)
+        places = (recording.position[near] - experiment.nominal.translation) @ back.T @ normal
+        x = np.array([math.log(stiffness), *normal, 1e2 * (np.nanmin(places) + INSIDE_M)])
+        left = math.inf
+        for span in FIRST_SPANS:
+            x, left = _fitted(experiment, x, begin, span, floor)
+        if left < (best[0] if best else 1.0 - EXPLAINED):
+            best = left, x
+    if best is None:
+        return None
+    left, x = best
+    for span in SPANS:
+        longer, left = _fitted(experiment, x, begin, span, floor)
+        if left > 1.0 - EXPLAINED:
+            break
+        x = longer
+    return x
+
+
+def _fitted(
+    experiment: Experiment, x: Floats, begin: float, span: float, floor: float
+) -> tuple[Floats, float]:
+    """The wall near ``x`` that leaves least from ``LEAD`` before ``begin`` (s) to ``span`` behind it, and the share of the squares that it leaves."""
+    short = Experiment(
+        experiment.recording.until(begin + span), experiment.robot, experiment.nodes, experiment.scheme.dt
+    )
+    stamps = short.recording.stamps
+    counted = (stamps > begin - LEAD) & np.isfinite(short.recording.position).all(axis=1)
+
+    def residual(x: Floats | None) -> Floats:
+        point: dict[Key, float] = (
+            {} if x is None else {(EFFECT, name): value for name, value in _values(x).items()}
+        )
+        try:
+            prediction = short.predict(point)
+        except InputError:  # the wall is where the robot rests
+            return np.full(3 * int(counted.sum()) + 1, FAILED)
+        if prediction.failure:
+            return np.full(3 * int(counted.sum()) + 1, FAILED)
+        left = short.residual(prediction)[counted, :3].ravel() / floor
+        return np.append(left, 0.0 if x is None else np.linalg.norm(x[1:4]) - 1.0)
+
+    found = least_squares(
+        residual, x, diff_step=1e-3, max_nfev=EVALUATIONS, loss="soft_l1", f_scale=3.0, x_scale=(0.3, 0.1, 0.1, 0.1, 0.2)
+    )  # fmt: skip
+    free, left = residual(None), residual(found.x)
+    return found.x, float(left @ left) / max(float(free @ free), 1e-12)
+
+
+def _values(x: Floats) -> dict[str, float]:
+    normal = x[1:4] / max(float(np.linalg.norm(x[1:4])), 1e-12)
+    return {
+        "stiffness_N_per_m": math.exp(min(max(float(x[0]), 0.0), 12.0)),
+        **{"n" + axis: float(part) for axis, part in zip("xyz", normal, strict=True)},
+        "offset_m": 1e-2 * float(x[4]),
+    }

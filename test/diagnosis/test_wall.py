@@ -1,0 +1,95 @@
+"""A wall that the tip runs into, hidden by the truth's own simulator, and found from the moment of the first impact."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from truth.cases import make_case
+
+from ctr_dynamics.diagnosis.candidates import Candidate, causes_of
+from ctr_dynamics.diagnosis.explanations import Explanation, look_closer
+from ctr_dynamics.diagnosis.fit import fit, make_problem
+from ctr_dynamics.diagnosis.recording import read_recording
+from ctr_dynamics.diagnosis.wall import wall
+from ctr_dynamics.effects import quantities
+from ctr_dynamics.robot import load_robot
+
+STIFFNESS = ("contact", "stiffness_N_per_m")
+NORMAL = [("contact", "n" + axis) for axis in "xyz"]
+
+
+@pytest.fixture(scope="module")
+def robot():
+    return load_robot("till2020_tissue")
+
+
+@pytest.fixture(scope="module")
+def known(robot):
+    return quantities(robot)
+
+
+def _problem(folder, robot, known, effect, seed):
+    case = make_case(seed, "single", folder, effects=(effect,), duration_s=2.2)
+    recording = read_recording(case.protocol, robot)
+    nuisances = [q for q in known if q.effect == "registration_translation"]
+    answer = json.loads((folder / "answer.json").read_text())["hidden"][0]["parameters"]
+    truth = {name: item["total"] for name, item in answer.items()}
+    return make_problem(robot, [recording], nuisances, np.ones(6, bool)), truth
+
+
+@pytest.fixture(scope="module")
+def hit(tmp_path_factory, robot, known):
+    """The problem of a recording with impacts, and the true plane."""
+    return _problem(tmp_path_factory.mktemp("hit"), robot, known, "contact", 91020)
+
+
+def _angle(a, b) -> float:
+    return float(np.degrees(np.arccos(np.clip(np.dot(a, b) / np.linalg.norm(a) / np.linalg.norm(b), -1, 1))))
+
+
+def test_the_first_impacts_tell_plane_and_stiffness(hit, known):
+    problem, truth = hit
+    found = wall(problem, known)
+    assert isinstance(found, Candidate)
+    start = dict(found.start)
+    assert _angle([start[key] for key in NORMAL], [truth[name] for _, name in NORMAL]) < 15.0
+    assert 0.4 < found.sizes[0] / truth["stiffness_N_per_m"] < 2.5
+    assert found.keys == {q.key for q in known if q.effect == "contact"}
+    before = problem.residual({})
+    result = fit(problem, causes_of([found]), {**start, STIFFNESS: found.sizes[0]})
+    assert result is not None
+    assert result.chi2 < 0.05 * float(before @ before)
+    assert 0.5 < result.point[STIFFNESS] / truth["stiffness_N_per_m"] < 2.0
+
+
+def test_a_delay_is_no_wall(tmp_path, robot, known):
+    """A late tracker parts from the model as suddenly, when the weight is cut."""
+    problem, _ = _problem(tmp_path, robot, known, "tracker_latency", 91021)
+    assert wall(problem, known) is None
+
+
+def test_what_impacts_leave_is_measured_against_the_error_in_time(hit, known):
+    problem, truth = hit
+    point = {("contact", name): value for name, value in truth.items()}
+    contact = tuple(q for q in known if q.effect == "contact")
+    candidate = Candidate("contact", contact)
+    residual = problem.residual(point)
+    finer = problem.with_step(0.5 * problem.experiments[0].scheme.dt).residual(point)
+    error = float((finer - residual) @ (finer - residual))
+    some = fit(problem, (), {}, iterations=1)
+    assert some is not None
+    for left, resolved in ((20.0 * error, True), (0.5 * error, False)):
+        at_truth = replace(
+            some,
+            active=contact,
+            values=np.array([point[q.key] for q in contact]),
+            residual=residual,
+            chi2=problem.size + left,
+        )
+        explanation = Explanation((candidate,), at_truth)
+        look_closer(problem, explanation)
+        assert explanation.resolved == resolved
+        elsewhere = Explanation((), at_truth)
+        look_closer(problem, elsewhere)
+        assert elsewhere.resolved
