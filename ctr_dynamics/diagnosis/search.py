@@ -159,6 +159,9 @@ def _stand_ins(
     """
     best = found[0]
     tried = {e.keys for e in found}
+    limit_apart = STAND_IN
+    if leftover(problem, best.fit) > MUCH:  # it is not right, and what is lies about that far away
+        limit_apart += math.sqrt(best.fit.chi2 - problem.size)
     jobs = []
     for gone in (*combinations(best.members, 1), *combinations(best.members, 2)):
         rest = tuple(m for m in best.members if m not in gone)
@@ -172,7 +175,7 @@ def _stand_ins(
             key=lambda item: item[:2],
         )
         wanted = [
-            (*rest, rival) for d, _, rival in near if d < STAND_IN and keys_of((*rest, rival)) not in tried
+            (*rest, rival) for d, _, rival in near if d < limit_apart and keys_of((*rest, rival)) not in tried
         ][:STAND_INS]
         tried.update(keys_of(members) for members in wanted)
         jobs += [(members, gone) for members in wanted]
