@@ -149,6 +149,7 @@ class Estimator:
         self._kept: deque[Kept] = deque()
         self._return_to: int | None = None  # ns: inputs from here on have changed
         self._joints_only = True  # and nothing but joints
+        self._urgent = False  # the load among them, by a jump: what goes on without it soon has nothing to do with the robot
         self._redo_s = 1e-3  # what stepping again costs in the mean, a step
         self._fused: State | None = None
         self._alone: State | None = None
@@ -283,6 +284,7 @@ class Estimator:
             self._load.forget(stamp_ns - self.window_ns)
             return
         i = self._load.stamps.index(stamp_ns)
+        before = self._load.values[i - 1] if i else np.zeros(6)
         if len(self._load.stamps) == 1:
             self._open_load()
             self._changed((self.t0_ns if len(self._load.stamps) == 1 else stamp_ns) - 1)
@@ -293,6 +295,7 @@ class Estimator:
         else:
             return
         self._joints_only = False
+        self._urgent |= self._return_to is not None and bool(np.any(np.abs(value - before) > self.model.load_kink))
 
     def _open_load(self) -> None:
         """Before the first load there is none, or that one if it comes soon enough after the first joints."""
@@ -365,11 +368,11 @@ class Estimator:
         return self._return_to is not None and self._predicting
 
     def _may_wait(self) -> bool:
-        """Whether the next step may be taken before the correction that is due."""
+        """Whether the next step may be taken before the correction that is due: not where the load has jumped, or it is too far behind."""
         assert self.t0_ns is not None and self._return_to is not None
         begun = bool(self._kept) and self._kept[-1].k == self.k
         behind = self.k - (self._return_to - self.t0_ns) // DT_NS
-        return self._predicting and begun and behind < MOST_BEFORE_REDONE
+        return self._predicting and begun and behind < MOST_BEFORE_REDONE and not self._urgent
 
     def use_pause(self) -> None:
         """A part of the work that no output waits for: the misfit monitor's, and a look at the stability or a part of the modes' refresh."""
@@ -675,6 +678,8 @@ class Estimator:
         """
         if spare_s is not None and self._may_wait() and spare_s() < MARGIN * self._redo_s:
             return
+        if self._urgent:
+            spare_s, self._urgent = None, False
         from_ns, self._return_to = self._return_to, None
         joints_only, self._joints_only = self._joints_only, True
         assert from_ns is not None and self.t0_ns is not None

@@ -167,6 +167,22 @@ def test_late_load_ends_as_in_time(release, policy):
     assert np.abs(run.last.predicted_position - reference.last.predicted_position).max() < 1e-6
 
 
+def test_a_jump_of_the_load_is_corrected_at_once_though_there_is_no_time(release):
+    """Poses that were fused into a course without the cut would throw the estimate off by more than what they measure."""
+    late = [m.late(0.060) if m.kind == "load" and 0.9e9 < m.stamp < 1.3e9 else m for m in release]
+    run = play(late, {"output.policy": "predict"}, tick=STEP, spare=lambda made: 0.0)
+    reference = play(release, {"output.policy": "predict"}, tick=STEP)
+    assert [out.k for out in run.outputs] == list(range(len(run.outputs)))
+    known = [out for out in run.outputs if out.k * STEP > 1.15]
+    assert all(out.valid for out in known), {out.reason for out in known}
+    apart = [
+        float(np.linalg.norm(a.tip_position - b.tip_position))
+        for a, b in zip(run.outputs, reference.outputs, strict=True)
+        if a.k * STEP > 1.15
+    ]
+    assert max(apart) < 0.3e-3
+
+
 @pytest.mark.parametrize("late", [0.004, 0.040, 0.090])
 @pytest.mark.parametrize("policy", ["wait", "predict"])
 def test_first_load_soon_after_the_joints_is_there_from_the_start(release, late, policy):
