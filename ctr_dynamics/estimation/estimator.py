@@ -295,7 +295,9 @@ class Estimator:
         else:
             return
         self._joints_only = False
-        self._urgent |= self._return_to is not None and bool(np.any(np.abs(value - before) > self.model.load_kink))
+        self._urgent |= self._return_to is not None and bool(
+            np.any(np.abs(value - before) > self.model.load_kink)
+        )
 
     def _open_load(self) -> None:
         """Before the first load there is none, or that one if it comes soon enough after the first joints."""
