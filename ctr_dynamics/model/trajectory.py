@@ -383,9 +383,9 @@ def _fast(
             *common, columns.wide, *solver, model.tangent_step, simulator.tolerance, simulator.limit, last, columns.effect, dinputs,
             EPSILON, many, work, columns.bank, before, columns.matrix, columns.dx, columns.dnodes, dtips,
         )  # fmt: skip
-    tips[:taken] = last[:taken, :TIP_ROWS]
     if outcome == -1:  # the step has been taken, and has no tangent
         taken += 1
+    tips[:taken] = last[:taken, :TIP_ROWS]
     state.usable = outcome in (CONVERGED, -1)
     if taken:
         state.nodes = nodes.reshape(-1, S).copy() if state.usable else state.nodes
