@@ -25,7 +25,7 @@ from .fit import Fit, Local, Problem, fit, make_problem
 from .mistakes import find_mistake
 from .numerics import add_numerics
 from .recording import Recording
-from .search import FAR, LEFT_NUMERICAL, LEFT_SHARE, Search, distinct, leftover, search
+from .search import FAR, LEFT_NUMERICAL, LEFT_SHARE, Search, distinct, leftover, search, second_opinion
 from .signatures import Linearisation, linearise, observable, separation
 from .unexplained import Unexplained, unexplained
 from .wall import wall
@@ -193,12 +193,18 @@ def diagnose(
     found = search(problem, pool, clean, note, workers)
     if found is None:
         raise InputError("the recalibrated model cannot be linearised", do="check the robot file and the bag")
+    held_out = None
+    if validation:
+        nodes = problem.experiments[0].nodes
+        held_out = make_problem(robot, validation, nuisances, mask, nodes)
+        note("second opinion of the validation bags")
+        second_opinion(found, problem, held_out)
     result.search = found
     seen = observable(problem, found.linearised)
     names = sorted({c.effect for c in pool})
     result.not_observable = [name for name in names if seen.get(name, 0.0) < OBSERVABLE]
     excited = sum(seen.get(name, 0.0) >= STRONG for name in names) >= EXCITED * len(names)
-    _decide(result, problem, found, excited, validation, note, workers)
+    _decide(result, problem, found, excited, held_out, note, workers)
     assert result.best is not None
     result.left = _residuals(problem, clean)
     result.rest = result.left if result.best is clean else _residuals(problem, result.best)
@@ -228,7 +234,7 @@ def _decide(
     problem: Problem,
     found: Search,
     excited: bool,
-    validation: Sequence[Recording],
+    held_out: Problem | None,
     note: Note,
     workers: int,
 ) -> None:
@@ -243,9 +249,9 @@ def _decide(
     left = (best.fit.chi2 - dof) / beyond if beyond > 3.0 * math.sqrt(2.0 * dof) else 0.0
     noise = result.white.p >= NOT_NOISE
     result.sets = cause_sets(found)
-    if validation:
+    if held_out is not None:
         note("validation")
-        result.validation = validate(problem, clean.fit, best.fit, validation)
+        result.validation = validate(held_out, clean.fit, best.fit)
     predicted = result.validation is not None and result.validation.confirms
     unexplained_part = left > (LEFT_SHARE if best.resolved else LEFT_NUMERICAL)
     if not noise and (not best.members or (unexplained_part and not predicted)):
@@ -306,7 +312,10 @@ def _member(problem: Problem, found: Search, best: Explanation, c: Candidate, li
     for e in found.explanations:
         others = [m for m in e.members if not m.keys <= rest]
         if len(others) == 1 and e.keys - others[0].keys == rest and others[0].effect not in own:
-            d = math.sqrt(max(e.fit.cost - best.fit.cost, 0.0))
+            more = e.fit.cost - best.fit.cost
+            if e.held_out is not None and best.held_out is not None:
+                more += 2.0 * (best.held_out - e.held_out)
+            d = math.sqrt(max(more, 0.0))
             fitted[others[0].effect] = min((d, FITTED), fitted.get(others[0].effect, (math.inf, FITTED)))
     near.update(fitted)
     probability = float(
@@ -332,14 +341,12 @@ def cause_sets(found: Search) -> list[tuple[tuple[str, ...], float]]:
     return out
 
 
-def validate(problem: Problem, clean: Fit, best: Fit, recordings: Sequence[Recording]) -> Validation | None:
+def validate(held_out: Problem, clean: Fit, best: Fit) -> Validation | None:
     """Errors on bags that were not fitted, with the recalibrated and with the extended model; None where neither can be simulated."""
     before, after, stamps, bags = [], [], [], []
     nis = [0.0, 0.0, 0]
     shift = 0.0
-    nodes = problem.experiments[0].nodes
-    own = make_problem(problem.robot, recordings, problem.nuisances, problem.whiteners[0].mask, nodes)
-    for experiment, whiten in zip(own.experiments, own.whiteners, strict=True):
+    for experiment, whiten in zip(held_out.experiments, held_out.whiteners, strict=True):
         residuals = []
         for point in (clean.point, best.point):
             prediction = experiment.predict(point)

@@ -31,6 +31,9 @@ class Explanation:
     members: tuple[Candidate, ...]
     fit: Fit
     score: float = 0.0  # log posterior, up to a constant
+    held_out: float | None = (
+        None  # log likelihood of bags that were not fitted, up to a constant; None where it is not known
+    )
     finished: bool = False  # with exact columns
     resolved: bool = True  # whether the model's error in time is small against what is left
 
@@ -131,18 +134,19 @@ def reduced(problem: Problem, members: tuple[Candidate, ...], start: Fit) -> Exp
 
 
 def replaced(
-    problem: Problem,
-    best: Explanation,
-    members: tuple[Candidate, ...],
-    gone: Sequence[Candidate],
-    lin: Linearisation,
-    limit: float,
+    problem: Problem, best: Explanation, members: tuple[Candidate, ...], lin: Linearisation, limit: float
 ) -> Explanation | None:
-    """Fit of ``members`` from where the columns of ``lin`` say that the newest of them does the work of the ``gone``."""
-    left = keys_of(gone)
+    """Fit of ``members`` from where the columns of ``lin``, at ``best``, say that those of them that are new do the work of those that are gone."""
+    left = best.keys - keys_of(members)
+    new = [c for c in members if c not in best.members]
     own, causes = with_nuisances(problem, members), causes_of(members)
     active, variance = variances(own.nuisances, causes)
-    known = {**lin.columns, **lin.own(members[-1]), **best.fit.by_key}
+    known = dict(lin.columns)
+    start: dict[Key, float] = {}
+    for c in new:
+        known.update(lin.own(c))
+        start.update(dict(c.start))
+    known.update(best.fit.by_key)
     point = {key: value for key, value in best.fit.point.items() if key not in left}
     departure = np.array([point.get(q.key, q.off) - q.off for q in active])
     without = sum(
@@ -153,7 +157,6 @@ def replaced(
     nothing = np.zeros(len(best.fit.residual))
     columns = np.stack([known.get(q.key, nothing) for q in active], axis=1)
     wanted, _, _ = posterior(best.fit.residual + without, columns, departure, variance, problem.numerics)
-    start = dict(members[-1].start)
     start.update(
         {
             q.key: float(np.clip(q.off + d, q.low, q.high))

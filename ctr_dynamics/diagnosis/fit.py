@@ -391,25 +391,47 @@ class _Descent:
 
     def result(self) -> Fit:
         """What was reached."""
-        departure, numerics = self.values - self.off, self.problem.numerics
-        _, covariance, _ = posterior(self.residual, self.columns, departure, self.variance, numerics)
-        J = np.hstack([self.columns * np.sqrt(self.variance), numerics])
-        evidence = -0.5 * self.cost - 0.5 * float(np.linalg.slogdet(np.eye(J.shape[1]) + J.T @ J)[1])
-        evidence += math.log(2.0) * sum(q.one_sided for q in self.causes)
-        within = inside(self.active, {q.key for q in self.causes}, departure, covariance)
-        left = self.residual - _numerics_part(self.residual, numerics)
-        return Fit(
-            self.causes,
-            self.active,
-            self.values,
-            covariance,
-            float(left @ left),
-            evidence + within,
-            self.residual,
-            left,
-            self.columns,
-            self.cost - 2.0 * within,
-        )
+        return summary(self.problem, self.causes, self.active, self.values, self.residual, self.columns)
+
+
+def summary(
+    problem: Problem,
+    causes: tuple[Quantity, ...],
+    active: tuple[Quantity, ...],
+    values: Floats,
+    residual: Floats,
+    columns: Floats,
+) -> Fit:
+    """The fit that stands at ``values`` (a,), with its posterior and evidence."""
+    wide = {q.key for q in causes}
+    variance = np.array([prior_variance(q, q.key in wide) for q in active])
+    departure, numerics = values - np.array([q.off for q in active]), problem.numerics
+    _, covariance, _ = posterior(residual, columns, departure, variance, numerics)
+    J = np.hstack([columns * np.sqrt(variance), numerics])
+    total = cost(residual, departure, variance, numerics)
+    evidence = -0.5 * total - 0.5 * float(np.linalg.slogdet(np.eye(J.shape[1]) + J.T @ J)[1])
+    evidence += math.log(2.0) * sum(q.one_sided for q in causes)
+    within = inside(active, wide, departure, covariance)
+    left = residual - _numerics_part(residual, numerics)
+    return Fit(
+        causes,
+        active,
+        values,
+        covariance,
+        float(left @ left),
+        evidence + within,
+        residual,
+        left,
+        columns,
+        total - 2.0 * within,
+    )
+
+
+def corrected(problem: Problem, result: Fit, change: Floats) -> Fit:
+    """``result`` after ``problem.offset`` has changed by ``change`` (m,), where it stood."""
+    return summary(
+        problem, result.causes, result.active, result.values, result.residual - change, result.columns
+    )
 
 
 def inside(active: Sequence[Quantity], causes: set[Key], departure: Floats, covariance: Floats) -> float:

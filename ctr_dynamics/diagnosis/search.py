@@ -16,9 +16,13 @@ import numpy as np
 from joblib import Parallel, delayed
 from numpy.typing import NDArray
 
+from ctr_dynamics.effects import EFFECTS
+
 from .candidates import Candidate, keys_of, log_prior
 from .explanations import Explanation, Job, finish, fit_all, look_closer, reduced, replaced
-from .fit import Fit, Key, Problem, fit
+from .fit import Fit, Key, Problem, corrected, fit
+from .numerics import renew_numerics
+from .sets import rank_sets
 from .signatures import Linearisation, Scored, linearise, screen, separation
 
 Floats = NDArray[np.float64]
@@ -38,6 +42,11 @@ CONTENDERS, CONTEND = 3, 6.0
 # separation from the best explanation's cause within which another is fitted in its place, and how many
 STAND_IN, STAND_INS = 12.0, 3
 ADEQUATE = 1.5  # of the noise: an explanation that leaves more is not worth the search for stand-ins
+# sets that are fitted because they look best by the columns at the best explanation, and how much less likely they may look where that is right
+SETS, CLOSE = 6, 6.0
+ROUNDS = 3  # of stand-ins and sets, from a new best explanation each
+OPINIONS = 12  # likeliest explanations that are asked to predict bags that were not fitted
+IMPOSSIBLE = -1e9  # log likelihood of bags that an explanation cannot simulate
 CONTENDER = 8.0  # deviations by which the cost may exceed the best one's: beyond, a fit is given up
 
 
@@ -84,6 +93,10 @@ def search(
     other = None if far is None else _search(free, pool, far, note, workers)
     if other is None:
         return found
+    change = free.offset - problem.offset
+    problem.offset, problem.numerics = free.offset, free.numerics
+    for e in found.explanations:
+        e.fit = corrected(problem, e.fit, change)
     both = found.explanations + [e for e in other.explanations if e.members]
     _score(both, pool)
     at_best = next((s.at_best for s in (found, other) if s.best is both[0]), None)
@@ -114,19 +127,29 @@ def _search(
         _score(found, pool)
     _finish_contenders(problem, found, pool, clean)
     at_best = None
-    for _ in range(2):  # a stand-in may take the first place
+    for _ in range(ROUNDS):  # a stand-in may take the first place
+        _renew(problem, found, pool, clean, note, workers)
         best = found[0]
-        if not best.members or best.fit.chi2 > ADEQUATE * problem.size:
+        adequate = best.fit.chi2 <= ADEQUATE * problem.size
+        wrong = leftover(problem, best.fit) > MUCH and best.fit.cost < _hopeless(problem, clean)
+        if not best.members or not (adequate or wrong):
             break
         note(f"what could stand in for {', '.join(best.effects)}")
-        at_best = linearise(
-            problem, best.fit.point, [s.candidate for s in distinct(screened)], workers, again=best.fit
-        )
-        new = [] if at_best is None else _stand_ins(problem, found, at_best, workers)
+        forms = [s.candidate for s in distinct(screened)]
+        at_best = linearise(problem, best.fit.point, forms, workers, again=best.fit)
+        if at_best is None:
+            break
+        sets = _stand_ins(problem, found, at_best) if adequate else []
+        margin = math.inf if wrong else CLOSE
+        sets += _other_sets(problem, found, at_best, pool, sets, margin)
+        new = _replace(problem, found, sets, at_best, workers)
         if not new:
             break
         found += new
         _score(found, pool)
+        if found[0] is not best:
+            found += _fewer(problem, found, note, workers)
+            _score(found, pool)
         _finish_contenders(problem, found, pool, clean)
         if found[0] is best:
             break
@@ -150,8 +173,8 @@ def _finish_contenders(
 
 
 def _stand_ins(
-    problem: Problem, found: Sequence[Explanation], lin: Linearisation, workers: int
-) -> list[Explanation]:
+    problem: Problem, found: Sequence[Explanation], lin: Linearisation
+) -> list[tuple[Candidate, ...]]:
     """The best explanation with each of its causes, and each two, replaced by one that looks much like them there, where nobody has tried.
 
     Screening looks from the re-calibrated model; a large effect looks different from there, and its place may have been taken by a likeness or
@@ -162,7 +185,7 @@ def _stand_ins(
     limit_apart = STAND_IN
     if leftover(problem, best.fit) > MUCH:  # it is not right, and what is lies about that far away
         limit_apart += math.sqrt(best.fit.chi2 - problem.size)
-    jobs = []
+    sets: list[tuple[Candidate, ...]] = []
     for gone in (*combinations(best.members, 1), *combinations(best.members, 2)):
         rest = tuple(m for m in best.members if m not in gone)
         kept = {m.effect for m in rest} if len(gone) > 1 else set(best.effects)
@@ -178,12 +201,66 @@ def _stand_ins(
             (*rest, rival) for d, _, rival in near if d < limit_apart and keys_of((*rest, rival)) not in tried
         ][:STAND_INS]
         tried.update(keys_of(members) for members in wanted)
-        jobs += [(members, gone) for members in wanted]
+        sets += wanted
+    return sets
+
+
+def _other_sets(
+    problem: Problem,
+    found: Sequence[Explanation],
+    lin: Linearisation,
+    pool: Sequence[Candidate],
+    planned: Sequence[tuple[Candidate, ...]],
+    margin: float,
+) -> list[tuple[Candidate, ...]]:
+    """Sets of one and two that explain most by the columns at the best explanation, whatever it holds, where nobody has tried or will; those
+    whose log posterior seems less by more than ``margin`` are left."""
+    best = found[0]
+    tried = {e.keys for e in found} | {keys_of(members) for members in planned}
+    forms = [c for c in lin.signatures if c.keys not in {m.keys for m in best.members}]
+    sets: list[tuple[Candidate, ...]] = []
+    for score, members in rank_sets(problem, lin, best.fit, (*best.members, *forms), pool):
+        if len(sets) == SETS or score < best.score - margin:
+            break
+        if keys_of(members) not in tried:
+            tried.add(keys_of(members))
+            sets.append(members)
+    return sets
+
+
+def _replace(
+    problem: Problem,
+    found: Sequence[Explanation],
+    sets: Sequence[tuple[Candidate, ...]],
+    lin: Linearisation,
+    workers: int,
+) -> list[Explanation]:
+    """Fits of ``sets`` from the best explanation, where ``lin`` stands."""
     limit = _limit(problem, found)
     fits = Parallel(workers, prefer="threads")(
-        delayed(replaced)(problem, best, members, gone, lin, limit) for members, gone in jobs
+        delayed(replaced)(problem, found[0], members, lin, limit) for members in sets
     )
     return [e for e in fits if e is not None]
+
+
+def second_opinion(found: Search, problem: Problem, held_out: Problem) -> None:
+    """Let the likeliest explanations predict ``held_out``, recordings that were not fitted, and weigh them by both: what imitates a cause in one
+    motion does not in another."""
+    every, first = found.explanations, found.best
+    for _ in range(CONTENDERS):  # finishing one may put another first
+        asked = [*(e for e in every[:OPINIONS] if e.members), found.clean]
+        for e in asked:
+            if e.held_out is None:
+                residual = held_out.residual(e.fit.point)
+                e.held_out = IMPOSSIBLE if residual is None else -0.5 * float(residual @ residual)
+        _score(every, found.pool)
+        if not every[0].members or every[0].finished:
+            break
+        finish(problem, every[0])
+        every[0].held_out = None
+    if every[0] is not first:
+        found.at_best = None
+    found.probabilities = _probabilities(every, problem)
 
 
 def _further(
@@ -201,6 +278,8 @@ def _further(
     tried: set[frozenset[str]] = set()
     leaders = [e for e in found if e.members][:2]
     much = leftover(problem, leaders[0].fit) > MUCH
+    if much and _renew(problem, found, pool, clean, note, workers):
+        leaders = [e for e in found if e.members][:2]
     if much:
         finish(problem, leaders[0])
         look_closer(problem, leaders[0])
@@ -236,6 +315,31 @@ def _limit(problem: Problem, found: Sequence[Explanation]) -> float:
     """Cost from which a fit has no chance against what was found."""
     best = min(e.fit.cost for e in found)
     return best + CONTENDER**2 * max(1.0, best / problem.size)
+
+
+def _renew(
+    problem: Problem,
+    found: list[Explanation],
+    pool: Sequence[Candidate],
+    clean: Fit,
+    note: Callable[[str], None],
+    workers: int,
+) -> bool:
+    """The solver's own error where the best explanation stands, if that is about right; what was found so far is weighed with it."""
+    best = found[0]
+    if not best.members or any(EFFECTS[m.effect].impacts for m in best.members):
+        return False
+    if best.fit.cost > _hopeless(problem, clean):
+        return False
+    note(f"numerics with {', '.join(best.effects)}")
+    change = renew_numerics(problem, best.fit.point, workers)
+    if change is None:
+        return False
+    for e in found:
+        e.fit, e.finished = corrected(problem, e.fit, change), False
+    _score(found, pool)
+    _finish_contenders(problem, found, pool, clean)
+    return True
 
 
 def _fewer(
@@ -281,18 +385,24 @@ def distinct(found: Sequence[Scored]) -> list[Scored]:
 def _score(found: list[Explanation], pool: Sequence[Candidate]) -> None:
     """Sort by log posterior; the better of two fits of the same set stays."""
     best: dict[frozenset[Key], Explanation] = {}
-    for e in found:
-        e.score = e.fit.log_evidence + log_prior(e.members, pool)
+    for e, evidence in zip(found, _evidence(found), strict=True):
+        e.score = evidence + log_prior(e.members, pool)
         if e.keys not in best or best[e.keys].score < e.score:
             best[e.keys] = e
     found[:] = sorted(best.values(), key=lambda e: -e.score)
 
 
+def _evidence(found: Sequence[Explanation]) -> list[float]:
+    """Log evidence of each, with what it predicts of bags that were not fitted; who was not asked predicts no better than the worst."""
+    worst = min((e.held_out for e in found if e.held_out is not None), default=0.0)
+    return [e.fit.log_evidence + (worst if e.held_out is None else e.held_out) for e in found]
+
+
 def _probabilities(found: Sequence[Explanation], problem: Problem) -> Floats:
     """Of each explanation: softmax of the tempered score, with the noise that the best one leaves."""
     inflation = max(1.0, found[0].fit.chi2 / problem.size)
-    scores = np.array(
-        [e.fit.log_evidence / (TEMPERATURE * inflation) + (e.score - e.fit.log_evidence) for e in found]
-    )
+    evidence = np.array(_evidence(found))
+    prior = np.array([e.score for e in found]) - evidence
+    scores = evidence / (TEMPERATURE * inflation) + prior
     weights = np.exp(scores - scores.max())
     return weights / weights.sum()

@@ -9,9 +9,9 @@ from ctr_dynamics.diagnosis import numerics
 from ctr_dynamics.diagnosis.candidates import candidates, causes_of
 from ctr_dynamics.diagnosis.experiment import NODES, Experiment
 from ctr_dynamics.diagnosis.explanations import Explanation
-from ctr_dynamics.diagnosis.fit import REACH, fit, make_problem
+from ctr_dynamics.diagnosis.fit import REACH, corrected, fit, make_problem
 from ctr_dynamics.diagnosis.recording import Recording
-from ctr_dynamics.diagnosis.search import _stand_ins
+from ctr_dynamics.diagnosis.search import _replace, _stand_ins
 from ctr_dynamics.diagnosis.signatures import linearise, screen
 from ctr_dynamics.effects import quantities
 from ctr_dynamics.robot import load_robot
@@ -86,6 +86,51 @@ def test_more_nodes_where_the_data_can_see_them(recording, robot, monkeypatch):
     assert problem.experiments[0].nodes == numerics.MOST_NODES
     assert finer["space_error_m"] < 0.3 * errors["space_error_m"]
     assert finer["time_error_m"] == pytest.approx(errors["time_error_m"], rel=0.2)
+
+
+def test_the_error_of_the_solver_is_that_of_the_point(recording, robot, known, monkeypatch):
+    """Where it is larger there, residuals and evidence are those with it, without a simulation."""
+    problem = make_problem(
+        robot, [recording], [known["encoder_offset", "tube1.offset_rad"]], np.ones(6, bool)
+    )
+    numerics.add_numerics(problem, {}, 1)
+    friction = known["tube_coulomb", "mu"]
+    there = fit(problem, [friction], {friction.key: friction.off + 0.1}, iterations=0)
+    assert there is not None
+    assert numerics.renew_numerics(problem, there.point, 1) is None  # about the same: all stays
+    np.testing.assert_array_equal(problem.residual(there.point), there.residual)
+    measured = numerics.differences
+    monkeypatch.setattr(
+        numerics, "differences", lambda *given: tuple(20.0 * part for part in measured(*given))
+    )
+    change = numerics.renew_numerics(problem, there.point, 1)
+    assert change is not None
+    assert np.linalg.norm(change) >= numerics.RENEWED
+    moved = corrected(problem, there, change)
+    np.testing.assert_allclose(moved.residual, problem.residual(there.point), atol=1e-9)
+    again = fit(problem, [friction], there.point, iterations=0)
+    assert again is not None
+    assert moved.log_evidence == pytest.approx(again.log_evidence, abs=1e-6)
+    assert moved.log_evidence != pytest.approx(there.log_evidence, abs=1.0)
+
+
+def test_a_shorter_step_that_fails_is_followed_by_a_longer_one(recording, robot, monkeypatch):
+    experiment = Experiment(recording, robot)
+    half = numerics._shorter(experiment, {})
+    plain = numerics._plain
+
+    def failing(other, point):
+        return None if other.scheme.dt < 0.6 * experiment.scheme.dt else plain(other, point)
+
+    monkeypatch.setattr(numerics, "_plain", failing)
+    longer = numerics._shorter(experiment, {})
+    base = plain(experiment, {})
+    errors = [factor * (base - found) for found, factor in (half, longer)]
+    assert half[1] == 1.0 < longer[1]
+    sizes = [np.linalg.norm(e[5:]) for e in errors]
+    assert sizes[1] == pytest.approx(sizes[0], rel=0.5)
+    monkeypatch.setattr(numerics, "_plain", lambda *_: None)
+    assert numerics._shorter(experiment, {})[0] is None
 
 
 def test_the_misfit_is_a_smooth_function_of_delays(robot, known):
@@ -165,7 +210,7 @@ def test_what_looks_like_a_cause_is_fitted_in_its_place(recording, robot, known)
     found = [Explanation((other,), wrong)]
     lin = linearise(problem, wrong.point, pool, 1, again=wrong)
     assert lin is not None
-    new = _stand_ins(problem, found, lin, 1)
+    new = _replace(problem, found, _stand_ins(problem, found, lin), lin, 1)
     (right,) = [e for e in new if e.effects == ("payload_mass",)]
     assert right.fit.cost < wrong.cost - 1.0
-    assert not [e for e in _stand_ins(problem, found + new, lin, 1) if e.effects == ("payload_mass",)]
+    assert not [s for s in _stand_ins(problem, found + new, lin) if s[0].effect == "payload_mass"]

@@ -1,0 +1,125 @@
+"""Sets of causes on problems that are linear: what a search one by one misses, and what bags that were not fitted say."""
+
+import math
+
+import numpy as np
+import pytest
+
+from ctr_dynamics.diagnosis.candidates import Candidate, causes_of
+from ctr_dynamics.diagnosis.explanations import Explanation
+from ctr_dynamics.diagnosis.fit import fit
+from ctr_dynamics.diagnosis.search import Search, _probabilities, _score, second_opinion
+from ctr_dynamics.diagnosis.sets import rank_sets
+from ctr_dynamics.diagnosis.signatures import Linearisation
+from ctr_dynamics.effects import Parameter, Quantity
+
+
+def quantity(effect, *, tolerance=0.0, low=-math.inf):
+    """A coordinate of unit prior size, of no effect of the catalogue."""
+    return Quantity(effect, "size", 0.0, tolerance, 1.0, low, math.inf, Parameter("size", "1", 0.0, 1.0))
+
+
+class Linear:
+    """A problem with one column for every quantity; ``data`` (m,) whitened."""
+
+    reach = 4.0
+
+    def __init__(self, columns, data, nuisances, numerics):
+        self.columns, self.data, self.nuisances, self.numerics = columns, data, nuisances, numerics
+        self.size = len(data)
+
+    def residual(self, point):
+        return self.data - sum(self.columns[key] * value for key, value in point.items())
+
+    def linearise(self, point, wanted):
+        return self.residual(point), np.stack([self.columns[q.key] for q in wanted], axis=1)
+
+
+@pytest.fixture
+def made():
+    """(problem, candidates by name, held-out problem): ``both`` looks nearly like ``one`` and ``two`` together, in the fitted data alone."""
+    rng = np.random.default_rng(5)
+    names = ("one", "two", "both", "other")
+    causes = {n: quantity(n, low=0.0 if n == "other" else -math.inf) for n in names}
+    nuisance = quantity("nuisance", tolerance=0.5)
+    problems = []
+    for held_out in (False, True):
+        columns = {q.key: 20.0 * rng.normal(size=300) for q in (*causes.values(), nuisance)}
+        one, two = columns[causes["one"].key], columns[causes["two"].key]
+        if not held_out:
+            columns[causes["both"].key] = one - two + 4.0 * rng.normal(size=300)
+        columns[causes["other"].key] -= 3.0 * one  # of the wrong sign
+        data = one - two + 0.2 * columns[nuisance.key] + rng.normal(size=300)
+        problems.append(Linear(columns, data, (nuisance,), rng.normal(size=(300, 1))))
+    return problems[0], {n: Candidate(n, (q,)) for n, q in causes.items()}, problems[1]
+
+
+def linearised(problem, pool, result):
+    signatures = {c: problem.columns[c.quantities[0].key][:, None] for c in pool}
+    return Linearisation(result.point, result.residual, dict(problem.columns), signatures)
+
+
+def explained(problem, *members):
+    return Explanation(members, fit(problem, causes_of(members), {}), finished=True)
+
+
+def test_the_pair_is_first_where_its_likeness_stands(made):
+    """Looking for one cause at a time ends at the likeness: beside it, and instead of it, each of the two alone is worse."""
+    problem, pool, _ = made
+    clean = fit(problem, (), {})
+    everything = list(pool.values())
+    first = rank_sets(problem, linearised(problem, everything, clean), clean, everything, everything)
+    singles = [members for _, members in first if len(members) == 1]
+    assert singles[0] == (pool["both"],)
+    best = explained(problem, pool["both"])
+    ranked = rank_sets(problem, linearised(problem, everything, best.fit), best.fit, everything, everything)
+    assert set(ranked[0][1]) == {pool["one"], pool["two"]}
+    assert not any(pool["other"] in members for _, members in ranked[:1] if len(members) == 1)
+
+
+def test_the_evidence_of_sets_is_that_of_their_fits(made):
+    """Where the model is linear and nuisances stay inside."""
+    problem, pool, _ = made
+    everything = list(pool.values())
+    start = explained(problem, pool["both"]).fit
+    ranked = rank_sets(problem, linearised(problem, everything, start), start, everything, everything)
+    found = [explained(problem, *members) for _, members in ranked]
+    _score(found, everything)
+    exact = {e.keys: e.score for e in found}
+    linear = {frozenset().union(*(c.keys for c in members)): score for score, members in ranked}
+    assert len(linear) > 4
+    for keys, score in linear.items():
+        assert score == pytest.approx(exact[keys], rel=1e-3, abs=0.5)
+
+
+def test_bags_that_were_not_fitted_have_a_say(made):
+    """A likeness that fits about as well as the truth does not predict."""
+    problem, pool, held_out = made
+    problem.data = problem.data + 0.9 * (
+        problem.columns[pool["both"].quantities[0].key]
+        - problem.columns[pool["one"].quantities[0].key]
+        + problem.columns[pool["two"].quantities[0].key]
+    )
+    everything = list(pool.values())
+    clean = Explanation((), fit(problem, (), {}))
+    right, wrong = explained(problem, pool["one"], pool["two"]), explained(problem, pool["both"])
+    found = [clean, right, wrong]
+    _score(found, everything)
+    assert found[0] is wrong
+    result = Search(found, _probabilities(found, problem), clean, None, [], everything)
+    second_opinion(result, problem, held_out)
+    assert result.best is right
+    assert result.probabilities[0] > 0.99
+    # who cannot simulate them loses, whoever it is; where nobody can, nothing changes
+    for e in found:
+        e.held_out = None
+    simulate = held_out.residual
+    held_out.residual = lambda point: None if len(point) == len(right.fit.point) else simulate(point)
+    second_opinion(result, problem, held_out)
+    assert result.best is wrong
+    for e in found:
+        e.held_out = None
+    held_out.residual = lambda point: None
+    second_opinion(result, problem, held_out)
+    assert result.best is wrong
+    assert np.isfinite(result.probabilities).all()
