@@ -41,9 +41,11 @@ MIN_SCREEN = 1.0  # log evidence by the linear estimate below which a candidate 
 CONTENDERS, CONTEND = 3, 6.0
 # separation from the best explanation's cause within which another is fitted in its place, and how many
 STAND_IN, STAND_INS = 12.0, 3
+LIKENESS = 0.12  # of its size: a rival that is nearer is alike in shape, and what a large effect does is not linear enough to tell them apart
 ADEQUATE = 1.5  # of the noise: an explanation that leaves more is not worth the search for stand-ins
-# sets that are fitted because they look best by the columns at the best explanation, and how much less likely they may look where that is right
-SETS, CLOSE = 6, 6.0
+# sets that are fitted because they look best by the columns at the best explanation; where that is right, how much less likely they may look,
+# and which share of the misfit that it explains they may leave by these columns
+SETS, CLOSE, NONLINEAR = 6, 6.0, 0.01
 ROUNDS = 3  # of stand-ins and sets, from a new best explanation each
 OPINIONS = 12  # likeliest explanations that are asked to predict bags that were not fitted
 IMPOSSIBLE = -1e9  # log likelihood of bags that an explanation cannot simulate
@@ -140,7 +142,7 @@ def _search(
         if at_best is None:
             break
         sets = _stand_ins(problem, found, at_best) if adequate else []
-        margin = math.inf if wrong else CLOSE
+        margin = math.inf if wrong else CLOSE + NONLINEAR * max(clean.cost - best.fit.cost, 0.0)
         sets += _other_sets(problem, found, at_best, pool, sets, margin)
         new = _replace(problem, found, sets, at_best, workers)
         if not new:
@@ -189,6 +191,7 @@ def _stand_ins(
     for gone in (*combinations(best.members, 1), *combinations(best.members, 2)):
         rest = tuple(m for m in best.members if m not in gone)
         kept = {m.effect for m in rest} if len(gone) > 1 else set(best.effects)
+        apart = max(limit_apart, LIKENESS * separation(problem, best.fit, gone, None, lin))
         near = sorted(
             (
                 (separation(problem, best.fit, gone, rival, lin), i, rival)
@@ -198,7 +201,7 @@ def _stand_ins(
             key=lambda item: item[:2],
         )
         wanted = [
-            (*rest, rival) for d, _, rival in near if d < limit_apart and keys_of((*rest, rival)) not in tried
+            (*rest, rival) for d, _, rival in near if d < apart and keys_of((*rest, rival)) not in tried
         ][:STAND_INS]
         tried.update(keys_of(members) for members in wanted)
         sets += wanted

@@ -23,7 +23,7 @@ from .uncertainty import ModelUncertainty
 
 Floats = NDArray[np.float64]
 COLUMN_NODES = 12
-EPSILON = 1e-6  # of one standard deviation: small against the curvature of the step, large against rounding
+EPSILON = 5e-9  # of one standard deviation: small against the curvature of the step, large against rounding
 
 
 def carried(matrix: csr_array, vector: Floats) -> Floats:

@@ -37,7 +37,8 @@ class Model:
         plain_parameters: (NP,) block at the robot file's values without its extensions; actuators and tip wrench are 0.
         setup: what a prediction needs besides, extensions included. parameters: its block.
         scale: (5 + N,) N and N m, unit of each shooting residual; step: (5 + N,) perturbation of each unknown for Newton's
-            method; tangent_step: a smaller one, for tangents.
+            method; tangent_step: a much smaller one, for tangents: strong friction between tubes bends the imbalance, and errors of a tangent grow
+            from step to step.
         load_kink: (6,) N and N m: a change of a load's slope that adds more than this within a step is worth dividing the step.
         nodes: requested nodes from plate to tip.
     """
@@ -92,7 +93,7 @@ class Model:
         self.scale = np.array([force] * 3 + [moment] * (2 + n))
         self.load_kink = LOAD_KINK * np.array([force] * 3 + [moment] * 3)
         self.step = np.array([moment] * n + [force] * 3 + [moment] * 2) * 1e-6
-        self.tangent_step = 0.1 * self.step
+        self.tangent_step = 5e-5 * self.step
         self._meshes: dict[Key, Mesh] = {}
         # precurvature that varies within a tube's segments, or twists it behind the plate, moves over the cells with the tube
         self.moving_precurvature = any(

@@ -31,7 +31,7 @@ TIP_ROWS = 13  # p, h, q, omega
 CHUNK = 256  # steps between returns to Python
 PATIENCE = 40  # steps that may need more than the compiled loop before a run is given up
 SENSITIVE = 10.0  # m, of the tip by a quantity's unit: where a ten-thousandth of it moves the tip by a millimetre, no derivative tells of a change
-EPSILON = 1e-6  # of a column's unit: small against the curvature of the step, large against rounding
+EPSILON = 5e-9  # of a column's unit: small against the curvature of the step, large against rounding
 
 
 @dataclass

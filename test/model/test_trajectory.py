@@ -67,6 +67,10 @@ def test_run_equals_steps(slide):
     assert moved[-1] == pytest.approx(at(found.t[-1]).beta[1])
 
 
+# of columns of p (m), h, q (m/s) and omega (rad/s) of the tip by a quantity's unit, which are differences of two sweeps
+ROUNDING = ((slice(0, 3), 2e-8), (slice(3, 7), 2e-7), (slice(7, 10), 2e-6), (slice(10, 13), 5e-5))
+
+
 def compare(model, slide, parameters, inputs, tolerance):
     """Columns of a run against central differences of runs.
 
@@ -111,12 +115,12 @@ def compare(model, slide, parameters, inputs, tolerance):
             assert not other.failure
             ends.append(other.tip)
         expected = (ends[0] - ends[1]) / (2.0 * h)
-        for part in (slice(0, 3), slice(3, 7), slice(7, 10), slice(10, 13)):
+        for part, rounding in ROUNDING:
             size = np.abs(expected[:, part]).max()
             error = np.abs(found.columns[:, part, c] - expected[:, part]).max()
-            if not (size > 0.0 and error < tolerance * size):
+            if not (size > 0.0 and error < tolerance * size + rounding):
                 wrong.append(((*parameters, *inputs)[c], part, size, error / max(size, 1e-300)))
-    assert not wrong
+    assert not wrong, wrong
 
 
 def test_sensitivities_of_a_plain_run():
@@ -141,6 +145,14 @@ def test_sensitivities_of_a_plain_run():
     )
     # beta itself on sections that stay: a shift of beta also shifts the time at which they change
     compare(model, 0.0, [], [(4, 1e-4), (5, 1e-4)], 2e-3)
+
+
+def test_sensitivities_with_strong_friction():
+    """Sixty times the stated friction between tubes bends the imbalance: a tangent by changes that are too large would grow from step to step."""
+    model = Model(ROBOT, nodes=12)
+    model.parameters[model.layout["tube_coulomb"]] = 0.19
+    unit = 0.02 * model.parameters[model.layout["bending_stiffness"]][0]
+    compare(model, 0.0, [("bending_stiffness", 0, unit), ("body_mass", 0, 1e-4)], [(0, 0.03)], 2e-2)
 
 
 def extended_robot(extensions):
