@@ -25,7 +25,17 @@ from .fit import Fit, Local, Problem, fit, make_problem
 from .mistakes import find_mistake
 from .numerics import add_numerics
 from .recording import Recording
-from .search import FAR, LEFT_NUMERICAL, LEFT_SHARE, Search, distinct, leftover, search, second_opinion
+from .search import (
+    ADEQUATE,
+    FAR,
+    LEFT_NUMERICAL,
+    LEFT_SHARE,
+    Search,
+    distinct,
+    leftover,
+    search,
+    second_opinion,
+)
 from .signatures import Linearisation, linearise, observable, separation
 from .unexplained import Unexplained, unexplained
 from .wall import wall
@@ -254,7 +264,10 @@ def _decide(
         result.validation = validate(held_out, clean.fit, best.fit)
     predicted = result.validation is not None and result.validation.confirms
     unexplained_part = left > (LEFT_SHARE if best.resolved else LEFT_NUMERICAL)
-    if not noise and (not best.members or (unexplained_part and not predicted)):
+    plain = (
+        best.resolved and best.fit.chi2 > ADEQUATE * dof
+    )  # whatever its share: causes that leave so much are not the right ones
+    if not noise and (not best.members or plain or (unexplained_part and not predicted)):
         result.verdict = "unknown"
         result.members = [Member(None, "unknown", 0.95, None, [])]
         result.unexplained = unexplained(problem.experiments[0], clean.fit.point)

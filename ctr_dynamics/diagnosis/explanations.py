@@ -21,6 +21,7 @@ Floats = NDArray[np.float64]
 LEAVES_LITTLE = 2.0  # times the noise: then no other size is tried
 FINER = 2.0  # times the steps, to see the error in time
 NUMERICAL = 5.0  # times that difference's squares: what is left can be the error itself, which falls slowly with the step
+FAILED = 1e30  # whitened squares where a simulation fails
 NEIGHBOURHOOD = (0.5, 1.7)  # of a probe's size: where the size that leaves least is looked for
 
 
@@ -110,7 +111,7 @@ def along(problem: Problem, point: Mapping[Key, float], q: Quantity) -> dict[Key
     def left(share: float) -> float:
         size = float(np.clip(q.off + share * departure, q.low, q.high))
         residual = coarse.residual({**point, q.key: size})
-        return math.inf if residual is None else float(residual @ residual)
+        return FAILED if residual is None else float(residual @ residual)
 
     found = minimize_scalar(
         left, bounds=NEIGHBOURHOOD, method="bounded", options={"maxiter": 12, "xatol": 0.01}

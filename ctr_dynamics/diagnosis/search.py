@@ -46,7 +46,7 @@ ADEQUATE = 1.5  # of the noise: an explanation that leaves more is not worth the
 # sets that are fitted because they look best by the columns at the best explanation; where that is right, how much less likely they may look,
 # and which share of the misfit that it explains they may leave by these columns
 SETS, CLOSE, NONLINEAR = 6, 6.0, 0.01
-ROUNDS = 3  # of stand-ins and sets, from a new best explanation each
+ROUNDS = 3  # of stand-ins and sets, from a new best explanation each, or the next sets where none of the first is better and more than noise is left
 OPINIONS = 12  # likeliest explanations that are asked to predict bags that were not fitted
 IMPOSSIBLE = -1e9  # log likelihood of bags that an explanation cannot simulate
 CONTENDER = 8.0  # deviations by which the cost may exceed the best one's: beyond, a fit is given up
@@ -128,7 +128,7 @@ def _search(
         found += _fewer(problem, found, note, workers)
         _score(found, pool)
     _finish_contenders(problem, found, pool, clean)
-    at_best = None
+    at_best, stood = None, None
     for _ in range(ROUNDS):  # a stand-in may take the first place
         _renew(problem, found, pool, clean, note, workers)
         best = found[0]
@@ -137,15 +137,16 @@ def _search(
         if not best.members or not (adequate or wrong):
             break
         note(f"what could stand in for {', '.join(best.effects)}")
-        forms = [s.candidate for s in distinct(screened)]
-        at_best = linearise(problem, best.fit.point, forms, workers, again=best.fit)
+        if best is not stood:
+            forms = [s.candidate for s in distinct(screened)]
+            at_best, stood = linearise(problem, best.fit.point, forms, workers, again=best.fit), best
         if at_best is None:
             break
         sets = _stand_ins(problem, found, at_best) if adequate else []
         margin = math.inf if wrong else CLOSE + NONLINEAR * max(clean.cost - best.fit.cost, 0.0)
         sets += _other_sets(problem, found, at_best, pool, sets, margin)
         new = _replace(problem, found, sets, at_best, workers)
-        if not new:
+        if not sets:
             break
         found += new
         _score(found, pool)
@@ -153,8 +154,9 @@ def _search(
             found += _fewer(problem, found, note, workers)
             _score(found, pool)
         _finish_contenders(problem, found, pool, clean)
-        if found[0] is best:
+        if found[0] is best and not wrong:
             break
+    if found[0] is not stood:
         at_best = None
     return Search(found, _probabilities(found, problem), base, lin, screened, pool, at_best)
 
