@@ -21,21 +21,12 @@ from ctr_dynamics.robot import Robot
 from .candidates import Candidate, candidates
 from .checks import Whiteness, block_bootstrap, rms, whiteness
 from .explanations import Explanation
+from .exploration import ADEQUATE, FAR, LEFT_NUMERICAL, LEFT_SHARE, Search, distinct, leftover
 from .fit import Fit, Local, Problem, fit, make_problem
 from .mistakes import find_mistake
 from .numerics import add_numerics
 from .recording import Recording
-from .search import (
-    ADEQUATE,
-    FAR,
-    LEFT_NUMERICAL,
-    LEFT_SHARE,
-    Search,
-    distinct,
-    leftover,
-    search,
-    second_opinion,
-)
+from .search import search, second_opinion
 from .signatures import Linearisation, linearise, observable, separation
 from .unexplained import Unexplained, unexplained
 from .wall import wall

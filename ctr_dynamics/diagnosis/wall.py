@@ -24,6 +24,7 @@ from .candidates import Candidate
 from .experiment import Experiment
 from .fit import Key, Problem
 from .noise import noise_floor
+from .recording import Recording
 
 Floats = NDArray[np.float64]
 EFFECT = "contact"
@@ -66,15 +67,38 @@ def wall(problem: Problem, known: Sequence[Quantity]) -> Candidate | None:
     return None
 
 
+def parting(experiment: Experiment) -> float | None:
+    """s at which measurement and nominal model part; None where they do not, or the model cannot be simulated."""
+    try:
+        prediction = experiment.predict({})
+    except InputError:
+        return None
+    if prediction.failure:
+        return None
+    residual = experiment.residual(prediction)[:, :3]
+    parted = _parted(_sizes(experiment.recording, residual), noise_floor(experiment.robot))
+    return None if parted is None else float(experiment.recording.stamps[parted])
+
+
+def _sizes(recording: Recording, residual: Floats) -> Floats:
+    """(s,) m of the residual (s, 3), zero where there is no measurement."""
+    good = np.isfinite(recording.position).all(axis=1)
+    return np.where(good, np.linalg.norm(residual, axis=1), 0.0)
+
+
+def _parted(sizes: Floats, floor: float) -> int | None:
+    """First sample at which a residual is large; None where none is."""
+    large = sizes > max(PARTED * float(np.quantile(sizes, 0.95)), 5.0 * floor)
+    return int(np.argmax(large)) if large.any() else None
+
+
 def _search(experiment: Experiment, residual: Floats, floor: float) -> Floats | None:
     """Logarithm of the stiffness (N/m), normal (3,) and offset (cm) of a wall; None where there is none."""
     recording = experiment.recording
-    good = np.isfinite(recording.position).all(axis=1)
-    sizes = np.where(good, np.linalg.norm(residual, axis=1), 0.0)
-    limit = max(PARTED * float(np.quantile(sizes, 0.95)), 5.0 * floor)
-    if not (sizes > limit).any():
+    sizes = _sizes(recording, residual)
+    parted = _parted(sizes, floor)
+    if parted is None:
         return None
-    parted = int(np.argmax(sizes > limit))
     first = parted
     while first > 0 and sizes[first - 1] > FIRST * floor:
         first -= 1

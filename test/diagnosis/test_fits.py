@@ -9,9 +9,9 @@ from ctr_dynamics.diagnosis import numerics
 from ctr_dynamics.diagnosis.candidates import candidates, causes_of
 from ctr_dynamics.diagnosis.experiment import NODES, Experiment
 from ctr_dynamics.diagnosis.explanations import Explanation
+from ctr_dynamics.diagnosis.exploration import _replace, _stand_ins
 from ctr_dynamics.diagnosis.fit import REACH, corrected, fit, make_problem
 from ctr_dynamics.diagnosis.recording import Recording
-from ctr_dynamics.diagnosis.search import _replace, _stand_ins
 from ctr_dynamics.diagnosis.signatures import linearise, screen
 from ctr_dynamics.effects import quantities
 from ctr_dynamics.robot import load_robot

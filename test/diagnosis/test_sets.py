@@ -7,8 +7,9 @@ import pytest
 
 from ctr_dynamics.diagnosis.candidates import Candidate, causes_of
 from ctr_dynamics.diagnosis.explanations import Explanation
+from ctr_dynamics.diagnosis.exploration import Search, probabilities, weigh
 from ctr_dynamics.diagnosis.fit import fit
-from ctr_dynamics.diagnosis.search import Search, _probabilities, _score, second_opinion
+from ctr_dynamics.diagnosis.search import second_opinion
 from ctr_dynamics.diagnosis.sets import rank_sets
 from ctr_dynamics.diagnosis.signatures import Linearisation
 from ctr_dynamics.effects import Parameter, Quantity
@@ -84,7 +85,7 @@ def test_the_evidence_of_sets_is_that_of_their_fits(made):
     start = explained(problem, pool["both"]).fit
     ranked = rank_sets(problem, linearised(problem, everything, start), start, everything, everything)
     found = [explained(problem, *members) for _, members in ranked]
-    _score(found, everything)
+    weigh(found, everything)
     exact = {e.keys: e.score for e in found}
     linear = {frozenset().union(*(c.keys for c in members)): score for score, members in ranked}
     assert len(linear) > 4
@@ -104,9 +105,9 @@ def test_bags_that_were_not_fitted_have_a_say(made):
     clean = Explanation((), fit(problem, (), {}))
     right, wrong = explained(problem, pool["one"], pool["two"]), explained(problem, pool["both"])
     found = [clean, right, wrong]
-    _score(found, everything)
+    weigh(found, everything)
     assert found[0] is wrong
-    result = Search(found, _probabilities(found, problem), clean, None, [], everything)
+    result = Search(found, probabilities(found, problem), clean, None, [], everything)
     second_opinion(result, problem, held_out)
     assert result.best is right
     assert result.probabilities[0] > 0.99
