@@ -123,14 +123,14 @@ def second_opinion(found: Search, problem: Problem, held_out: Problem) -> None:
     """Let the likeliest explanations predict ``held_out``, recordings that were not fitted, and weigh them by both: what imitates a cause in one
     motion does not in another."""
     every, first = found.explanations, found.best
-    for _ in range(CONTENDERS):  # finishing one may put another first
+    for turn in range(CONTENDERS + 1):  # finishing one may put another first
         asked = [*(e for e in every[:OPINIONS] if e.members), found.clean]
         for e in asked:
             if e.held_out is None:
                 residual = held_out.residual(e.fit.point)
                 e.held_out = IMPOSSIBLE if residual is None else -0.5 * float(residual @ residual)
         weigh(every, found.pool)
-        if not every[0].members or every[0].finished:
+        if not every[0].members or every[0].finished or turn == CONTENDERS:
             break
         finish(problem, every[0])
         every[0].held_out = None
