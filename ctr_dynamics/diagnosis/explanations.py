@@ -134,6 +134,14 @@ def reduced(problem: Problem, members: tuple[Candidate, ...], start: Fit) -> Exp
     return None if result is None else Explanation(members, result)
 
 
+def combined(problem: Problem, parts: Sequence[Explanation], limit: float) -> Explanation | None:
+    """Fit of the causes of all ``parts`` from the values that each has alone, beside nominal nuisances: theirs stand in for one another's causes."""
+    members = tuple(m for e in parts for m in e.members)
+    start = {key: value for e in parts for key, value in e.fit.point.items() if key in e.keys}
+    result = fit(with_nuisances(problem, members), causes_of(members), start, limit=limit, polish=False)
+    return None if result is None else Explanation(members, result)
+
+
 def replaced(
     problem: Problem, best: Explanation, members: tuple[Candidate, ...], lin: Linearisation, limit: float
 ) -> Explanation | None:

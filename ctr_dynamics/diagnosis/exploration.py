@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from ctr_dynamics.effects import EFFECTS
 
 from .candidates import Candidate, keys_of, log_prior
-from .explanations import Explanation, Job, finish, fit_all, look_closer, reduced, replaced
+from .explanations import Explanation, Job, combined, finish, fit_all, look_closer, reduced, replaced
 from .fit import Fit, Key, Problem, corrected
 from .numerics import renew_numerics
 from .sets import rank_sets
@@ -30,6 +30,7 @@ TEMPERATURE = 1.6  # of the log evidence: a judgement against overconfidence, no
 SHORTLIST = 8  # candidates that are fitted
 BATCH = 2  # fits between which the best is looked at; fixed, so that the outcome does not depend on the number of workers
 SECOND = 4  # second causes that are fitted beside a first
+HELPFUL = 5  # effects that leave least alone, whose pairs are tried where more than noise is left
 LEFT_SHARE = 0.03  # of the misfit beyond noise that an explanation may leave
 LEFT_NUMERICAL = 0.15  # the same where the model's error in time is as large
 MUCH = 4.0  # deviations of the noise that an explanation may leave before more is tried
@@ -95,6 +96,10 @@ def explore(
     if found[0].members:
         found += _further(problem, pool, found, clean, lin, note, workers)
         weigh(found, pool)
+        if leftover(problem, found[0].fit) > MUCH:
+            note("pairs of what helps most alone")
+            found += _pairs(problem, found, workers)
+            weigh(found, pool)
         found += _fewer(problem, found, note, workers)
         weigh(found, pool)
     _finish_contenders(problem, found, pool, clean)
@@ -264,6 +269,19 @@ def _further(
         if new[0].fit.cost > beyond:
             break  # a third cause would not save it: it is outside the catalogue
     return out
+
+
+def _pairs(problem: Problem, found: Sequence[Explanation], workers: int) -> list[Explanation]:
+    """All pairs of the effects that leave least alone, where nobody has tried: beside one of two causes that stands in for both, the other looks like
+    nothing."""
+    alone: dict[str, Explanation] = {}
+    for e in sorted((e for e in found if len(e.members) == 1), key=lambda e: e.fit.cost):
+        alone.setdefault(e.effects[0], e)
+    tried = {e.keys for e in found}
+    pairs = [p for p in combinations(list(alone.values())[:HELPFUL], 2) if p[0].keys | p[1].keys not in tried]
+    limit = _limit(problem, found)
+    fits = Parallel(workers, prefer="threads")(delayed(combined)(problem, pair, limit) for pair in pairs)
+    return [e for e in fits if e is not None]
 
 
 def _limit(problem: Problem, found: Sequence[Explanation]) -> float:

@@ -1,10 +1,13 @@
 """Sets of causes on problems that are linear: what a search one by one misses, and what bags that were not fitted say."""
 
 import math
+from collections import defaultdict
+from itertools import combinations
 
 import numpy as np
 import pytest
 
+from ctr_dynamics.diagnosis import explanations, exploration
 from ctr_dynamics.diagnosis.candidates import Candidate, causes_of
 from ctr_dynamics.diagnosis.explanations import Explanation
 from ctr_dynamics.diagnosis.exploration import Search, probabilities, weigh
@@ -12,7 +15,7 @@ from ctr_dynamics.diagnosis.fit import fit
 from ctr_dynamics.diagnosis.search import second_opinion
 from ctr_dynamics.diagnosis.sets import rank_sets
 from ctr_dynamics.diagnosis.signatures import Linearisation
-from ctr_dynamics.effects import Parameter, Quantity
+from ctr_dynamics.effects import EFFECTS, Parameter, Quantity
 
 
 def quantity(effect, *, tolerance=0.0, low=-math.inf):
@@ -91,6 +94,21 @@ def test_the_evidence_of_sets_is_that_of_their_fits(made):
     assert len(linear) > 4
     for keys, score in linear.items():
         assert score == pytest.approx(exact[keys], rel=1e-3, abs=0.5)
+
+
+def test_pairs_of_what_helps_most_alone(made, monkeypatch):
+    """Each of a few effects with each other, once."""
+    problem, pool, _ = made
+    monkeypatch.setattr(explanations, "EFFECTS", defaultdict(lambda: EFFECTS["density"]))
+    monkeypatch.setattr(exploration, "HELPFUL", 3)
+    found = [explained(problem, c) for c in pool.values()]
+    alone = sorted(found, key=lambda e: e.fit.cost)
+    pairs = exploration._pairs(problem, found, 1)
+    assert {e.keys for e in pairs} == {a.keys | b.keys for a, b in combinations(alone[:3], 2)}
+    best = min(pairs, key=lambda e: e.fit.cost)
+    assert best.effects == ("one", "two")
+    assert best.fit.chi2 == pytest.approx(explained(problem, pool["one"], pool["two"]).fit.chi2, abs=0.1)
+    assert not exploration._pairs(problem, found + pairs, 1)
 
 
 def test_bags_that_were_not_fitted_have_a_say(made):
