@@ -96,7 +96,7 @@ def explore(
     if found[0].members:
         found += _further(problem, pool, found, clean, lin, note, workers)
         weigh(found, pool)
-        if leftover(problem, found[0].fit) > MUCH:
+        if leftover(problem, found[0].fit) > MUCH and found[0].fit.cost < hopeless(problem, clean):
             note("pairs of what helps most alone")
             found += _pairs(problem, found, workers)
             weigh(found, pool)
