@@ -38,7 +38,7 @@ NOT_NOISE = 1e-4  # p below which what is left is no noise
 PREDICTED = 1.15
 PREDICTED_SHARE = 0.2  # of the misfit there that may be left
 NAMED = 0.9  # probability from which a set of causes is named
-CLEAN_GAIN = 4.0  # log evidence, priors included, that a cause must gain over none
+CLEAN_GAIN = 4.0  # log evidence, priors included, that causes must gain over fewer or none
 SEPARATION = 5.0  # whitened units: linear signatures that are nearer cannot be told apart
 FITTED = 3.0  # the same between fits: the root of the difference of their costs, priors included
 OBSERVABLE = 3.0  # whitened size of a signature at its prior scale from which a bag can see it
@@ -240,9 +240,7 @@ def _decide(
     workers: int,
 ) -> None:
     """Verdict, causes and their probabilities."""
-    clean, best = found.clean, found.best
-    if best.members and best.score - clean.score < CLEAN_GAIN:
-        best = clean
+    clean, best = found.clean, needed(found.explanations)
     result.best = best.fit
     result.white = whiteness(problem, best.fit.whitened, len(best.fit.active))
     dof = problem.size
@@ -270,13 +268,13 @@ def _decide(
     if best.members:
         note("separability")
         forms_once = [s.candidate for s in distinct(found.screened)]
-        result.at_best = found.at_best or linearise(
-            problem, best.fit.point, forms_once, workers, again=best.fit
-        )
+        known = found.at_best if best is found.best else None
+        result.at_best = known or linearise(problem, best.fit.point, forms_once, workers, again=best.fit)
         lin = result.at_best or found.linearised
         result.members = [_member(problem, found, best, c, lin) for c in best.members]
     apart = not any(m.rivals or m.separation < FITTED for m in result.members if m.separation is not None)
-    probability = dict(result.sets).get(best.effects, 0.0)
+    # who names more names these too
+    probability = sum(p for effects, p in result.sets if set(best.effects) <= set(effects))
     if not excited and not (best.members and apart and probability >= NAMED):
         result.verdict, result.members = "not_excited", []
     elif not best.members:
@@ -298,6 +296,13 @@ def _decide(
             )
             if not predicted and best.resolved:
                 result.members.append(Member(None, "unknown", 0.6, None, []))
+
+
+def needed(explanations: Sequence[Explanation]) -> Explanation:
+    """The first of ``explanations``, likeliest first, without causes that gain less than ``CLEAN_GAIN`` together."""
+    best = explanations[0]
+    fewer = [e for e in explanations if e.keys <= best.keys and best.score - e.score < CLEAN_GAIN]
+    return min(fewer, key=lambda e: (len(e.members), -e.score))
 
 
 def _member(problem: Problem, found: Search, best: Explanation, c: Candidate, lin: Linearisation) -> Member:

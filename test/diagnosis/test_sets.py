@@ -9,6 +9,7 @@ import pytest
 
 from ctr_dynamics.diagnosis import explanations, exploration
 from ctr_dynamics.diagnosis.candidates import Candidate, causes_of
+from ctr_dynamics.diagnosis.diagnose import needed
 from ctr_dynamics.diagnosis.explanations import Explanation
 from ctr_dynamics.diagnosis.exploration import Search, probabilities, weigh
 from ctr_dynamics.diagnosis.fit import fit
@@ -142,3 +143,20 @@ def test_bags_that_were_not_fitted_have_a_say(made):
     second_opinion(result, problem, held_out)
     assert result.best is wrong
     assert np.isfinite(result.probabilities).all()
+
+
+def test_a_cause_that_gains_little_is_not_needed(made):
+    _, pool, _ = made
+    one, two, other = pool["one"], pool["two"], pool["other"]
+    three, pair, single = (Explanation(m, None) for m in ((one, two, other), (one, two), (one,)))
+    none = Explanation((), None)
+    for found, scores, expected in (
+        ((three, pair, single, none), (0.0, -3.0, -20.0, -40.0), pair),
+        ((three, pair, single, none), (0.0, -5.0, -20.0, -40.0), three),
+        ((three, single, pair, none), (0.0, -2.0, -3.0, -40.0), single),
+        ((single, none), (0.0, -3.0), none),
+        ((none, single), (0.0, -1.0), none),
+    ):
+        for e, score in zip(found, scores, strict=True):
+            e.score = score
+        assert needed(found) is expected
