@@ -6,6 +6,8 @@ import math
 from collections.abc import Callable
 from dataclasses import replace
 
+import numpy as np
+
 from ctr_dynamics.effects import EFFECTS
 
 from .candidates import Candidate
@@ -28,7 +30,7 @@ from .wall import parting
 EARLY = 1.0  # s after model and measurement part, to which causes are first fitted where there are impacts
 SPANS = (2.0, 4.0)  # s after it, before the whole recording
 LEADERS = 2  # explanations of the first moments that are fitted to longer spans
-OPINIONS = 12  # likeliest explanations that are asked to predict bags that were not fitted
+OPINIONS = 8  # likeliest explanations that are asked to predict bags that were not fitted
 IMPOSSIBLE = -1e9  # log likelihood of bags that an explanation cannot simulate
 
 
@@ -127,8 +129,7 @@ def second_opinion(found: Search, problem: Problem, held_out: Problem) -> None:
         asked = [*(e for e in every[:OPINIONS] if e.members), found.clean]
         for e in asked:
             if e.held_out is None:
-                residual = held_out.residual(e.fit.point)
-                e.held_out = IMPOSSIBLE if residual is None else -0.5 * float(residual @ residual)
+                e.held_out = predicted(held_out, e.fit)
         weigh(every, found.pool)
         if not every[0].members or every[0].finished or turn == CONTENDERS:
             break
@@ -137,3 +138,16 @@ def second_opinion(found: Search, problem: Problem, held_out: Problem) -> None:
     if every[0] is not first:
         found.at_best = None
     found.probabilities = probabilities(every, problem)
+
+
+def predicted(held_out: Problem, result: Fit) -> float:
+    """Log likelihood of ``held_out``, up to a constant, with the posterior of ``result``: what the fitted bags leave open is no wrong prediction."""
+    found = held_out.linearise(result.point, result.active)
+    if found is None:
+        return IMPOSSIBLE
+    residual, columns = found
+    size, axes = np.linalg.eigh(result.covariance)
+    A = columns @ (axes * np.sqrt(np.maximum(size, 0.0)))
+    factor = np.linalg.cholesky(np.eye(A.shape[1]) + A.T @ A)
+    half = np.linalg.solve(factor, A.T @ residual)
+    return -0.5 * float(residual @ residual - half @ half) - float(np.log(np.diag(factor)).sum())

@@ -133,13 +133,15 @@ def test_bags_that_were_not_fitted_have_a_say(made):
     # who cannot simulate them loses, whoever it is; where nobody can, nothing changes
     for e in found:
         e.held_out = None
-    simulate = held_out.residual
-    held_out.residual = lambda point: None if len(point) == len(right.fit.point) else simulate(point)
+    simulate = held_out.linearise
+    held_out.linearise = lambda point, wanted: (
+        None if len(point) == len(right.fit.point) else simulate(point, wanted)
+    )
     second_opinion(result, problem, held_out)
     assert result.best is wrong
     for e in found:
         e.held_out = None
-    held_out.residual = lambda point: None
+    held_out.linearise = lambda point, wanted: None
     second_opinion(result, problem, held_out)
     assert result.best is wrong
     assert np.isfinite(result.probabilities).all()
