@@ -299,9 +299,14 @@ def _decide(
 
 
 def needed(explanations: Sequence[Explanation]) -> Explanation:
-    """The first of ``explanations``, likeliest first, without causes that gain less than ``CLEAN_GAIN`` together."""
+    """The first of ``explanations``, likeliest first, without causes that gain less than ``CLEAN_GAIN`` together, by all bags or by the fitted alone:
+    bags that were not fitted can speak against a cause, but not for one that the others do not show."""
     best = explanations[0]
-    fewer = [e for e in explanations if e.keys <= best.keys and best.score - e.score < CLEAN_GAIN]
+    fewer = [
+        e
+        for e in explanations
+        if e.keys <= best.keys and min(best.score - e.score, best.fitted - e.fitted) < CLEAN_GAIN
+    ]
     return min(fewer, key=lambda e: (len(e.members), -e.score))
 
 

@@ -32,6 +32,7 @@ class Explanation:
     members: tuple[Candidate, ...]
     fit: Fit
     score: float = 0.0  # log posterior, up to a constant
+    fitted: float = 0.0  # the same by the fitted bags alone
     held_out: float | None = (
         None  # log likelihood of bags that were not fitted, up to a constant; None where it is not known
     )

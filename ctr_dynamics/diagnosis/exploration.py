@@ -359,7 +359,8 @@ def weigh(found: list[Explanation], pool: Sequence[Candidate]) -> None:
     """Sort by log posterior; the better of two fits of the same set stays."""
     best: dict[frozenset[Key], Explanation] = {}
     for e, evidence in zip(found, _evidence(found), strict=True):
-        e.score = evidence + log_prior(e.members, pool)
+        prior = log_prior(e.members, pool)
+        e.score, e.fitted = evidence + prior, e.fit.log_evidence + prior
         if e.keys not in best or best[e.keys].score < e.score:
             best[e.keys] = e
     found[:] = sorted(best.values(), key=lambda e: -e.score)

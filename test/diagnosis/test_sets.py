@@ -160,5 +160,9 @@ def test_a_cause_that_gains_little_is_not_needed(made):
         ((none, single), (0.0, -1.0), none),
     ):
         for e, score in zip(found, scores, strict=True):
-            e.score = score
+            e.score = e.fitted = score
         assert needed(found) is expected
+    # what only the other bags speak for
+    three.score, pair.score, single.score, none.score = 0.0, -9.0, -20.0, -40.0
+    three.fitted, pair.fitted, single.fitted, none.fitted = 0.0, -1.0, -12.0, -40.0
+    assert needed((three, pair, single, none)) is pair
