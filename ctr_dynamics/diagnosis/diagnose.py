@@ -253,9 +253,8 @@ def _decide(
         result.validation = validate(held_out, clean.fit, best.fit)
     predicted = result.validation is not None and result.validation.confirms
     unexplained_part = left > (LEFT_SHARE if best.resolved else LEFT_NUMERICAL)
-    plain = (
-        best.resolved and best.fit.chi2 > ADEQUATE * dof
-    )  # whatever its share: causes that leave so much are not the right ones
+    # whatever its share: causes that leave so much are not the right ones
+    plain = best.resolved and best.fit.chi2 > ADEQUATE * dof
     if not noise and (not best.members or plain or (unexplained_part and not predicted)):
         result.verdict = "unknown"
         result.members = [Member(None, "unknown", 0.95, None, [])]

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctr_dynamics.effects import EFFECTS, Quantity, Setup, apply_effects, make_setup, play
+from ctr_dynamics.errors import InputError
 from ctr_dynamics.estimation.signals import Signal
 from ctr_dynamics.model.lanes import PACK
 from ctr_dynamics.model.model import Model
@@ -158,6 +159,14 @@ class Experiment:
                 to_vectors(product(conjugated(prediction.quaternion), self.recording.quaternion)),
             ]
         )
+
+    def residual_at(self, point: Point) -> Floats | None:
+        """(s, 6) residual of the prediction at ``point``; None where it cannot be simulated to the end."""
+        try:
+            prediction = self.predict(point)
+        except InputError:  # no equilibrium to start from
+            return None
+        return None if prediction.failure else self.residual(prediction)
 
     def jacobian(self, point: Point, wanted: Sequence[Quantity]) -> tuple[Prediction, Floats]:
         """Prediction at ``point`` and its derivatives (s, 6, len(wanted)) by the coordinates of ``wanted``, each times its ``scale``."""

@@ -19,7 +19,6 @@ from .signatures import PROBE_STEP, Linearisation, Scored, strayed
 
 Floats = NDArray[np.float64]
 LEAVES_LITTLE = 2.0  # times the noise: then no other size is tried
-FINER = 2.0  # times the steps, to see the error in time
 NUMERICAL = 5.0  # times that difference's squares: what is left can be the error itself, which falls slowly with the step
 FAILED = 1e30  # whitened squares where a simulation fails
 NEIGHBOURHOOD = (0.5, 1.7)  # of a probe's size: where the size that leaves least is looked for
@@ -33,9 +32,7 @@ class Explanation:
     fit: Fit
     score: float = 0.0  # log posterior, up to a constant
     fitted: float = 0.0  # the same by the fitted bags alone
-    held_out: float | None = (
-        None  # log likelihood of bags that were not fitted, up to a constant; None where it is not known
-    )
+    held_out: float | None = None  # log likelihood of bags that were not fitted, up to a constant, if known
     finished: bool = False  # with exact columns
     resolved: bool = True  # whether the model's error in time is small against what is left
 
@@ -183,7 +180,7 @@ def look_closer(problem: Problem, found: Explanation) -> None:
     excite what steps of this length do not follow, and a further cause would only imitate that."""
     if not any(EFFECTS[m.effect].impacts for m in found.members):
         return
-    finer = problem.with_step(problem.experiments[0].scheme.dt / FINER).residual(found.fit.point)
+    finer = problem.finer.residual(found.fit.point)
     if finer is not None and len(finer) == len(found.fit.residual):
         error = finer - found.fit.residual
         found.resolved = found.fit.chi2 - problem.size > NUMERICAL * float(error @ error)

@@ -8,8 +8,6 @@ import numpy as np
 from joblib import Parallel, delayed
 from numpy.typing import NDArray
 
-from ctr_dynamics.errors import InputError
-
 from .experiment import Experiment
 from .fit import Key, Problem
 
@@ -55,7 +53,9 @@ def differences(problem: Problem, point: Mapping[Key, float], workers: int) -> t
     """Whitened differences (m, 2) to shorter steps and to twice the nodes at ``point``, and the sums (2,) m^2 of their squares in position; zero
     where a recording cannot be simulated so."""
     jobs = [
-        delayed(residual)(e, point) for e in problem.experiments for residual in (_plain, _shorter, _denser)
+        delayed(residual)(e, point)
+        for e in problem.experiments
+        for residual in (Experiment.residual_at, _shorter, _denser)
     ]
     done = Parallel(workers, prefer="threads")(jobs)
     parts: list[list[Floats]] = [[], []]
@@ -75,21 +75,13 @@ def _put(problem: Problem, D: Floats) -> None:
     problem.numerics = NUMERICS_SIGMA * D
 
 
-def _plain(experiment: Experiment, point: Mapping[Key, float]) -> Floats | None:
-    try:
-        prediction = experiment.predict(point)
-    except InputError:  # no equilibrium to start from
-        return None
-    return None if prediction.failure else experiment.residual(prediction)
-
-
 def _shorter(experiment: Experiment, point: Mapping[Key, float]) -> tuple[Floats | None, float]:
     for share, factor in SHORTER:
-        found = _plain(experiment.resolved(experiment.nodes, share * experiment.scheme.dt), point)
+        found = experiment.resolved(experiment.nodes, share * experiment.scheme.dt).residual_at(point)
         if found is not None:
             return found, factor
     return None, 0.0
 
 
 def _denser(experiment: Experiment, point: Mapping[Key, float]) -> tuple[Floats | None, float]:
-    return _plain(experiment.resolved(2 * experiment.nodes, experiment.scheme.dt), point), 1.0
+    return experiment.resolved(2 * experiment.nodes, experiment.scheme.dt).residual_at(point), 1.0

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -23,7 +23,7 @@ from .exploration import (
     probabilities,
     weigh,
 )
-from .fit import Fit, Problem, corrected, fit, make_problem
+from .fit import Fit, Problem, corrected, fit, make_problem, posterior
 from .numerics import add_numerics
 from .wall import parting
 
@@ -88,9 +88,13 @@ def _from_early(
 
     Over a whole recording a wall a little off is out of step for good, and so is one beside a further cause that is not there yet.
     """
-    short = _until(problem, EARLY)
-    start = None if short is None else fit(short, (), {}, polish=False)
-    if short is None or start is None:
+    partings = [parting(e) for e in problem.experiments]
+    begins = [begin for begin in partings if begin is not None]
+    if len(begins) < len(partings):
+        return []
+    short = _until(problem, begins, EARLY)
+    start = fit(short, (), {}, polish=False)
+    if start is None:
         return []
     add_numerics(short, start.point, workers)
     start = fit(short, (), start.point) or start
@@ -101,22 +105,19 @@ def _from_early(
             continue
         note(f"longer spans with {', '.join(e.effects)}")
         result: Fit | None = e.fit
-        for whole in (*(_until(problem, span) for span in SPANS), problem):
-            if result is not None and whole is not None:
+        for whole in (*(_until(problem, begins, span) for span in SPANS), problem):
+            if result is not None:
                 result = fit(with_nuisances(whole, e.members), e.fit.causes, result.point)
         if result is not None:
             out.append(Explanation(e.members, result, finished=True))
     return out
 
 
-def _until(problem: Problem, span: float) -> Problem | None:
-    """``problem`` up to ``span`` (s) after nominal model and measurement part; None where they never do or cannot be told apart."""
-    recordings = []
-    for e in problem.experiments:
-        begin = parting(e)
-        if begin is None:
-            return None
-        recordings.append(e.recording.until(begin + span))
+def _until(problem: Problem, begins: Sequence[float], span: float) -> Problem:
+    """``problem`` up to ``span`` (s) after the time ``begins`` of each recording."""
+    recordings = [
+        e.recording.until(begin + span) for e, begin in zip(problem.experiments, begins, strict=True)
+    ]
     nodes = problem.experiments[0].nodes
     return make_problem(problem.robot, recordings, problem.nuisances, problem.whiteners[0].mask, nodes)
 
@@ -147,7 +148,6 @@ def predicted(held_out: Problem, result: Fit) -> float:
         return IMPOSSIBLE
     residual, columns = found
     size, axes = np.linalg.eigh(result.covariance)
-    A = columns @ (axes * np.sqrt(np.maximum(size, 0.0)))
-    factor = np.linalg.cholesky(np.eye(A.shape[1]) + A.T @ A)
-    half = np.linalg.solve(factor, A.T @ residual)
-    return -0.5 * float(residual @ residual - half @ half) - float(np.log(np.diag(factor)).sum())
+    free = columns @ (axes * np.sqrt(np.maximum(size, 0.0)))  # by coefficients of unit deviation
+    _, _, evidence = posterior(residual, free, np.zeros(len(size)), np.ones(len(size)), held_out.numerics)
+    return evidence

@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from ctr_dynamics.effects import Quantity
-from ctr_dynamics.errors import InputError
 from ctr_dynamics.estimation.rotations import matrix
 
 from .candidates import Candidate
@@ -46,12 +45,8 @@ def wall(problem: Problem, known: Sequence[Quantity]) -> Candidate | None:
     """A candidate whose plane explains the first moments after measurement and nominal model part; None where no wall does."""
     own = [q for q in known if q.effect == EFFECT]
     for experiment in problem.experiments:
-        try:
-            prediction = experiment.predict({})
-        except InputError:
-            continue
-        residual = experiment.residual(prediction)[:, :3]
-        found = None if prediction.failure else _search(experiment, residual, noise_floor(problem.robot))
+        residual = experiment.residual_at({})
+        found = None if residual is None else _search(experiment, residual[:, :3], noise_floor(problem.robot))
         if found is not None:
             start = {(EFFECT, name): value for name, value in _values(found).items()}
             shapes = tuple(replace(q, off=start[q.key]) for q in own if q.parameter.shape)
@@ -69,14 +64,10 @@ def wall(problem: Problem, known: Sequence[Quantity]) -> Candidate | None:
 
 def parting(experiment: Experiment) -> float | None:
     """s at which measurement and nominal model part; None where they do not, or the model cannot be simulated."""
-    try:
-        prediction = experiment.predict({})
-    except InputError:
+    residual = experiment.residual_at({})
+    if residual is None:
         return None
-    if prediction.failure:
-        return None
-    residual = experiment.residual(prediction)[:, :3]
-    parted = _parted(_sizes(experiment.recording, residual), noise_floor(experiment.robot))
+    parted = _parted(_sizes(experiment.recording, residual[:, :3]), noise_floor(experiment.robot))
     return None if parted is None else float(experiment.recording.stamps[parted])
 
 
@@ -146,13 +137,10 @@ def _fitted(
         point: dict[Key, float] = (
             {} if x is None else {(EFFECT, name): value for name, value in _values(x).items()}
         )
-        try:
-            prediction = short.predict(point)
-        except InputError:  # the wall is where the robot rests
+        whole = short.residual_at(point)
+        if whole is None:  # as where the robot rests behind the wall
             return np.full(3 * int(counted.sum()) + 1, FAILED)
-        if prediction.failure:
-            return np.full(3 * int(counted.sum()) + 1, FAILED)
-        left = short.residual(prediction)[counted, :3].ravel() / floor
+        left = whole[counted, :3].ravel() / floor
         return np.append(left, 0.0 if x is None else np.linalg.norm(x[1:4]) - 1.0)
 
     found = least_squares(

@@ -117,19 +117,19 @@ def test_the_error_of_the_solver_is_that_of_the_point(recording, robot, known, m
 def test_a_shorter_step_that_fails_is_followed_by_a_longer_one(recording, robot, monkeypatch):
     experiment = Experiment(recording, robot)
     half = numerics._shorter(experiment, {})
-    plain = numerics._plain
+    plain = Experiment.residual_at
 
     def failing(other, point):
         return None if other.scheme.dt < 0.6 * experiment.scheme.dt else plain(other, point)
 
-    monkeypatch.setattr(numerics, "_plain", failing)
+    monkeypatch.setattr(Experiment, "residual_at", failing)
     longer = numerics._shorter(experiment, {})
     base = plain(experiment, {})
     errors = [factor * (base - found) for found, factor in (half, longer)]
     assert half[1] == 1.0 < longer[1]
     sizes = [np.linalg.norm(e[5:]) for e in errors]
     assert sizes[1] == pytest.approx(sizes[0], rel=0.5)
-    monkeypatch.setattr(numerics, "_plain", lambda *_: None)
+    monkeypatch.setattr(Experiment, "residual_at", lambda *_: None)
     assert numerics._shorter(experiment, {})[0] is None
 
 
