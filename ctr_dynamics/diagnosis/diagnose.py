@@ -355,15 +355,20 @@ def cause_sets(found: Search) -> list[tuple[tuple[str, ...], float]]:
 
 
 def validate(held_out: Problem, clean: Fit, best: Fit) -> Validation | None:
-    """Errors on bags that were not fitted, with the recalibrated and with the extended model; None where neither can be simulated."""
+    """Errors on bags that were not fitted, with the recalibrated and with the extended model; None where neither can be simulated.
+
+    By half the step where that can be simulated: fits are corrected for their error in time as well.
+    """
     before, after, stamps, bags = [], [], [], []
     nis = [0.0, 0.0, 0]
     shift = 0.0
-    for experiment, whiten in zip(held_out.experiments, held_out.whiteners, strict=True):
-        residuals = []
-        for point in (clean.point, best.point):
-            prediction = experiment.predict(point)
-            residuals.append(experiment.residual(prediction))
+    for experiment, finer, whiten in zip(
+        held_out.experiments, held_out.finer.experiments, held_out.whiteners, strict=True
+    ):
+        points = (clean.point, best.point)
+        residuals = [left for point in points if (left := finer.residual_at(point)) is not None]
+        if len(residuals) < len(points):
+            residuals = [experiment.residual(experiment.predict(point)) for point in points]
         if not all(np.isfinite(r).any() for r in residuals):
             continue
         good = np.isfinite(residuals[0]).all(axis=1) & np.isfinite(residuals[1]).all(axis=1)

@@ -36,6 +36,10 @@ class Linear:
     def residual(self, point):
         return self.data - sum(self.columns[key] * value for key, value in point.items())
 
+    @property
+    def finer(self):
+        return self
+
     def linearise(self, point, wanted):
         return self.residual(point), np.stack([self.columns[q.key] for q in wanted], axis=1)
 

@@ -67,10 +67,6 @@ def test_run_equals_steps(slide):
     assert moved[-1] == pytest.approx(at(found.t[-1]).beta[1])
 
 
-# of columns of p (m), h, q (m/s) and omega (rad/s) of the tip by a quantity's unit, which are differences of two sweeps
-ROUNDING = ((slice(0, 3), 2e-8), (slice(3, 7), 2e-7), (slice(7, 10), 2e-6), (slice(10, 13), 5e-5))
-
-
 def compare(model, slide, parameters, inputs, tolerance):
     """Columns of a run against central differences of runs.
 
@@ -115,10 +111,10 @@ def compare(model, slide, parameters, inputs, tolerance):
             assert not other.failure
             ends.append(other.tip)
         expected = (ends[0] - ends[1]) / (2.0 * h)
-        for part, rounding in ROUNDING:
+        for part in (slice(0, 3), slice(3, 7), slice(7, 10), slice(10, 13)):
             size = np.abs(expected[:, part]).max()
             error = np.abs(found.columns[:, part, c] - expected[:, part]).max()
-            if not (size > 0.0 and error < tolerance * size + rounding):
+            if not (size > 0.0 and error < tolerance * size):
                 wrong.append(((*parameters, *inputs)[c], part, size, error / max(size, 1e-300)))
     assert not wrong, wrong
 
@@ -137,7 +133,7 @@ def test_sensitivities_of_a_plain_run():
             ("bending_damping", 0, 1e-6),
             ("body_mass", 0, 1e-4),
             ("base_coulomb", 0, 0.05),
-            ("tube_viscous", 0, 1e-7),
+            ("tube_viscous", 0, 1e-5),
             ("gravity", 0, 0.1),
         ],
         [(0, 0.01), (6, 0.01)],
@@ -188,14 +184,14 @@ def test_sensitivities_of_an_extended_run():
         0.03,
         [
             ("bending_stiffness", 0, 0.02 * model.parameters[0]),
-            ("drive_compliance", 0, 0.05),
+            ("drive_compliance", 0, 0.5),
             ("drive_inertia", 0, 1e-5),
             ("play", 0, 1e-3),
-            ("play_share", 0, 0.05),
+            ("play_share", 0, 0.5),
             ("oval_cos", 0, 0.01),
             ("softening", 0, 1e-4),
             ("drag_linear", 0, 0.01),
-            ("drag_quadratic", 0, 0.02),
+            ("drag_quadratic", 0, 0.2),
             ("stribeck_excess", 0, 0.05),
             ("overlap_friction", 0, 2e-4),
             ("spring_stiffness", 0, 0.1),
