@@ -21,7 +21,7 @@ from ctr_dynamics.robot import Robot
 from .candidates import Candidate, candidates
 from .checks import Whiteness, block_bootstrap, rms, whiteness
 from .explanations import Explanation
-from .exploration import ADEQUATE, FAR, LEFT_NUMERICAL, LEFT_SHARE, Search, distinct, leftover
+from .exploration import ADEQUATE, LEFT_NUMERICAL, LEFT_SHARE, Search, distinct
 from .fit import Fit, Local, Problem, fit, make_problem
 from .mistakes import find_mistake
 from .numerics import add_numerics
@@ -29,7 +29,6 @@ from .recording import Recording
 from .search import search, second_opinion
 from .signatures import Linearisation, linearise, observable, separation
 from .unexplained import Unexplained, unexplained
-from .wall import wall
 
 Floats = NDArray[np.float64]
 Note = Callable[[str], None]
@@ -186,9 +185,6 @@ def diagnose(
     pool = candidates(
         catalogue, np.concatenate([r.position[np.isfinite(r.position).all(axis=1)] for r in recordings])
     )
-    if leftover(problem, clean) > FAR:
-        found_wall = wall(problem, catalogue)
-        pool += [found_wall] if found_wall else []
     result.tested += sorted({c.effect for c in pool})
     result.white_before = whiteness(problem, clean.whitened, len(clean.active))
     found = search(problem, pool, clean, note, workers)
@@ -199,10 +195,10 @@ def diagnose(
         nodes = problem.experiments[0].nodes
         held_out = make_problem(robot, validation, nuisances, mask, nodes)
         note("second opinion of the validation bags")
-        second_opinion(found, problem, held_out)
+        second_opinion(found, problem, held_out, workers)
     result.search = found
     seen = observable(problem, found.linearised)
-    names = sorted({c.effect for c in pool})
+    names = sorted({c.effect for c in found.pool})
     result.not_observable = [name for name in names if seen.get(name, 0.0) < OBSERVABLE]
     excited = sum(seen.get(name, 0.0) >= STRONG for name in names) >= EXCITED * len(names)
     _decide(result, problem, found, excited, held_out, note, workers)

@@ -123,12 +123,13 @@ def fit_all(problem: Problem, jobs: Sequence[Job], limit: float, workers: int) -
     return [e for e in results if e is not None]
 
 
-def reduced(problem: Problem, members: tuple[Candidate, ...], start: Fit) -> Explanation | None:
-    """Fit of ``members`` from that of a larger set."""
+def reduced(problem: Problem, members: tuple[Candidate, ...], start: Fit, limit: float) -> Explanation | None:
+    """Fit of ``members`` from that of a larger set; ``limit``: cost beyond which it is given up."""
     causes = causes_of(members)
     own = with_nuisances(problem, members)
     free = {q.key for q in (*own.nuisances, *causes)}
-    result = fit(own, causes, {key: value for key, value in start.point.items() if key in free}, renewals=1)
+    point = {key: value for key, value in start.point.items() if key in free}
+    result = fit(own, causes, point, renewals=1, limit=limit)
     return None if result is None else Explanation(members, result)
 
 

@@ -16,14 +16,15 @@ import numpy as np
 from joblib import Parallel, delayed
 from numpy.typing import NDArray
 
-from ctr_dynamics.effects import EFFECTS
+from ctr_dynamics.effects import EFFECTS, quantities
 
 from .candidates import Candidate, keys_of, log_prior
 from .explanations import Explanation, Job, combined, finish, fit_all, look_closer, reduced, replaced
 from .fit import Fit, Key, Problem, corrected
 from .numerics import renew_numerics
 from .sets import rank_sets
-from .signatures import Linearisation, Scored, linearise, screen, separation
+from .signatures import Linearisation, Scored, far_probes, linearise, screen, separation
+from .wall import wall
 
 Floats = NDArray[np.float64]
 TEMPERATURE = 1.6  # of the log evidence: a judgement against overconfidence, not fitted to cases
@@ -36,7 +37,8 @@ LEFT_NUMERICAL = 0.15  # the same where the model's error in time is as large
 MUCH = 4.0  # deviations of the noise that an explanation may leave before more is tried
 HOPELESS = 0.3  # of the misfit: two causes that leave more are not made right by a third
 SECOND_EVIDENCE = 5.0  # log evidence that a further cause must add
-FAR = 80.0  # deviations of the noise in the misfit from which large sizes of a cause are looked at too
+# deviations of the noise: misfit from which large sizes of causes and a wall are looked at too, unless something else leaves no more than so many
+FAR, LARGER = 80.0, 2.0
 MIN_SCREEN = 1.0  # log evidence by the linear estimate below which a candidate is not worth a fit
 # explanations that are finished with exact columns, and the log evidence to the best within which they may be
 CONTENDERS, CONTEND = 3, 6.0
@@ -81,25 +83,32 @@ def explore(
     """The explanations that deserve probability, from the recalibrated fit ``clean`` on; None where the model cannot be simulated there."""
     base = Explanation((), clean)
     note("signatures of all candidates")
-    lin = linearise(problem, clean.point, pool, workers, far=leftover(problem, clean) > FAR)
+    lin = linearise(problem, clean.point, pool, workers)
     if lin is None:
         return None
-    screened = screen(problem, lin, clean, (), pool)
-    first = distinct([s for s in screened if s.gain > MIN_SCREEN][: SHORTLIST + 3])[:SHORTLIST]
-    note(f"fitting {len(first)} single causes")
     found = [base]
-    # likeliest first: what cannot win against those before it is given up
-    for begin in range(0, len(first), BATCH):
-        jobs = [Job((), s, clean, lin) for s in first[begin : begin + BATCH]]
-        found += fit_all(problem, jobs, _limit(problem, found), workers)
-        weigh(found, pool)
+    screened = screen(problem, lin, clean, (), pool)
+    _singles(problem, pool, found, screened, lin, note, workers)
+    if leftover(problem, clean) > FAR and leftover(problem, found[0].fit) > LARGER:
+        note("large sizes, and a wall")
+        pool = [*pool, *_walls(problem, pool, workers)]
+        tried = {s.candidate: s.probe for s in screened}
+        lin = far_probes(problem, lin, pool, workers)
+        screened = screen(problem, lin, clean, (), pool)
+        other = [s for s in screened if s.candidate not in tried or s.probe is not tried[s.candidate]]
+        _singles(problem, pool, found, other, lin, note, workers)
     if found[0].members:
-        found += _further(problem, pool, found, clean, lin, note, workers)
+        leaders = _leaders(problem, found, pool, clean, note, workers)
+        found += _further(problem, pool, leaders, clean, lin, note, workers)
         weigh(found, pool)
         if leftover(problem, found[0].fit) > MUCH and found[0].fit.cost < hopeless(problem, clean):
             note("pairs of what helps most alone")
             found += _pairs(problem, found, workers)
             weigh(found, pool)
+        found += _further(
+            problem, pool, _pair_to_go_on(problem, found, leaders, clean), clean, lin, note, workers
+        )
+        weigh(found, pool)
         found += _fewer(problem, found, note, workers)
         weigh(found, pool)
     _finish_contenders(problem, found, pool, clean)
@@ -134,6 +143,34 @@ def explore(
     if found[0] is not stood:
         at_best = None
     return Search(found, probabilities(found, problem), base, lin, screened, pool, at_best)
+
+
+def _singles(
+    problem: Problem,
+    pool: Sequence[Candidate],
+    found: list[Explanation],
+    screened: Sequence[Scored],
+    lin: Linearisation,
+    note: Callable[[str], None],
+    workers: int,
+) -> None:
+    """Fits of what the screening likes best to ``found``, which begins with the clean one; likeliest first, so that what cannot win against those
+    before it is given up."""
+    clean = next(e for e in found if not e.members).fit
+    first = distinct([s for s in screened if s.gain > MIN_SCREEN][: SHORTLIST + 3])[:SHORTLIST]
+    note(f"fitting {len(first)} single causes")
+    for begin in range(0, len(first), BATCH):
+        jobs = [Job((), s, clean, lin) for s in first[begin : begin + BATCH]]
+        found += fit_all(problem, jobs, _limit(problem, found), workers)
+        weigh(found, pool)
+
+
+def _walls(problem: Problem, pool: Sequence[Candidate], workers: int) -> list[Candidate]:
+    """The wall that the data tell of, if they do and ``pool`` has none yet."""
+    if any(c.sizes for c in pool):
+        return []
+    found = wall(problem, quantities(problem.robot), workers)
+    return [found] if found else []
 
 
 def _finish_contenders(
@@ -223,52 +260,65 @@ def _replace(
     return [e for e in fits if e is not None]
 
 
+def _leaders(
+    problem: Problem,
+    found: list[Explanation],
+    pool: Sequence[Candidate],
+    clean: Fit,
+    note: Callable[[str], None],
+    workers: int,
+) -> list[Explanation]:
+    """The likeliest single cause, and the next where it may be as good, beside which others are looked for; none beside impacts that leave no more
+    than the model's error in time."""
+    much = leftover(problem, found[0].fit) > MUCH
+    if much:
+        _renew(problem, found, pool, clean, note, workers)
+        finish(problem, found[0])
+        look_closer(problem, found[0])
+        if not found[0].resolved:
+            return []
+    near = found[0].score - (20.0 if much else 3.0)
+    return [e for e in found if e.members and e.score > near][:2]
+
+
+def _pair_to_go_on(
+    problem: Problem, found: Sequence[Explanation], leaders: Sequence[Explanation], clean: Fit
+) -> list[Explanation]:
+    """The best pair, where two are needed and a third could save it: what leaves more is outside the catalogue."""
+    two = next((e for e in found if len(e.members) == 2), None)
+    if two is None or not leaders or two.fit.cost > hopeless(problem, clean):
+        return []
+    enough = max(e.fit.log_evidence for e in leaders) + SECOND_EVIDENCE
+    return [two] if two.fit.log_evidence > enough else []
+
+
 def _further(
     problem: Problem,
-    pool: list[Candidate],
-    found: list[Explanation],
+    pool: Sequence[Candidate],
+    leaders: Sequence[Explanation],
     clean: Fit,
     lin: Linearisation,
     note: Callable[[str], None],
     workers: int,
 ) -> list[Explanation]:
-    """Two causes, and three where that pays: what each of the best leaves is screened again."""
-    out: list[Explanation] = []
-    beyond = hopeless(problem, clean)
+    """One more cause beside those of each of ``leaders``: what they leave is screened again."""
+    new: list[Explanation] = []
     tried: set[frozenset[str]] = set()
-    leaders = [e for e in found if e.members][:2]
-    much = leftover(problem, leaders[0].fit) > MUCH
-    if much and _renew(problem, found, pool, clean, note, workers):
-        leaders = [e for e in found if e.members][:2]
-    if much:
-        finish(problem, leaders[0])
-        look_closer(problem, leaders[0])
-        if not leaders[0].resolved:
-            return out
-    leaders = [e for e in leaders if e.score > leaders[0].score - (20.0 if much else 3.0)]
-    for _ in range(2):
-        new: list[Explanation] = []
-        for leader in leaders:
-            note(f"what {', '.join(leader.effects)} leaves")
-            finish(problem, leader)
-            here = lin.carried(leader.fit)
-            scored = screen(problem, here, leader.fit, leader.members, pool)
-            jobs = []
-            for s in distinct([s for s in scored if s.gain > SECOND_EVIDENCE - 2.0])[:SECOND]:
-                names = frozenset(x.label for x in (*leader.members, s.candidate))
-                if names not in tried:
-                    tried.add(names)
-                    jobs.append(Job(leader.members, s, leader.fit, here))
-            enough = leader.fit.log_evidence + SECOND_EVIDENCE
-            new += [e for e in fit_all(problem, jobs, beyond, workers) if e.fit.log_evidence > enough]
-        if not new:
-            break
-        out += new
-        weigh(new, pool)
-        leaders = new[:1]
-        if new[0].fit.cost > beyond:
-            break  # a third cause would not save it: it is outside the catalogue
-    return out
+    for leader in leaders:
+        note(f"what {', '.join(leader.effects)} leaves")
+        finish(problem, leader)
+        here = lin.carried(leader.fit)
+        scored = screen(problem, here, leader.fit, leader.members, pool)
+        jobs = []
+        for s in distinct([s for s in scored if s.gain > SECOND_EVIDENCE - 2.0])[:SECOND]:
+            names = frozenset(x.label for x in (*leader.members, s.candidate))
+            if names not in tried:
+                tried.add(names)
+                jobs.append(Job(leader.members, s, leader.fit, here))
+        enough = leader.fit.log_evidence + SECOND_EVIDENCE
+        beyond = hopeless(problem, clean)
+        new += [e for e in fit_all(problem, jobs, beyond, workers) if e.fit.log_evidence > enough]
+    return new
 
 
 def _pairs(problem: Problem, found: Sequence[Explanation], workers: int) -> list[Explanation]:
@@ -323,7 +373,10 @@ def _fewer(
     while len(best.members) > 1:
         note(f"whether each of {', '.join(best.effects)} is needed")
         sets = [tuple(m for m in best.members if m is not c) for c in best.members]
-        fits = Parallel(workers, prefer="threads")(delayed(reduced)(problem, rest, best.fit) for rest in sets)
+        limit = _limit(problem, found)
+        fits = Parallel(workers, prefer="threads")(
+            delayed(reduced)(problem, rest, best.fit, limit) for rest in sets
+        )
         smaller = [e for e in fits if e is not None]
         out += smaller
         better = max(smaller, key=lambda e: e.fit.log_evidence, default=None)

@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
+from joblib import Parallel, delayed
 
 from ctr_dynamics.effects import EFFECTS
 
@@ -31,6 +32,7 @@ EARLY = 1.0  # s after model and measurement part, to which causes are first fit
 SPANS = (2.0, 4.0)  # s after it, before the whole recording
 LEADERS = 2  # explanations of the first moments that are fitted to longer spans
 OPINIONS = 8  # likeliest explanations that are asked to predict bags that were not fitted
+OUTVOTED = 60.0  # log evidence of the fitted bags that no prediction of others makes good
 IMPOSSIBLE = -1e9  # log likelihood of bags that an explanation cannot simulate
 
 
@@ -45,6 +47,7 @@ def search(
     found = explore(problem, pool, clean, note, workers)
     if found is None or _explained(problem, found, clean):
         return found
+    pool = found.pool  # with the wall that was found
     if any(EFFECTS[m.effect].impacts for m in found.best.members):
         note("impacts: the first moments after them")
         early = _from_early(problem, pool, note, workers)
@@ -122,15 +125,17 @@ def _until(problem: Problem, begins: Sequence[float], span: float) -> Problem:
     return make_problem(problem.robot, recordings, problem.nuisances, problem.whiteners[0].mask, nodes)
 
 
-def second_opinion(found: Search, problem: Problem, held_out: Problem) -> None:
+def second_opinion(found: Search, problem: Problem, held_out: Problem, workers: int) -> None:
     """Let the likeliest explanations predict ``held_out``, recordings that were not fitted, and weigh them by both: what imitates a cause in one
-    motion does not in another."""
+    motion does not in another. Where the likeliest leaves no more than noise, those far behind it have no say."""
     every, first = found.explanations, found.best
+    margin = OUTVOTED if leftover(problem, first.fit) <= MUCH else math.inf
     for turn in range(CONTENDERS + 1):  # finishing one may put another first
-        asked = [*(e for e in every[:OPINIONS] if e.members), found.clean]
-        for e in asked:
-            if e.held_out is None:
-                e.held_out = predicted(held_out, e.fit)
+        asked = [e for e in every[:OPINIONS] if e.members and e.fitted > every[0].fitted - margin]
+        asked = [e for e in (*asked, found.clean) if e.held_out is None]
+        opinions = Parallel(workers, prefer="threads")(delayed(predicted)(held_out, e.fit) for e in asked)
+        for e, opinion in zip(asked, opinions, strict=True):
+            e.held_out = opinion
         weigh(every, found.pool)
         if not every[0].members or every[0].finished or turn == CONTENDERS:
             break

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from joblib import Parallel, delayed
@@ -17,6 +17,9 @@ from .fit import INSIDE, Fit, Key, Problem, inside, posterior, prior_variance, v
 
 Floats = NDArray[np.float64]
 PROBE_STEP = 0.005  # s: what a finite size changes is large against the error in time of what it changes
+
+
+Try = tuple[Candidate, float, Mapping[Key, float]]  # a size in scales, and the nuisances beside it
 
 
 @dataclass(frozen=True)
@@ -68,12 +71,10 @@ def linearise(
     workers: int,
     *,
     again: Fit | None = None,
-    far: bool = False,
 ) -> Linearisation | None:
     """Columns of nuisances and all candidates at ``point``; those without a derivative by finite probes.
 
     Args:
-        far: whether to probe those at large sizes whose derivative says little of these.
         again: the fit whose ``point`` it is, when signatures are only compared with it: its columns serve, and one probe of each candidate.
     Returns:
         None where the model cannot be simulated at ``point``.
@@ -100,27 +101,16 @@ def linearise(
         found = problem.linearise({**at, **point}, (*wanted, *more))
         return columns({}, wanted) if found is None and more else found
 
-    probing = problem if again else problem.with_step(PROBE_STEP)
-
-    def probe(c: Candidate, size: float, back: Mapping[Key, float]) -> tuple[dict[Key, float], Floats | None]:
-        q = c.quantities[0]
-        shift = {**back, **dict(c.start), q.key: q.off + size * q.scale}
-        return shift, probing.residual({**point, **shift})
-
-    # nuisances that have left their tolerances imitate a cause: then it is tried beside nominal ones too
-    places: list[dict[Key, float]] = [{}]
-    if again is None and strayed(problem, point):
-        places.append({q.key: q.off for q in problem.nuisances})
-    probes = [
-        (c, size, back) for back in places for c in rough for size in _probed(c)[: 1 if again else None]
-    ]
-    probes += [(c, size, back) for back in places for c in pool if far for size in EFFECTS[c.effect].far]
     jobs = [
         delayed(columns)(at, wanted, first)
     ]  # together: what has no room in one simulation has it in another
     jobs += [delayed(columns)(at, tuple(q for c in group for q in c.quantities)) for at, group in groups[1:]]
-    jobs += [delayed(probing.residual)(point)] if again is None and probes else []
-    jobs += [delayed(probe)(*arguments) for arguments in probes]
+    if again:
+        tries: list[Try] = [(c, _probed(c)[0], {}) for c in rough]
+        jobs += _probing(problem, point, tries)
+    else:
+        tries = [(c, size, back) for back in _places(problem, point) for c in rough for size in _probed(c)]
+        jobs += _probing(problem.with_step(PROBE_STEP), point, (None, *tries))
     done = Parallel(workers, prefer="threads")(jobs)
     if done[0] is None:
         return None
@@ -129,25 +119,78 @@ def linearise(
         dict(point), residual, {**known, **{q.key: computed[:, i] for i, q in enumerate(wanted)}}
     )
     outcomes = [(members, computed[:, len(wanted) :])] if computed.shape[1] > len(wanted) else []
-    outcomes += [(m, o[1]) for (_, m), o in zip(groups[1:], done[1:], strict=False) if o is not None]
+    more = max(len(groups), 1)
+    outcomes += [(m, o[1]) for (_, m), o in zip(groups[1:], done[1:more], strict=True) if o is not None]
     for group, found in outcomes:
         last = 0
         for c in group:
             result.signatures[c] = found[:, last : last + len(c.quantities)]
             last += len(c.quantities)
-    tried = done[len(jobs) - len(probes) :]
-    reference = residual if again or not probes else done[-len(probes) - 1]
-    for (c, _, _), (shift, new) in zip(probes, tried, strict=True):
-        if new is not None and reference is not None:
-            result.probes.setdefault(c, []).append(Probe(shift, residual + new - reference))
     for c in pool:
-        if c in rough and c in result.probes:
-            q, first_probe = c.quantities[0], result.probes[c][0]
-            secant = (residual - first_probe.residual) / (first_probe.shift[q.key] - q.off)
-            result.signatures[c] = secant[:, None]
-        elif c not in shaped and c not in rough:
+        if c not in shaped and c not in rough:
             result.signatures[c] = np.stack([result.columns[q.key] for q in c.quantities], axis=1)
+    result.probes = _probed_with(result, tries, [residual, *done[more:]] if again else done[more:])
+    _secants(result, rough)
     return result
+
+
+def far_probes(
+    problem: Problem, lin: Linearisation, pool: Sequence[Candidate], workers: int
+) -> Linearisation:
+    """``lin`` with probes at large sizes, of which the derivative says little, and of those in ``pool`` that it does not know yet."""
+    new = [c for c in pool if EFFECTS[c.effect].probes and c not in lin.signatures]
+    tries: list[Try] = [
+        (c, size, back)
+        for back in _places(problem, lin.point)
+        for c in pool
+        for size in (_probed(c) if c in new else EFFECTS[c.effect].far)
+    ]
+    jobs = _probing(problem.with_step(PROBE_STEP), lin.point, (None, *tries))
+    found = _probed_with(lin, tries, Parallel(workers, prefer="threads")(jobs))
+    probes = {c: lin.probes.get(c, []) + found.get(c, []) for c in (*lin.probes, *found)}
+    result = replace(lin, signatures=dict(lin.signatures), probes=probes)
+    _secants(result, new)
+    return result
+
+
+def _places(problem: Problem, point: Mapping[Key, float]) -> list[dict[Key, float]]:
+    """Where finite sizes are tried: nuisances that have left their tolerances imitate a cause, so it is tried beside nominal ones too."""
+    places: list[dict[Key, float]] = [{}]
+    if strayed(problem, point):
+        places.append({q.key: q.off for q in problem.nuisances})
+    return places
+
+
+def _shift(c: Candidate, size: float, back: Mapping[Key, float]) -> dict[Key, float]:
+    """Coordinates of a candidate at a finite size, in scales, with nuisances at ``back``."""
+    q = c.quantities[0]
+    return {**back, **dict(c.start), q.key: q.off + size * q.scale}
+
+
+def _probing(problem: Problem, point: Mapping[Key, float], tries: Sequence[Try | None]) -> list:
+    """Jobs: the residual with each of ``tries`` at ``point``; None is for the point itself."""
+    return [delayed(problem.residual)({**point, **(_shift(*t) if t else {})}) for t in tries]
+
+
+def _probed_with(
+    lin: Linearisation, tries: Sequence[Try], residuals: Sequence[Floats | None]
+) -> dict[Candidate, list[Probe]]:
+    """Probes with the residuals that :func:`_probing` found, that of the point itself first."""
+    probes: dict[Candidate, list[Probe]] = {}
+    for arguments, residual in zip(tries, residuals[1:], strict=True):
+        if residual is not None and residuals[0] is not None:
+            probe = Probe(_shift(*arguments), lin.residual + residual - residuals[0])
+            probes.setdefault(arguments[0], []).append(probe)
+    return probes
+
+
+def _secants(lin: Linearisation, rough: Sequence[Candidate]) -> None:
+    """Signatures of ``rough`` candidates: the secants to their first probes."""
+    for c in rough:
+        if c in lin.probes:
+            q, probe = c.quantities[0], lin.probes[c][0]
+            secant = (lin.residual - probe.residual) / (probe.shift[q.key] - q.off)
+            lin.signatures[c] = secant[:, None]
 
 
 def _probed(c: Candidate) -> tuple[float, ...]:

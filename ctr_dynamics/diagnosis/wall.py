@@ -10,9 +10,9 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from itertools import product
 
 import numpy as np
+from joblib import Parallel, delayed
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
@@ -41,12 +41,14 @@ FAILED = 1e3  # noise floors: residual where the model cannot be simulated
 EVALUATIONS = 12  # of the residual's derivatives, a span
 
 
-def wall(problem: Problem, known: Sequence[Quantity]) -> Candidate | None:
+def wall(problem: Problem, known: Sequence[Quantity], workers: int) -> Candidate | None:
     """A candidate whose plane explains the first moments after measurement and nominal model part; None where no wall does."""
     own = [q for q in known if q.effect == EFFECT]
     for experiment in problem.experiments:
         residual = experiment.residual_at({})
-        found = None if residual is None else _search(experiment, residual[:, :3], noise_floor(problem.robot))
+        found = None
+        if residual is not None:
+            found = _search(experiment, residual[:, :3], noise_floor(problem.robot), workers)
         if found is not None:
             start = {(EFFECT, name): value for name, value in _values(found).items()}
             shapes = tuple(replace(q, off=start[q.key]) for q in own if q.parameter.shape)
@@ -83,7 +85,7 @@ def _parted(sizes: Floats, floor: float) -> int | None:
     return int(np.argmax(large)) if large.any() else None
 
 
-def _search(experiment: Experiment, residual: Floats, floor: float) -> Floats | None:
+def _search(experiment: Experiment, residual: Floats, floor: float, workers: int) -> Floats | None:
     """Logarithm of the stiffness (N/m), normal (3,) and offset (cm) of a wall; None where there is none."""
     recording = experiment.recording
     sizes = _sizes(recording, residual)
@@ -98,10 +100,8 @@ def _search(experiment: Experiment, residual: Floats, floor: float) -> Floats | 
     back = matrix(experiment.nominal.rotation).T  # tracker's axes to base axes
     calm = residual[max(first - 3, 0)] if first else np.zeros(3)
     begin = recording.stamps[parted]
-    best: tuple[float, Floats] | None = None
-    for k, stiffness in product(dict.fromkeys((first, parted)), STIFFNESSES):
-        if best is not None and best[0] < SURE:
-            break
+
+    def start(k: int, stiffness: float) -> tuple[float, Floats]:
         normal = back @ (residual[k] - calm)
         normal = normal / max(float(np.linalg.norm(normal)), 1e-12)
         near = slice(max(first - 1, 0), parted + 3)
@@ -110,8 +110,15 @@ def _search(experiment: Experiment, residual: Floats, floor: float) -> Floats | 
         left = math.inf
         for span in FIRST_SPANS:
             x, left = _fitted(experiment, x, begin, span, floor)
-        if left < (best[0] if best else 1.0 - EXPLAINED):
-            best = left, x
+        return left, x
+
+    best: tuple[float, Floats] | None = None
+    for k in dict.fromkeys((first, parted)):
+        if best is not None and best[0] < SURE:
+            break
+        for left, x in Parallel(workers, prefer="threads")(delayed(start)(k, s) for s in STIFFNESSES):
+            if left < (best[0] if best else 1.0 - EXPLAINED):
+                best = left, x
     if best is None:
         return None
     left, x = best
