@@ -92,11 +92,10 @@ def explore(
     if leftover(problem, clean) > FAR and leftover(problem, found[0].fit) > LARGER:
         note("large sizes, and a wall")
         pool = [*pool, *_walls(problem, pool, workers)]
-        tried = {s.candidate: s.probe for s in screened}
+        tried = screened
         lin = far_probes(problem, lin, pool, workers)
         screened = screen(problem, lin, clean, (), pool)
-        other = [s for s in screened if s.candidate not in tried or s.probe is not tried[s.candidate]]
-        _singles(problem, pool, found, other, lin, note, workers)
+        _singles(problem, pool, found, screened, lin, note, workers, tried)
     if found[0].members:
         leaders = _leaders(problem, found, pool, clean, note, workers)
         found += _further(problem, pool, leaders, clean, lin, note, workers)
@@ -153,11 +152,14 @@ def _singles(
     lin: Linearisation,
     note: Callable[[str], None],
     workers: int,
+    tried: Sequence[Scored] = (),
 ) -> None:
-    """Fits of what the screening likes best to ``found``, which begins with the clean one; likeliest first, so that what cannot win against those
-    before it is given up."""
+    """Fits of what the screening likes best to ``found``, which holds the clean one; likeliest first, so that what cannot win against those before
+    it is given up. ``tried``: an earlier screening, of which nothing is fitted again."""
     clean = next(e for e in found if not e.members).fit
     first = distinct([s for s in screened if s.gain > MIN_SCREEN][: SHORTLIST + 3])[:SHORTLIST]
+    before = {s.candidate: s.probe for s in tried}
+    first = [s for s in first if s.candidate not in before or s.probe is not before[s.candidate]]
     note(f"fitting {len(first)} single causes")
     for begin in range(0, len(first), BATCH):
         jobs = [Job((), s, clean, lin) for s in first[begin : begin + BATCH]]

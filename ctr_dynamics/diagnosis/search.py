@@ -32,7 +32,7 @@ EARLY = 1.0  # s after model and measurement part, to which causes are first fit
 SPANS = (2.0, 4.0)  # s after it, before the whole recording
 LEADERS = 2  # explanations of the first moments that are fitted to longer spans
 OPINIONS = 8  # likeliest explanations that are asked to predict bags that were not fitted
-OUTVOTED = 60.0  # log evidence of the fitted bags that no prediction of others makes good
+OUTVOTED = 100.0  # log evidence of the fitted bags that no prediction as good as the noise makes good
 IMPOSSIBLE = -1e9  # log likelihood of bags that an explanation cannot simulate
 
 
@@ -127,15 +127,24 @@ def _until(problem: Problem, begins: Sequence[float], span: float) -> Problem:
 
 def second_opinion(found: Search, problem: Problem, held_out: Problem, workers: int) -> None:
     """Let the likeliest explanations predict ``held_out``, recordings that were not fitted, and weigh them by both: what imitates a cause in one
-    motion does not in another. Where the likeliest leaves no more than noise, those far behind it have no say."""
+    motion does not in another. Those have no say that are farther behind than a prediction down to the noise would make good."""
     every, first = found.explanations, found.best
-    margin = OUTVOTED if leftover(problem, first.fit) <= MUCH else math.inf
-    for turn in range(CONTENDERS + 1):  # finishing one may put another first
-        asked = [e for e in every[:OPINIONS] if e.members and e.fitted > every[0].fitted - margin]
-        asked = [e for e in (*asked, found.clean) if e.held_out is None]
-        opinions = Parallel(workers, prefer="threads")(delayed(predicted)(held_out, e.fit) for e in asked)
-        for e, opinion in zip(asked, opinions, strict=True):
+
+    def ask(those: Sequence[Explanation]) -> None:
+        new = [e for e in those if e.held_out is None]
+        for e, opinion in zip(
+            new,
+            Parallel(workers, prefer="threads")(delayed(predicted)(held_out, e.fit) for e in new),
+            strict=True,
+        ):
             e.held_out = opinion
+
+    for turn in range(CONTENDERS + 1):  # finishing one may put another first
+        best = every[0]
+        ask([best, found.clean])
+        assert best.held_out is not None
+        room = OUTVOTED + max(0.0, -0.5 * held_out.size - best.held_out)
+        ask([e for e in every[:OPINIONS] if e.members and e.fitted > best.fitted - room])
         weigh(every, found.pool)
         if not every[0].members or every[0].finished or turn == CONTENDERS:
             break

@@ -131,7 +131,7 @@ def test_bags_that_were_not_fitted_have_a_say(made):
     weigh(found, everything)
     assert found[0] is wrong
     result = Search(found, probabilities(found, problem), clean, None, [], everything)
-    second_opinion(result, problem, held_out)
+    second_opinion(result, problem, held_out, 1)
     assert result.best is right
     assert result.probabilities[0] > 0.99
     # who cannot simulate them loses, whoever it is; where nobody can, nothing changes
@@ -141,12 +141,12 @@ def test_bags_that_were_not_fitted_have_a_say(made):
     held_out.linearise = lambda point, wanted: (
         None if len(point) == len(right.fit.point) else simulate(point, wanted)
     )
-    second_opinion(result, problem, held_out)
+    second_opinion(result, problem, held_out, 1)
     assert result.best is wrong
     for e in found:
         e.held_out = None
     held_out.linearise = lambda point, wanted: None
-    second_opinion(result, problem, held_out)
+    second_opinion(result, problem, held_out, 1)
     assert result.best is wrong
     assert np.isfinite(result.probabilities).all()
 

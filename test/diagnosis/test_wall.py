@@ -50,7 +50,7 @@ def _angle(a, b) -> float:
 
 def test_the_first_impacts_tell_plane_and_stiffness(hit, known):
     problem, truth = hit
-    found = wall(problem, known)
+    found = wall(problem, known, 2)
     assert isinstance(found, Candidate)
     start = dict(found.start)
     assert _angle([start[key] for key in NORMAL], [truth[name] for _, name in NORMAL]) < 15.0
@@ -66,7 +66,7 @@ def test_the_first_impacts_tell_plane_and_stiffness(hit, known):
 def test_a_delay_is_no_wall(tmp_path, robot, known):
     """A late tracker parts from the model as suddenly, when the weight is cut."""
     problem, _ = _problem(tmp_path, robot, known, "tracker_latency", 91021)
-    assert wall(problem, known) is None
+    assert wall(problem, known, 2) is None
 
 
 def test_what_impacts_leave_is_measured_against_the_error_in_time(hit, known):
