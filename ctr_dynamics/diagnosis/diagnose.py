@@ -194,8 +194,9 @@ def diagnose(
     if validation:
         nodes = problem.experiments[0].nodes
         held_out = make_problem(robot, validation, nuisances, mask, nodes)
-        note("second opinion of the validation bags")
-        second_opinion(found, problem, held_out, workers)
+        if any(not _plain(problem, e) for e in found.explanations):
+            note("second opinion of the validation bags")
+            second_opinion(found, problem, held_out, workers)
     result.search = found
     seen = observable(problem, found.linearised)
     names = sorted({c.effect for c in found.pool})
@@ -249,9 +250,7 @@ def _decide(
         result.validation = validate(held_out, clean.fit, best.fit)
     predicted = result.validation is not None and result.validation.confirms
     unexplained_part = left > (LEFT_SHARE if best.resolved else LEFT_NUMERICAL)
-    # whatever its share: causes that leave so much are not the right ones
-    plain = best.resolved and best.fit.chi2 > ADEQUATE * dof
-    if not noise and (not best.members or plain or (unexplained_part and not predicted)):
+    if not noise and (not best.members or _plain(problem, best) or (unexplained_part and not predicted)):
         result.verdict = "unknown"
         result.members = [Member(None, "unknown", 0.95, None, [])]
         result.unexplained = unexplained(problem.experiments[0], clean.fit.point)
@@ -291,6 +290,11 @@ def _decide(
             )
             if not predicted and best.resolved:
                 result.members.append(Member(None, "unknown", 0.6, None, []))
+
+
+def _plain(problem: Problem, found: Explanation) -> bool:
+    """Whether ``found`` leaves so much that it is not right, whatever share of the misfit that is."""
+    return found.resolved and found.fit.chi2 > ADEQUATE * problem.size
 
 
 def needed(explanations: Sequence[Explanation]) -> Explanation:

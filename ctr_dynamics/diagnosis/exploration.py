@@ -29,7 +29,7 @@ from .wall import wall
 Floats = NDArray[np.float64]
 TEMPERATURE = 1.6  # of the log evidence: a judgement against overconfidence, not fitted to cases
 SHORTLIST = 8  # candidates that are fitted
-BATCH = 2  # fits between which the best is looked at; fixed, so that the outcome does not depend on the number of workers
+BATCH = 2  # first fits, which the others must be able to beat; fixed, so that the outcome does not depend on the number of workers
 SECOND = 4  # second causes that are fitted beside a first
 HELPFUL = 5  # effects that leave least alone, whose pairs are tried where more than noise is left
 LEFT_SHARE = 0.03  # of the misfit beyond noise that an explanation may leave
@@ -161,8 +161,8 @@ def _singles(
     before = {s.candidate: s.probe for s in tried}
     first = [s for s in first if s.candidate not in before or s.probe is not before[s.candidate]]
     note(f"fitting {len(first)} single causes")
-    for begin in range(0, len(first), BATCH):
-        jobs = [Job((), s, clean, lin) for s in first[begin : begin + BATCH]]
+    for batch in (first[:BATCH], first[BATCH:]):
+        jobs = [Job((), s, clean, lin) for s in batch]
         found += fit_all(problem, jobs, _limit(problem, found), workers)
         weigh(found, pool)
 
