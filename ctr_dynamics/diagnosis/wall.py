@@ -35,6 +35,7 @@ FIRST_SPANS, SPANS = (0.05, 0.13), (0.25, 0.5, 1.0)  # s after it
 STIFFNESSES = (120.0, 400.0)  # N/m to begin with
 FACTORS = (1.0, 0.5, 2.0)  # on the stiffness that is found, for the fits with all nuisances
 SURE = 2e-3  # of the squares there: a wall that leaves no more needs no other start
+NO_WALL = 0.5  # of the squares in the first span: what leaves more there is none
 EXPLAINED = 0.9  # of the squared misfit in a span that a wall must explain there
 INSIDE_M = 2e-3  # m that the tip is behind the plane where it is noticed first
 FAILED = 1e3  # noise floors: residual where the model cannot be simulated
@@ -110,6 +111,8 @@ def _search(experiment: Experiment, residual: Floats, floor: float, workers: int
         left = math.inf
         for span in FIRST_SPANS:
             x, left = _fitted(experiment, x, begin, span, floor)
+            if left > NO_WALL:
+                break
         return left, x
 
     best: tuple[float, Floats] | None = None
