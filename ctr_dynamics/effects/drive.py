@@ -184,7 +184,7 @@ register(
         "smooth saturation of the tilt, play * m / sqrt(m^2 + m0^2) with m0 = 0.01 N m; clearance: Ha, Fritzler, Park and Dupont (2016)",
         extended=True,
         presets=({"share": 0.0}, {"share": 1.0}),
-        probes=(0.6, 1.6),
+        probes=(0.6, 1.2, 1.6),
         form=("play_kinematics",),
     )
 )
