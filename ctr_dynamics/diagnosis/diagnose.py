@@ -21,7 +21,7 @@ from ctr_dynamics.robot import Robot
 from .candidates import Candidate, candidates
 from .checks import Whiteness, block_bootstrap, rms, whiteness
 from .explanations import Explanation
-from .exploration import ADEQUATE, LEFT_NUMERICAL, LEFT_SHARE, Search, distinct
+from .exploration import LEFT_NUMERICAL, LEFT_SHARE, Search, adequate, distinct
 from .fit import Fit, Local, Problem, fit, make_problem
 from .mistakes import find_mistake
 from .numerics import add_numerics
@@ -185,7 +185,8 @@ def diagnose(
     pool = candidates(
         catalogue, np.concatenate([r.position[np.isfinite(r.position).all(axis=1)] for r in recordings])
     )
-    result.tested += sorted({c.effect for c in pool})
+    names = sorted({c.effect for c in pool})
+    result.tested += names
     result.white_before = whiteness(problem, clean.whitened, len(clean.active))
     found = search(problem, pool, clean, note, workers)
     if found is None:
@@ -199,7 +200,6 @@ def diagnose(
             second_opinion(found, problem, held_out, workers)
     result.search = found
     seen = observable(problem, found.linearised)
-    names = sorted({c.effect for c in found.pool})
     result.not_observable = [name for name in names if seen.get(name, 0.0) < OBSERVABLE]
     excited = sum(seen.get(name, 0.0) >= STRONG for name in names) >= EXCITED * len(names)
     _decide(result, problem, found, excited, held_out, note, workers)
@@ -293,8 +293,8 @@ def _decide(
 
 
 def _plain(problem: Problem, found: Explanation) -> bool:
-    """Whether ``found`` leaves so much that it is not right, whatever share of the misfit that is."""
-    return found.resolved and found.fit.chi2 > ADEQUATE * problem.size
+    """Whether ``found`` leaves so much that it is not right, and that is not the model's error in time."""
+    return found.resolved and not adequate(problem, found.fit)
 
 
 def needed(explanations: Sequence[Explanation]) -> Explanation:

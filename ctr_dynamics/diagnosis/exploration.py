@@ -45,7 +45,7 @@ CONTENDERS, CONTEND = 3, 6.0
 # separation from the best explanation's cause within which another is fitted in its place, and how many
 STAND_IN, STAND_INS = 12.0, 3
 LIKENESS = 0.12  # of its size: a rival that is nearer is alike in shape, and what a large effect does is not linear enough to tell them apart
-ADEQUATE = 1.5  # of the noise: an explanation that leaves more is not worth the search for stand-ins
+ADEQUATE = 1.5  # of the noise: an explanation that leaves more is not right, nor worth stand-ins
 # sets that are fitted because they look best by the columns at the best explanation; where that is right, how much less likely they may look,
 # and which share of the misfit that it explains they may leave by these columns
 SETS, CLOSE, NONLINEAR = 6, 6.0, 0.01
@@ -115,9 +115,9 @@ def explore(
     for _ in range(ROUNDS):  # a stand-in may take the first place
         _renew(problem, found, pool, clean, note, workers)
         best = found[0]
-        adequate = best.fit.chi2 <= ADEQUATE * problem.size
+        close = adequate(problem, best.fit)
         wrong = leftover(problem, best.fit) > MUCH and best.fit.cost < hopeless(problem, clean)
-        if not best.members or not (adequate or wrong):
+        if not best.members or not (close or wrong):
             break
         note(f"what could stand in for {', '.join(best.effects)}")
         if best is not stood:
@@ -125,7 +125,7 @@ def explore(
             at_best, stood = linearise(problem, best.fit.point, forms, workers, again=best.fit), best
         if at_best is None:
             break
-        sets = _stand_ins(problem, found, at_best) if adequate else []
+        sets = _stand_ins(problem, found, at_best) if close else []
         margin = math.inf if wrong else CLOSE + NONLINEAR * max(clean.cost - best.fit.cost, 0.0)
         sets += _other_sets(problem, found, at_best, pool, sets, margin)
         new = _replace(problem, found, sets, at_best, workers)
@@ -306,6 +306,7 @@ def _further(
     """One more cause beside those of each of ``leaders``: what they leave is screened again."""
     new: list[Explanation] = []
     tried: set[frozenset[str]] = set()
+    beyond = hopeless(problem, clean)
     for leader in leaders:
         note(f"what {', '.join(leader.effects)} leaves")
         finish(problem, leader)
@@ -318,7 +319,6 @@ def _further(
                 tried.add(names)
                 jobs.append(Job(leader.members, s, leader.fit, here))
         enough = leader.fit.log_evidence + SECOND_EVIDENCE
-        beyond = hopeless(problem, clean)
         new += [e for e in fit_all(problem, jobs, beyond, workers) if e.fit.log_evidence > enough]
     return new
 
@@ -397,6 +397,11 @@ def leftover(problem: Problem, result: Fit) -> float:
     """Deviations by which the residual's squares exceed what noise gives."""
     dof = problem.size
     return (result.chi2 - dof) / math.sqrt(2.0 * dof)
+
+
+def adequate(problem: Problem, result: Fit) -> bool:
+    """Whether ``result`` may be right: what leaves more is not, whatever share of the misfit that is, but for impacts."""
+    return result.chi2 <= ADEQUATE * problem.size
 
 
 def distinct(found: Sequence[Scored]) -> list[Scored]:

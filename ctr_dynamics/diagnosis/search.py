@@ -14,11 +14,11 @@ from ctr_dynamics.effects import EFFECTS
 from .candidates import Candidate
 from .explanations import Explanation, finish, look_closer, with_nuisances
 from .exploration import (
-    ADEQUATE,
     CONTENDERS,
     LEFT_SHARE,
     MUCH,
     Search,
+    adequate,
     explore,
     leftover,
     probabilities,
@@ -80,8 +80,8 @@ def _explained(problem: Problem, found: Search, clean: Fit) -> bool:
     """Whether the best explanation leaves no more than noise, a small part of the misfit, or the model's own error in time."""
     if leftover(problem, found.best.fit) <= MUCH or not found.best.resolved:
         return True
-    plain = found.best.fit.chi2 > ADEQUATE * problem.size
-    return not plain and found.best.fit.chi2 - problem.size <= LEFT_SHARE * (clean.chi2 - problem.size)
+    best = found.best.fit
+    return adequate(problem, best) and best.chi2 - problem.size <= LEFT_SHARE * (clean.chi2 - problem.size)
 
 
 def _from_early(

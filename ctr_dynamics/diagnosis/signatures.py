@@ -45,7 +45,8 @@ class Linearisation:
 
     Attributes:
         columns: of quantities that have a derivative there. signatures: (m, quantities) of each candidate. probes: of those that were
-            tried at finite sizes; their signatures are the secants to the first.
+            tried at finite sizes; their signatures are the secants to the first. reference: the residual as the steps of the probes show it;
+            None where these cannot be simulated.
     """
 
     point: dict[Key, float]
@@ -53,6 +54,7 @@ class Linearisation:
     columns: dict[Key, Floats]
     signatures: dict[Candidate, Floats] = field(default_factory=dict)
     probes: dict[Candidate, list[Probe]] = field(default_factory=dict)
+    reference: Floats | None = None
 
     def carried(self, fit: Fit) -> Linearisation:
         """The same at a fit not far away: its residual and columns, and the signatures of here."""
@@ -109,8 +111,9 @@ def linearise(
         tries: list[Try] = [(c, _probed(c)[0], {}) for c in rough]
         jobs += _probing(problem, point, tries)
     else:
+        coarse = problem.with_step(PROBE_STEP)
         tries = [(c, size, back) for back in _places(problem, point) for c in rough for size in _probed(c)]
-        jobs += _probing(problem.with_step(PROBE_STEP), point, (None, *tries))
+        jobs += [*_probing(coarse, point, tries), delayed(coarse.residual)(point)]
     done = Parallel(workers, prefer="threads")(jobs)
     if done[0] is None:
         return None
@@ -129,7 +132,8 @@ def linearise(
     for c in pool:
         if c not in shaped and c not in rough:
             result.signatures[c] = np.stack([result.columns[q.key] for q in c.quantities], axis=1)
-    result.probes = _probed_with(result, tries, [residual, *done[more:]] if again else done[more:])
+    result.reference = residual if again else done[-1]
+    result.probes = _probed_with(result, tries, done[more : more + len(tries)])
     _secants(result, rough)
     return result
 
@@ -145,7 +149,7 @@ def far_probes(
         for c in pool
         for size in (_probed(c) if c in new else EFFECTS[c.effect].far)
     ]
-    jobs = _probing(problem.with_step(PROBE_STEP), lin.point, (None, *tries))
+    jobs = _probing(problem.with_step(PROBE_STEP), lin.point, tries)
     found = _probed_with(lin, tries, Parallel(workers, prefer="threads")(jobs))
     probes = {c: lin.probes.get(c, []) + found.get(c, []) for c in (*lin.probes, *found)}
     result = replace(lin, signatures=dict(lin.signatures), probes=probes)
@@ -167,19 +171,19 @@ def _shift(c: Candidate, size: float, back: Mapping[Key, float]) -> dict[Key, fl
     return {**back, **dict(c.start), q.key: q.off + size * q.scale}
 
 
-def _probing(problem: Problem, point: Mapping[Key, float], tries: Sequence[Try | None]) -> list:
-    """Jobs: the residual with each of ``tries`` at ``point``; None is for the point itself."""
-    return [delayed(problem.residual)({**point, **(_shift(*t) if t else {})}) for t in tries]
+def _probing(problem: Problem, point: Mapping[Key, float], tries: Sequence[Try]) -> list:
+    """Jobs: the residual with each of ``tries`` at ``point``."""
+    return [delayed(problem.residual)({**point, **_shift(*arguments)}) for arguments in tries]
 
 
 def _probed_with(
     lin: Linearisation, tries: Sequence[Try], residuals: Sequence[Floats | None]
 ) -> dict[Candidate, list[Probe]]:
-    """Probes with the residuals that :func:`_probing` found, that of the point itself first."""
+    """Probes with the residuals that :func:`_probing` found."""
     probes: dict[Candidate, list[Probe]] = {}
-    for arguments, residual in zip(tries, residuals[1:], strict=True):
-        if residual is not None and residuals[0] is not None:
-            probe = Probe(_shift(*arguments), lin.residual + residual - residuals[0])
+    for arguments, residual in zip(tries, residuals, strict=True):
+        if residual is not None and lin.reference is not None:
+            probe = Probe(_shift(*arguments), lin.residual + residual - lin.reference)
             probes.setdefault(arguments[0], []).append(probe)
     return probes
 

@@ -57,7 +57,8 @@ def test_topics_services_and_qos_are_the_contract(start):
 
 @pytest.mark.parametrize("policy", ["predict", "wait"])
 def test_every_step_has_its_stamp_once(start, on_grid, policy):
-    with start({"output.policy": policy}) as live:
+    # a driver that a busy machine holds up is not a silent one
+    with start({"output.policy": policy, "input_timeout_s": 4.0}) as live:
         robot = live.resting_robot()
         live.wait_for_more(topics.TIP_POSE, 400)
         live.wait_for_more(topics.BACKBONE, 3)

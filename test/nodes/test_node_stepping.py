@@ -2,6 +2,7 @@
 
 import math
 import threading
+import time
 from functools import partial
 from types import SimpleNamespace
 
@@ -84,7 +85,8 @@ def test_inputs_are_taken_in_together_before_the_step(clock):
     assert published == [clock.now]
 
 
-def test_the_first_inputs_are_gathered_before_the_model_starts(clock):
+def test_the_first_inputs_are_gathered_before_the_model_starts(clock, monkeypatch):
+    monkeypatch.setattr(time, "monotonic_ns", lambda: clock.now)
     estimator = Scripted()
     loop, published, _ = make_loop(estimator, clock, gather_ns=20 * MS)
     loop._round()
@@ -96,13 +98,18 @@ def test_the_first_inputs_are_gathered_before_the_model_starts(clock):
     loop._wake.clear()
     loop._round()
     assert (len(estimator.asked), order, published) == (1, ["load"], [])
-    loop._sleep()  # until it may start
+    clock.now += 20 * MS - 1
     loop._round()
-    assert published == [clock.now]
+    assert published == []
+    assert loop._gathering_ns() == 1  # no longer than that does it sleep
+    clock.now += 1
+    loop._round()
+    assert published[0] == estimator.t0_ns
     loop.reset()
+    begun = len(published)
     estimator.t0_ns = clock.now
     loop._round()
-    assert len(published) == 1
+    assert len(published) == begun
 
 
 def test_pauses_are_used_after_steps_are_out_and_not_while_inputs_wait(clock):
