@@ -154,6 +154,12 @@ def snap(
             help="Longest step: steps grow to it from --dt where the motion is slow.",
         ),
     ] = None,
+    equations: Annotated[
+        str,
+        typer.Option(
+            "--equations", help="derived, or printed: (12) and (20) as in the paper, without a term in gamma."
+        ),
+    ] = "derived",
     points: Annotated[int, typer.Option("--points", metavar="N", help="Points of the S-curve.")] = 1000,
     slower: Annotated[
         float, typer.Option("--slower", metavar="FACTOR", help="Slow motion of the bag.")
@@ -185,6 +191,7 @@ def snap(
         "cells": chosen,
         "scheme": scheme,
         "alpha": alpha,
+        "equations": equations,
     }
     Plan(start or 0.0, adaptive=adaptive, **options).check()  # type: ignore[arg-type]
     output.mkdir(parents=True, exist_ok=True)

@@ -16,7 +16,7 @@ from ctr_dynamics.robot import Robot, quantities, robot_with
 from ctr_dynamics.snap.features import Extremum
 from ctr_dynamics.snap.grid import default_cells
 from ctr_dynamics.snap.scurve import SCurve
-from ctr_dynamics.snap.solver import SnapSolver, Solved
+from ctr_dynamics.snap.solver import EQUATIONS, SnapSolver, Solved
 
 MARGIN = 0.0128  # rad before the predicted snap at which a run starts when no start is given
 DOUBLE_BELOW = 0.05  # a step whose error is below this share of the allowed one may double
@@ -87,6 +87,7 @@ class Plan:
         scheme, alpha: ``bdf2`` or another one-stage scheme; alpha of ``bdf_alpha``.
         adaptive: longest step in s, or None for equal steps; angle_error: rad, allowed for one of its steps.
         frames: about this many backbones are kept.
+        equations: ``derived`` or ``printed``, see :class:`SnapSolver`.
     """
 
     start: float
@@ -99,6 +100,7 @@ class Plan:
     adaptive: float | None = None
     angle_error: float = 1e-4
     frames: int = 240
+    equations: str = "derived"
 
     def check(self) -> None:
         """Raises InputError for numbers out of range."""
@@ -110,6 +112,10 @@ class Plan:
         ):
             if not low <= value <= high:
                 raise InputError(f"{name} {value:g} {unit} is outside [{low:g}, {high:g}] {unit}")
+        if self.equations not in EQUATIONS:
+            raise InputError(
+                f"equations '{self.equations}' are not known", do=f"one of {', '.join(EQUATIONS)}"
+            )
         if self.duration / self.dt > 2e6:
             raise InputError(
                 f"{self.duration / self.dt:.3g} steps are more than 2e6", do="raise dt or shorten duration"
@@ -173,7 +179,7 @@ def run(robot: Robot, plan: Plan, progress: Callable[[float], None] | None = Non
     if robot.n_tubes < 2:
         raise InputError(f"robot {robot.name} has one tube", do="a snap needs two")
     beta, held = np.array(robot.rest.beta.value), float(robot.rest.alpha.value[1])
-    solver = SnapSolver(robot, beta, plan.cells)
+    solver = SnapSolver(robot, beta, plan.cells, equations=plan.equations)
 
     def alpha(theta_b: float) -> np.ndarray:
         angles = np.full(robot.n_tubes, held)

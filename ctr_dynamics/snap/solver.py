@@ -25,6 +25,8 @@ ABSENT = {
     "tip_force",
     "tip_spring",
 }
+EQUATIONS = {"derived": 1.0, "printed": 0.0}
+"""Share of the derivative of R_z(theta_i)^T in omega_i,t: (12) and (20) as printed leave it out (docs/model.md, *Gyroscopic term of (12)*)."""
 OUTCOMES = {
     CONVERGED: "ok",
     1: "Newton's method did not converge",
@@ -51,6 +53,7 @@ class SnapSolver:
         beta: (N,) m.
         cells: behind the plate and in each section, base to tip; default :func:`ctr_dynamics.snap.grid.default_cells`.
         tolerance: largest ||E||^2.
+        equations: ``derived``, or ``printed`` for (12) and (20) as the paper prints them and the published program solves them.
 
     Raises:
         InputError: translations or cells that do not fit the robot, or an extension that these equations lack.
@@ -62,6 +65,7 @@ class SnapSolver:
         beta: np.ndarray,
         cells: tuple[int, ...] | None = None,
         tolerance: float = TOLERANCE,
+        equations: str = "derived",
     ) -> None:
         problem = robot.actuator_problem(np.asarray(beta, float))
         if problem:
@@ -79,7 +83,7 @@ class SnapSolver:
             model.segments, self.beta, cells or default_cells(robot.name, model.segments, self.beta)
         )
         self.tolerance = tolerance
-        self.parameters = model.parameters.copy()
+        self.parameters = np.append(model.parameters, EQUATIONS[equations])
         self.parameters[model.layout["beta"]] = self.beta
         self.work = make_work(self.grid.arrays)
         size = self.work.left.shape[1]

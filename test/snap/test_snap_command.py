@@ -139,6 +139,7 @@ def test_settings_of_a_robot():
         (["--cells", "a"], "not a list"),
         (["--scheme", "magic"], "not known"),
         (["--scheme", "sdirk3"], "stages"),
+        (["--equations", "wrong"], "equations 'wrong' are not known"),
         (["--adaptive", "1e-6"], "longest step"),
         (["--start", "3.6"], "fold"),
         (["--robot", "nobody"], "neither"),

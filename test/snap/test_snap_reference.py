@@ -82,6 +82,25 @@ def test_first_peak_converges_in_second_order(example, scheme, alpha, factor):
             assert theirs - mine == pytest.approx(8.5e-4, abs=2e-4)
 
 
+@pytest.mark.slow
+def test_printed_equations_are_those_of_the_published_program():
+    """Without the term in gamma that (12) and (20) as printed lack: the same motion, and first peaks that go to 6.2085 rad."""
+    robot, peaks = load_robot(EXAMPLE), []
+    for dt, file in ((1e-5, "tip_dt10us.csv"), (5e-6, "theta_dt5us.csv")):
+        theirs = table(file)
+        mine = run(robot, Plan(START, dt=dt, duration=7.6e-3, equations="printed"))
+        crossings = crossing(mine.t, mine.theta_f), crossing(theirs["t_s"], theirs["theta_f"])
+        grid = np.linspace(-6e-3, 0.8e-3, 10_001)
+        off = CubicSpline(mine.t - crossings[0], mine.theta_f)(grid) - CubicSpline(
+            theirs["t_s"] - crossings[1], theirs["theta_f"]
+        )(grid)
+        print(f"{1e6 * dt:g} us: theta_f {np.abs(off).max():.5f} rad")
+        assert np.abs(off).max() < 5e-4
+        peaks.append(after_snap(extrema(mine.t, mine.theta_f), crossings[0])[0].theta_f)
+    assert peaks == pytest.approx([6.2007, 6.2065], abs=2e-4)
+    assert peaks[1] + (peaks[1] - peaks[0]) / 3 == pytest.approx(6.2085, abs=2e-4)
+
+
 def test_no_friction_snaps_sooner_and_keeps_its_energy():
     """Held by nothing, the tubes snap some 4 ms earlier and ring on."""
     robot = robot_for_snap(load_robot(EXAMPLE), {"tube_coulomb": 0.0})
