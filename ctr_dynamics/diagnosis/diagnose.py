@@ -131,7 +131,7 @@ def diagnose(
     nuisances = [q for q in catalogue if q.tolerance > 0.0 and q.effect not in forms]
     notes = [text for r in (*recordings, *validation) for text in r.notes]
     if mask is None:
-        mask = measured_axes(recordings, notes)
+        mask = measured_axes([*recordings, *validation], notes)
     result = Diagnosis(
         robot,
         list(recordings),
@@ -211,9 +211,9 @@ def diagnose(
 
 
 def measured_axes(recordings: Sequence[Recording], notes: list[str]) -> NDArray[np.bool_]:
-    """(6,) axes that carry information: a tracker that sends one and the same rotation has three degrees of freedom."""
+    """(6,) axes that carry information in every recording: a tracker that sends one and the same rotation has three degrees of freedom."""
     mask = np.ones(6, bool)
-    if all(np.ptp(r.quaternion, axis=0).max(initial=0.0) < 1e-9 for r in recordings):
+    if any(np.ptp(r.quaternion, axis=0).max(initial=0.0) < 1e-9 for r in recordings):
         mask[3:] = False
         notes.append(
             "the tracker sends no rotation (three degrees of freedom); causes are judged by position alone"

@@ -16,6 +16,8 @@ from ctr_dynamics.robot import Robot
 
 Floats = NDArray[np.float64]
 SHORTEST = 2.0  # s of joints and tracker together, below which nothing can be said
+GAP = 0.1  # s without joints in which the robot may have gone anywhere
+SETTLING = 0.5  # s after it that the tip still swings from what was not seen
 LOAD_GRACE = 0.1  # s; a first load that comes this soon after the joints is there from the start
 
 
@@ -93,22 +95,38 @@ def read_recording(path: str | Path, robot: Robot) -> Recording:
             f"{int((~inside).sum())} tracker poses lie outside the time of the joints and were left out"
         )
     tracker = tracker[inside]
-    span = float(np.ptp(tracker[:, 0])) if len(tracker) else 0.0
+    unseen, note = _unseen(table[:, 0], tracker[:, 0])
+    notes += [note] if note else []
+    span = float(np.ptp(tracker[:, 0]) * np.mean(~unseen)) if len(tracker) else 0.0
+    tracker = tracker[~unseen]
     if span < SHORTEST:
         raise InputError(
-            f"tracker and joints overlap for {span:.2f} s, less than {SHORTEST:g} s",
+            f"tracker and joints overlap for {span:.2f} s, less than {SHORTEST:g} s{f' ({note})' if note else ''}",
             do="record for longer; ten seconds with motion are enough",
             where=where,
         )
     load = np.array([[(stamp - t0) * 1e-9, *value] for stamp, value in _once(loads)]).reshape(-1, 7)
     if len(load) and load[0, 0] > LOAD_GRACE:
         load = np.vstack([np.r_[load[0, 0] - 1e-9, np.zeros(6)], load])
-    gap = float(np.diff(table[:, 0]).max(initial=0.0))
-    if gap > 0.1:
-        notes.append(f"joints are missing for up to {gap:.2f} s; they are taken as straight lines there")
     return Recording(
         bag.path.name, where, bag.sha256(), table, load, tracker[:, 0], tracker[:, 1:4], _continuous(tracker[:, 4:8]), tuple(notes)
     )  # fmt: skip
+
+
+def _unseen(joints: Floats, poses: Floats) -> tuple[NDArray[np.bool_], str]:
+    """Which of ``poses`` (s) fall into gaps of ``joints`` (s) or so soon behind that the tip may still swing from them, and a note about them."""
+    gaps = np.flatnonzero(np.diff(joints) > GAP)
+    unseen = np.zeros(len(poses), bool)
+    for i in gaps:
+        unseen |= (poses > joints[i]) & (poses < joints[i + 1] + SETTLING)
+    if not len(gaps):
+        return unseen, ""
+    longest = float(np.diff(joints).max())
+    times = "once" if len(gaps) == 1 else f"{len(gaps)} times"
+    return unseen, (
+        f"joints are missing {times}, for up to {longest:.2f} s (limit {GAP:g} s): {int(unseen.sum())} of {len(poses)} tracker poses, "
+        f"up to {SETTLING:g} s after, were left out"
+    )
 
 
 Samples = list[tuple[int, list[float]]]
@@ -117,6 +135,7 @@ Samples = list[tuple[int, list[float]]]
 def _collect(bag: Bag, robot: Robot) -> tuple[Samples, Samples, Samples, list[str], str]:
     joints: Samples = []
     poses: Samples = []
+    bare: Samples = []  # poses without a usable orientation
     loads: Samples = []
     left, wrong = 0, ""
     for item in bag.inputs():
@@ -140,12 +159,17 @@ def _collect(bag: Bag, robot: Robot) -> tuple[Samples, Samples, Samples, list[st
             norm = float(np.sqrt(x * x + y * y + z * z + w * w)) if finite(message.quaternion_xyzw) else 0.0
             if finite(message.position) and 0.9 <= norm <= 1.1:
                 poses.append((message.stamp_ns, [*message.position, w / norm, x / norm, y / norm, z / norm]))
+            elif finite(message.position):
+                bare.append((message.stamp_ns, [*message.position, 1.0, 0.0, 0.0, 0.0]))
             else:
                 left += 1
         elif finite(message.force) and finite(message.torque):
             loads.append((message.stamp_ns, [*message.force, *message.torque]))
         else:
             left += 1
+    if poses:
+        left += len(bare)
+    poses = poses or bare  # a tracker of positions alone sends zeros or NaN for the orientation
     notes = [f"{left} messages hold values that cannot be used and were left out"] if left else []
     if wrong and joints:
         notes.append(f"some joint states were left out: {wrong}")

@@ -1,0 +1,88 @@
+"""What is taken from a bag, and what is left out and said."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from ctr_dynamics.bagio.writer import write_bag
+from ctr_dynamics.diagnosis.diagnose import measured_axes
+from ctr_dynamics.diagnosis.recording import GAP, SETTLING, SHORTEST, read_recording
+from ctr_dynamics.errors import InputError
+from ctr_dynamics.messages import topics
+from ctr_dynamics.messages.encode import encode_joint_state, encode_pose_stamped
+from ctr_dynamics.robot import load_robot
+
+START_NS = 1_700_000_000_000_000_000
+
+
+@pytest.fixture
+def robot():
+    return load_robot("till2020_tissue")
+
+
+@pytest.fixture
+def bag(tmp_path, robot):
+    """Makes a bag of a resting robot from the stamps (s) of joints and tracker."""
+    names = [f"tube{n}_{kind}" for n in (1, 2) for kind in ("rotation", "translation")]
+    rest = [x for pair in zip(robot.rest.alpha.value, robot.rest.beta.value, strict=True) for x in pair]
+
+    def make(joints, poses, quaternions=lambda k: (0.0, 0.0, 0.0, 1.0)):
+        path = tmp_path / "bag.mcap"
+        with write_bag(path, {}) as writer:
+            for t in joints:
+                stamp = START_NS + round(1e9 * t)
+                writer.write(topics.JOINT_STATES, stamp, encode_joint_state(stamp, names, rest))
+            for k, t in enumerate(poses):
+                stamp = START_NS + round(1e9 * t)
+                pose = encode_pose_stamped(stamp, "ctr_base", (0.01, 0.0, 0.2), quaternions(k))
+                writer.write(topics.TRACKER_TIP, stamp, pose)
+        return path
+
+    return make
+
+
+def test_poses_in_gaps_of_the_joints_and_soon_after_are_left_out(robot, bag):
+    joints, poses = np.arange(0.0, 10.0, 0.01), np.arange(0.0, 9.9, 0.025)
+    gap = (joints > 4.0) & (joints < 4.7)
+    found = read_recording(bag(joints[~gap], poses), robot)
+    kept = (poses <= 4.001) | (poses >= 4.7 + SETTLING - 1e-6)
+    np.testing.assert_allclose(found.stamps, poses[kept], atol=1e-8)
+    assert len(found.notes) == 1
+    assert "joints are missing once, for up to 0.70 s" in found.notes[0]
+    assert f"{int((~kept).sum())} of {len(poses)} tracker poses" in found.notes[0]
+
+
+def test_joints_at_half_the_rate_are_no_gap(robot, bag):
+    poses = np.arange(0.0, 4.9, 0.025)
+    found = read_recording(bag(np.arange(0.0, 5.0, 0.02), poses), robot)
+    assert len(found.stamps) == len(poses)
+    assert not found.notes
+
+
+def test_joints_that_come_and_go_leave_nothing_to_say(robot, bag):
+    joints = np.arange(0.0, 10.0, 0.01)
+    seen = joints % 0.5 < 0.5 - 2 * GAP
+    with pytest.raises(InputError, match=rf"less than {SHORTEST:g} s \(joints are missing 19 times"):
+        read_recording(bag(joints[seen], np.arange(0.0, 9.9, 0.025)), robot)
+
+
+@pytest.mark.parametrize("missing", [0.0, float("nan")])
+def test_a_tracker_without_orientation_gives_positions(robot, bag, missing):
+    joints, poses = np.arange(0.0, 5.0, 0.01), np.arange(0.0, 4.9, 0.025)
+    found = read_recording(bag(joints, poses, lambda k: (missing,) * 4), robot)
+    assert len(found.stamps) == len(poses)
+    np.testing.assert_array_equal(found.quaternion, np.tile([1.0, 0.0, 0.0, 0.0], (len(poses), 1)))
+    turning = replace(found, quaternion=np.eye(4)[np.arange(len(poses)) % 4])
+    notes: list[str] = []
+    assert measured_axes([turning], notes).all()
+    assert not notes
+    np.testing.assert_array_equal(measured_axes([turning, found], notes), [True] * 3 + [False] * 3)
+    assert "three degrees of freedom" in notes[0]
+
+
+def test_single_poses_without_orientation_are_left_out(robot, bag):
+    joints, poses = np.arange(0.0, 5.0, 0.01), np.arange(0.0, 4.9, 0.025)
+    found = read_recording(bag(joints, poses, lambda k: (0.0, 0.0, 0.0, float(k % 10 > 0))), robot)
+    assert len(found.stamps) == len(poses) - len(poses[::10])
+    assert found.notes == (f"{len(poses[::10])} messages hold values that cannot be used and were left out",)
