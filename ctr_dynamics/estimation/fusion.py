@@ -234,6 +234,11 @@ class Fusion:
         self.tips.transform(T)
         self.unreduced = 0
 
+    def forget_parameters(self) -> None:
+        """Have the parameters of the robot file again."""
+        self.theta[:] = 0.0
+        self._apply_theta()
+
     def _apply_theta(self) -> None:
         """Write the estimated parameters and force into the simulator's block."""
         self.simulator.parameters[:] = self.nominal + self.uncertainty.effect @ self.theta

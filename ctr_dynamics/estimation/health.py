@@ -6,6 +6,8 @@ import math
 from collections import deque
 from dataclasses import dataclass, field
 
+import numpy as np
+from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from ctr_dynamics.snap.stability import Stability
@@ -13,7 +15,10 @@ from ctr_dynamics.snap.stability import Stability
 from .misfit import MisfitMonitor
 from .outputs import ERROR, OK, WARN, Status
 
+Floats = NDArray[np.float64]
 SNAP_WARNING_S = 1.0  # a snap that is nearer than this is warned of
+WAITING = "waiting for the first complete joint state"
+OF_SAMPLES = ("nis_count", "nis_sum", "nis_dof", "accepted", "rejected", "dropped", "_squares", "_compared")
 TRACKER_LIMIT_S = 1.0  # without a usable sample for longer than this the status says so
 
 
@@ -43,7 +48,7 @@ class Health:
     joints: dict[str, Counter] = field(default_factory=dict)
     tracker: dict[str, Counter] = field(default_factory=dict)
     load: dict[str, Counter] = field(default_factory=dict)
-    problem: str = "waiting for the first complete joint state"
+    problem: str = WAITING
     steps: int = 0
     failures: int = 0
     reasons: dict[str, int] = field(default_factory=dict)
@@ -65,6 +70,8 @@ class Health:
     misfit: MisfitMonitor = field(default_factory=MisfitMonitor)
     stability: Stability | None = None
     _within: int = 0
+    _squares: tuple[float, float] = (0.0, 0.0)  # m^2, of the model alone and fused
+    _compared: int = 0
 
     def note(self, group: str, kind: str, what: str) -> None:
         """Count an input problem of ``kind`` in ``group`` (joints, tracker or load)."""
@@ -86,6 +93,35 @@ class Health:
             self.accepted += 1
         elif self.fusing:
             self.rejected += 1
+
+    def compared(self, alone: Floats, fused: Floats) -> None:
+        """Count a reading that lies ``alone`` (3,) and ``fused`` (3,) m from the outputs of its time."""
+        self._squares = self._squares[0] + float(alone @ alone), self._squares[1] + float(fused @ fused)
+        self._compared += 1
+
+    def residual_rms(self) -> dict[str, float | None]:
+        """m between readings and outputs: of the model alone, and fused where the filter is on."""
+        alone, fused = (math.sqrt(s / self._compared) if self._compared else None for s in self._squares)
+        return {"predicted": alone, "fused": fused if self.fusing else None}
+
+    def of_samples(self) -> tuple:
+        """What is counted of samples, for :meth:`return_to`."""
+        return (*(getattr(self, name) for name in OF_SAMPLES), list(self.recent))
+
+    def return_to(self, counted: tuple) -> None:
+        """Have counted of samples what :meth:`of_samples` gave."""
+        *values, recent = counted
+        for name, value in zip(OF_SAMPLES, values, strict=True):
+            setattr(self, name, value)
+        self.recent.clear()
+        self.recent.extend(recent)
+
+    def begin_anew(self) -> None:
+        """Wait for joints and watch afresh; counters of what was odd stay."""
+        self.problem = WAITING
+        self.recent.clear()
+        self.misfit.clear()
+        self._squares, self._compared = (0.0, 0.0), 0
 
     @property
     def rejecting(self) -> bool:

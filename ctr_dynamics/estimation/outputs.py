@@ -104,6 +104,15 @@ class StepOutput:
     innovations: list[Innovation] = field(default_factory=list)
     solver: SolverStats = SolverStats(0, 0, "")
 
+    @classmethod
+    def invalid(cls, stamp_ns: int, k: int, reason: str, innovations: list[Innovation]) -> StepOutput:
+        """A stamp without an estimate: every number is NaN, the backbone empty."""
+        nan3, nan4, nan6 = np.full(3, np.nan), np.full(4, np.nan), np.full(6, np.nan)
+        return cls(
+            stamp_ns, k, False, reason, nan3, nan4, np.full((6, 6), np.nan), nan6, np.full((6, 6), np.nan), nan3, nan4,
+            np.zeros((0, 15), np.float32), Modes.none(), nan3, nan3, innovations, SolverStats(0, 0, reason),
+        )  # fmt: skip
+
 
 @dataclass(frozen=True)
 class Status:

@@ -359,11 +359,11 @@ def test_poses_without_joints_do_not_pile_up(sweep):
     for k in range(1000):
         made.add_tracker_pose(START_NS + 25_000_000 * k, *pose.content)
         assert made.advance(START_NS + 25_000_000 * k) == []
-    assert len(made._samples) <= 200
+    assert len(made.inputs.samples) <= 200
     assert made.health.dropped >= 800
     for k in range(1000):
         made.add_tip_load(START_NS + 10_000_000 * k, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
-    assert len(made._load.stamps) < 100
+    assert len(made.inputs.load.stamps) < 100
 
 
 def test_tracker_on_a_clock_that_is_ahead(sweep):

@@ -91,7 +91,7 @@ def corrected_apart(a, b):
         float(np.linalg.norm(x.last.position - y.last.position))
         for x, y in (
             (a.estimator.fusion.tips, b.estimator.fusion.tips),
-            (a.estimator._alone_tips, b.estimator._alone_tips),
+            (a.estimator.runs.alone_tips, b.estimator.runs.alone_tips),
         )
     )
 

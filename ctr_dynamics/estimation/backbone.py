@@ -1,0 +1,65 @@
+"""The published backbone: states at the nodes as rows in the tracker's registered frame."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ctr_dynamics.model.mesh import node_points, node_positions
+from ctr_dynamics.model.model import Model
+from ctr_dynamics.model.simulator import State
+
+from .fusion import Fusion
+from .kernels import backbone_rows, conjugate, from_vector, matrix
+from .tracker import ROTATION, TRANSLATION
+
+Floats = NDArray[np.float64]
+SHAPES = 8  # sections at a beta whose nodes are remembered
+
+
+class Backbone:
+    """Makes the rows of the backbone of one estimator."""
+
+    def __init__(self, model: Model, fusion: Fusion) -> None:
+        self.model, self.fusion = model, fusion
+        self._nodes: dict[tuple, tuple[Floats, NDArray[np.int64]]] = {}
+        self._turn: tuple[bytes, tuple[Floats, Floats]] | None = None
+
+    def rows(self, state: State) -> NDArray[np.float32]:
+        """(P, 15) float32, see :class:`ctr_dynamics.estimation.outputs.StepOutput`."""
+        turn, shift = self._registration()
+        key = (state.key, state.inputs.beta.tobytes())
+        if key not in self._nodes:
+            if len(self._nodes) > SHAPES:
+                self._nodes.clear()
+            self._nodes[key] = (
+                node_positions(state.mesh, state.inputs.beta),
+                node_points(state.mesh.sec_cells),
+            )
+        s, points = self._nodes[key]
+        rows = np.empty((len(state.nodes), 15), np.float32)
+        inserted = self.fusion.inserted
+        c = self.fusion.columns
+        r = c.theta.shape[1]
+        backbone_rows(
+            s, state.nodes, state.fields, points, self.model.n, float(state.inputs.beta_rate[0]) * (1.0 - inserted), turn, shift,
+            c.position_deviation(self.fusion.pi[:r, :r]), rows,
+        )  # fmt: skip
+        rates = state.inputs.beta_rate
+        if inserted and np.any(rates):
+            # the model's velocities are those of the grid, which lies still at the plate and follows tube 1 at the tip only
+            beta = state.inputs.beta
+            grid = (node_positions(state.mesh, beta + 1e-4 * rates) - s) / 1e-4
+            tangents = np.array([matrix(h)[:, 2] for h in state.nodes[:, 3:7]])
+            rows[:, 8:11] += inserted * (rates[0] - grid)[:, None] * tangents
+        return rows
+
+    def _registration(self) -> tuple[Floats, Floats]:
+        """Estimated error of the registration in base axes: rotation (3, 3) and translation (3,) m."""
+        bias = self.fusion.bias[:6]
+        key = bias.tobytes()
+        if self._turn is None or self._turn[0] != key:
+            back = matrix(conjugate(self.fusion.tracker.rotation))
+            turn = matrix(from_vector(back @ bias[ROTATION]))
+            self._turn = key, (turn, back @ bias[TRANSLATION])
+        return self._turn[1]

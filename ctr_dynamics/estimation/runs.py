@@ -1,0 +1,298 @@
+"""Two runs of the model side by side, step by step: the fused one, which the filter corrects, and the model alone; and states that both return to."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ctr_dynamics.errors import InputError
+from ctr_dynamics.model.model import Model
+from ctr_dynamics.model.scheme import make_scheme
+from ctr_dynamics.model.simulator import Simulator, State, StepResult
+from ctr_dynamics.parameters import Settings, axes_mask
+
+from .actuation import Actuation, standing
+from .fusion import Fusion, FusionOptions
+from .health import Health
+from .inputs import DT_NS, InputBuffer, Sample
+from .outputs import Innovation, Moment
+from .tip import TipWindow
+from .tracker import registered, tracker_model
+
+Floats = NDArray[np.float64]
+DT = DT_NS * 1e-9
+KEEP_EVERY = 8  # steps between kept states that late inputs return to
+
+
+@dataclass(frozen=True)
+class Kept:
+    """Both runs and the filter after step ``k``; ``taken``: by the stamp (ns) of a tracker sample, the step after which it was fused."""
+
+    k: int
+    fused: State
+    alone: State
+    fusion: tuple
+    alone_tips: tuple
+    taken: dict[int, int]
+
+
+class Runs:
+    """The fused run with its filter, and the model alone, driven by an :class:`InputBuffer`.
+
+    Attributes:
+        fused, alone: states after the last step; None before the start and after what cannot be gone on from.
+        alone_tips: of the model alone. kept: states to return to, oldest first. innovations: of samples, until someone takes them.
+        sampled_ns: stamp of the newest sample that reached the gate.
+    """
+
+    def __init__(self, model: Model, settings: Settings, inputs: InputBuffer, health: Health) -> None:
+        self.model, self.inputs, self.health = model, inputs, health
+        scheme = make_scheme(str(settings["model.scheme"]), DT, float(settings["model.alpha"]))
+        tolerance = float(settings["model.tolerance"])
+        self.simulator = Simulator(model, scheme, tolerance)
+        self.reference = Simulator(model, scheme, tolerance)
+        self.tracker = tracker_model(
+            model.setup,
+            delay=float(settings["tracker.delay_s"]),
+            lever=np.array(settings["tracker.lever_arm_m"]),
+            rotation=np.array(settings["tracker.registration_rotation_rad"]),
+            translation=np.array(settings["tracker.registration_translation_m"]),
+            mask=axes_mask(str(settings["tracker.axes"])),
+        )
+        self.fusion = Fusion(
+            self.simulator,
+            self.tracker,
+            FusionOptions(
+                rank=int(settings["filter.rank"]),
+                gate_probability=float(settings["filter.gate_probability"]),
+                force_sigma=float(settings["filter.tip_force_sigma_N"]),
+                force_sigma_max=float(settings["filter.tip_force_sigma_max_N"]),
+                adaptation=float(settings["filter.adaptation"]),
+                force_time=float(settings["filter.tip_force_time_s"]),
+                window=float(settings["filter.window_s"]),
+            ),
+        )
+        names = self.fusion.uncertainty.names
+        self._offset_rows = [
+            (i, names.index(f"encoder_offset.tube{i + 1}"))
+            for i in range(model.n)
+            if f"encoder_offset.tube{i + 1}" in names
+        ]
+        if model.extended:
+            self.fusion.inserted = float(model.setup.block[model.layout["insertion"]][0])
+        self.clear()
+
+    def clear(self) -> None:
+        """Forget both runs."""
+        self.fusion.forget_parameters()
+        self.fused: State | None = None
+        self.alone: State | None = None
+        self.alone_tips = TipWindow(self.fusion.tips.size)
+        self.kept: deque[Kept] = deque()
+        self.innovations: list[Innovation] = []
+        self.sampled_ns: int | None = None
+        self._signals: dict[tuple[float, float], tuple[Floats, Floats]] = {}  # of one step
+
+    # -- steps --
+
+    def start(self, k: int) -> str:
+        """Both runs at rest at step ``k``; returns the reason when there is no equilibrium."""
+        t = k * DT_NS * 1e-9
+        self._signals.clear()
+        self.fusion.forget_parameters()
+        try:
+            self.fused = self.simulator.rest(self._actuation(False)(t))
+        except InputError as error:
+            self.fused = self.alone = None
+            return str(error)
+        self.fused.inputs = standing(self.fused.inputs)
+        self.alone = self.fused.copy()
+        self.fusion.start(self.fused, t)
+        self.alone_tips.clear(1)
+        self._keep_alone_tip(t)
+        for sample in self.inputs.samples:
+            sample.fused_k = None
+        while self.kept and self.kept[-1].k >= k:
+            self.kept.pop()
+        self.keep(k)
+        return ""
+
+    def step(self, k: int, track: Kept | None = None, keep: bool = True) -> StepResult:
+        """Both runs from step k - 1 to k, and every sample that has become due; with ``track`` the covariance is taken from there. Without
+        ``keep`` the state is kept at every eighth step only."""
+        assert self.fused is not None and self.alone is not None
+        before, t = (k - 1) * DT_NS * 1e-9, k * DT_NS * 1e-9
+        self._signals.clear()
+        f, a = self.fused, self.alone
+        apart = (
+            3.0 * (a.unknowns - f.unknowns)
+            - 3.0 * (a.earlier[0] - f.earlier[0])
+            + (a.earlier[1] - f.earlier[1])
+        )
+        events = self.inputs.load_bends(k)
+        result = self.simulator.step(
+            f, before, self._actuation(True), record=False if track else "end", events=events
+        )
+        # the actuators' noise moves both runs alike: what lies between their unknowns is smooth, so a parabola meets it
+        start = f.unknowns + apart if result.ok else None
+        alone = self.reference.step(a, before, self._actuation(False), start=start, events=events)
+        if not alone.ok:
+            return alone
+        self._keep_alone_tip(t)
+        if not result.ok:
+            self._start_filter(k)
+            return result
+        if result.substeps > 1:
+            self.health.substeps += 1
+        if track is not None:
+            self.fusion.follow(track.fusion, self.fused)
+        else:
+            due = self.inputs.due_samples(self.tracker, t)
+            if not self.fusion.predict(self.fused, result, t, sampled=bool(due)):
+                self.health.note(
+                    "tracker", "tangent", "the step could not be linearised; the covariance was held"
+                )
+            self._fuse(k, due)
+        if keep or k % KEEP_EVERY == 0:
+            self.keep(k)
+        return result
+
+    def _actuation(self, corrected: bool) -> Actuation:
+        """Actuators and load at a time (s from t0), with the estimated offsets and force for the fused run."""
+        inputs, n = self.inputs, self.model.n
+        assert inputs.t0_ns is not None
+        shift = np.zeros(self.model.input_count)
+        shift[3 * n : 3 * n + 3] = self.model.setup.tip_force
+        if corrected:
+            for i, row in self._offset_rows:
+                shift[i] += self.fusion.theta[row]
+            shift[3 * n : 3 * n + 3] += self.fusion.force
+        extrapolate = inputs.timeout_ns if inputs.predicting else 0
+        return Actuation(
+            self.model, inputs.t0_ns, inputs.joints, inputs.load, extrapolate, shift, self._signals
+        )
+
+    def _start_filter(self, k: int) -> None:
+        """Start the filter anew from the model alone at step ``k``: a correction has led the fused run astray."""
+        assert self.alone is not None
+        self.fused = self.alone.copy()
+        self.fusion.start(self.fused, k * DT_NS * 1e-9)
+        self.health.restarts += 1
+        self.keep(k)
+
+    def _keep_alone_tip(self, t: float) -> None:
+        assert self.alone is not None
+        S = self.alone.nodes.shape[1]
+        rate = float(self.alone.inputs.beta_rate[0]) * (1.0 - self.fusion.inserted)
+        self.alone_tips.append(t, self.alone.nodes[-1], np.zeros((S, 1)), rate)
+
+    def _fuse(self, k: int, due: list[tuple[Sample, float, Floats]]) -> None:
+        """Compare and fuse the samples ``due`` after step ``k``."""
+        assert self.fused is not None
+        for sample, time_s, position in due:
+            sample.fused_k = k
+            moment = self._compare(time_s, position, sample.quaternion)
+            if self.health.fusing:
+                update = self.fusion.update(self.fused, time_s, position, sample.quaternion)
+            else:
+                update = self.fusion.compare(time_s, position, sample.quaternion)
+            if update.dof:
+                self.sampled_ns = max(self.sampled_ns or 0, sample.stamp_ns)
+                self.health.measured(
+                    update.nis, update.dof, update.accepted, update.accepted and not update.reason
+                )
+            else:
+                self.health.dropped += 1
+                self.health.note(
+                    "tracker",
+                    "outside the window",
+                    f"pose of t = {time_s:.3f} s at step {k}: {update.reason}",
+                )
+            self.innovations.append(
+                Innovation(
+                    sample.stamp_ns,
+                    update.residual,
+                    update.variance,
+                    update.nis,
+                    update.dof,
+                    update.accepted,
+                    sample.late_s,
+                    update.reason,
+                    update.white,
+                    moment,
+                )
+            )
+        self.inputs.forget_samples(k)
+        self.health.force_sigma = self.fusion.force_sigma
+
+    def _compare(self, time_s: float, position: Floats, quaternion: Floats) -> Moment | None:
+        """Residuals of the published outputs against a reading, before its update, and the moment of it."""
+        n = self.model.n
+        own_s = time_s - self.tracker.delay
+        fused = self.fusion.tips.at(own_s, DT, columns=False)
+        alone = self.alone_tips.at(own_s, DT, columns=False)
+        earlier = self.alone_tips.at(own_s - 2 * DT, DT, columns=False) or alone
+        if fused is None or alone is None or earlier is None:
+            return None
+        position, _ = self.tracker.to_base(position, quaternion)
+        estimate = registered(self.tracker, self.fusion.bias, fused)[:3]
+        left = position - alone.position
+        self.health.compared(left, position - estimate)
+        assert self.inputs.t0_ns is not None
+        joints, rates = self.inputs.joints.at(self.inputs.t0_ns + own_s * 1e9)
+        acceleration = (alone.velocity - earlier.velocity) / (2 * DT)
+        return Moment(
+            left, alone.position, alone.quaternion, alone.velocity, acceleration,
+            joints[:n], rates[:n], rates[n:],
+        )  # fmt: skip
+
+    # -- states to return to --
+
+    def keep(self, k: int, always: bool = False) -> None:
+        """Remember both runs after step ``k``, for as long as inputs may come late: every step where joints are extrapolated, else every eighth."""
+        if not (always or self.inputs.predicting) and k % KEEP_EVERY:
+            return
+        assert self.fused is not None and self.alone is not None
+        self.kept.append(
+            Kept(
+                k,
+                self.fused.copy(),
+                self.alone.copy(),
+                self.fusion.snapshot(),
+                self.alone_tips.snapshot(),
+                {s.stamp_ns: s.fused_k for s in self.inputs.samples if s.fused_k is not None},
+            )
+        )
+        oldest = k - self.inputs.window_ns // DT_NS - 9
+        while len(self.kept) > 1 and self.kept[1].k <= oldest:
+            self.kept.popleft()
+        self.inputs.forget_signals(self.kept[0].k)
+
+    def restore(self, kept: Kept) -> None:
+        """Be where the runs were at ``kept``."""
+        self.fused, self.alone = kept.fused.copy(), kept.alone.copy()
+        self.fusion.restore(kept.fusion)
+        self.alone_tips.restore(kept.alone_tips)
+        for sample in self.inputs.samples:
+            sample.fused_k = kept.taken.get(sample.stamp_ns)
+
+    def parameters(self) -> dict[str, Any]:
+        """Values and deviations of what the filter estimates beside the state, for a file."""
+        f = self.fusion
+        r = f.columns.theta.shape[1] if self.fused is not None else 0
+        deviation = (
+            np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", f.columns.theta, f.pi[:r, :r], f.columns.theta), 0.0))
+            if r
+            else None
+        )
+        return {
+            name: {
+                "value": float(f.theta[i]),
+                "sigma": float(deviation[i]) if deviation is not None else None,
+            }
+            for i, name in enumerate(f.uncertainty.names)
+        }
