@@ -2,6 +2,7 @@
 
 import hashlib
 import os
+import sys
 from pathlib import Path
 
 # The filter's matrices are small: a second BLAS thread gains nothing and, on a busy machine, waits for its time slice for up to 100 ms.
@@ -21,8 +22,10 @@ def _kernel_cache() -> str:
         for p in (here / folder).glob("*.py")
     )
     digest = hashlib.sha256(repr(stamps).encode()).hexdigest()[:16]
+    made = Path(sys.prefix) / "numba-cache"  # what `make` has compiled
     base = Path(
         os.environ.get("NUMBA_CACHE_DIR")
+        or (made if os.access(made, os.W_OK) else None)
         or Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser() / "ctr_dynamics"
     )
     return str(base if base.name == digest else base / digest)

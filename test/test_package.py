@@ -157,3 +157,17 @@ def test_colcon_lists_builds_and_tests_the_package(source):
     counts = re.search(r"Summary: (\d+) tests, 0 errors, 0 failures", result)
     assert counts is not None, result
     assert int(counts[1]) > 50
+
+
+def test_commands_find_the_kernels_that_make_has_compiled(tmp_path):
+    made = Path(sys.prefix) / "numba-cache"
+    elsewhere = tmp_path / ".cache" / "ctr_dynamics"
+    show = "import os, ctr_dynamics; print(os.environ['NUMBA_CACHE_DIR'])"
+    for given, expected in (
+        ({}, made if os.access(made, os.W_OK) else elsewhere),
+        ({"NUMBA_CACHE_DIR": str(tmp_path / "given")}, tmp_path / "given"),
+    ):
+        env = {k: v for k, v in os.environ.items() if k not in ("NUMBA_CACHE_DIR", "XDG_CACHE_HOME")}
+        env.update(given, HOME=str(tmp_path))
+        where = subprocess.check_output([sys.executable, "-c", show], cwd=ROOT, env=env, text=True).strip()
+        assert Path(where).parent == expected
