@@ -24,7 +24,7 @@ from ctr_dynamics.snap.stability import StabilityWatch
 
 from .backbone import Backbone
 from .health import Health
-from .inputs import DT_NS, InputBuffer
+from .inputs import DT_NS, InputBuffer, seconds
 from .misfit import misfit_monitor
 from .modes import ModeTracker
 from .outputs import Innovation, SolverStats, StepOutput
@@ -216,7 +216,7 @@ class Estimator:
             return  # a long call without a gap: take every step
         newest = self.inputs.joints.stamps[-1]
         self.health.note(
-            "joints", "gap", f"{behind * DT_NS * 1e-9:.1f} s without joints; the model starts anew at rest"
+            "joints", "gap", f"{seconds(behind):.1f} s without joints; the model starts anew at rest"
         )
         self.health.restarts += 1
         self.k = (newest - self.t0_ns) // DT_NS - 1
@@ -314,9 +314,8 @@ class Estimator:
             if not result.ok:
                 changed = 0.0
                 self.health.failed(result.reason)
-                if (
-                    self.runs.alone_tips.last.stamp < again * DT_NS * 1e-9 - 1e-9
-                ):  # the model alone failed too
+                alone_s = self.runs.alone_tips.last.stamp
+                if alone_s < seconds(again) - 1e-9:  # the model alone failed too
                     self.runs.fused = None
                     break
             self._redo_s += 0.1 * (time.perf_counter() - begin - self._redo_s)
@@ -408,7 +407,7 @@ class Estimator:
         assert self.runs.fused is not None
         now = self.runs.fused.inputs
         self.health.stability = self._watch.update(
-            k * DT_NS * 1e-9, now.beta, now.alpha, now.force, now.torque, guess=self.runs.fused.unknowns[-1]
+            seconds(k), now.beta, now.alpha, now.force, now.torque, guess=self.runs.fused.unknowns[-1]
         )
 
     def snapshot(self) -> dict[str, Any]:

@@ -17,9 +17,10 @@ from .outputs import ERROR, OK, WARN, Status
 
 Floats = NDArray[np.float64]
 SNAP_WARNING_S = 1.0  # a snap that is nearer than this is warned of
-WAITING = "waiting for the first complete joint state"
-OF_SAMPLES = ("nis_count", "nis_sum", "nis_dof", "accepted", "rejected", "dropped", "_squares", "_compared")
 TRACKER_LIMIT_S = 1.0  # without a usable sample for longer than this the status says so
+WAITING = "waiting for the first complete joint state"
+# what is counted once a sample, though samples are fused again when a step is taken again
+OF_SAMPLES = ("nis_count", "nis_sum", "nis_dof", "accepted", "rejected", "dropped", "_squares", "_compared")
 
 
 @dataclass

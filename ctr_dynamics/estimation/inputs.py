@@ -27,6 +27,11 @@ AHEAD_NS = 10_000_000_000  # a pose that far after the newest joint state is on 
 WAITING_SAMPLES = 200  # poses kept until the first joint state
 
 
+def seconds(k: int) -> float:
+    """s from t0 of step ``k``; multiplied in this order everywhere, as another rounding moves what is read of inputs by 1 ns."""
+    return k * DT_NS * 1e-9
+
+
 @dataclass
 class Sample:
     """A tracker pose on its way into the filter; ``fused_k`` is the step after which it was used."""

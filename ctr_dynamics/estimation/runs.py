@@ -18,13 +18,13 @@ from ctr_dynamics.parameters import Settings, axes_mask
 from .actuation import Actuation, standing
 from .fusion import Fusion, FusionOptions
 from .health import Health
-from .inputs import DT_NS, InputBuffer, Sample
+from .inputs import DT_NS, InputBuffer, Sample, seconds
 from .outputs import Innovation, Moment
 from .tip import TipWindow
 from .tracker import registered, tracker_model
 
 Floats = NDArray[np.float64]
-DT = DT_NS * 1e-9
+DT = seconds(1)
 KEEP_EVERY = 8  # steps between kept states that late inputs return to
 
 
@@ -101,7 +101,7 @@ class Runs:
 
     def start(self, k: int) -> str:
         """Both runs at rest at step ``k``; returns the reason when there is no equilibrium."""
-        t = k * DT_NS * 1e-9
+        t = seconds(k)
         self._signals.clear()
         self.fusion.forget_parameters()
         try:
@@ -125,7 +125,7 @@ class Runs:
         """Both runs from step k - 1 to k, and every sample that has become due; with ``track`` the covariance is taken from there. Without
         ``keep`` the state is kept at every eighth step only."""
         assert self.fused is not None and self.alone is not None
-        before, t = (k - 1) * DT_NS * 1e-9, k * DT_NS * 1e-9
+        before, t = seconds(k - 1), seconds(k)
         self._signals.clear()
         f, a = self.fused, self.alone
         apart = (
@@ -180,7 +180,7 @@ class Runs:
         """Start the filter anew from the model alone at step ``k``: a correction has led the fused run astray."""
         assert self.alone is not None
         self.fused = self.alone.copy()
-        self.fusion.start(self.fused, k * DT_NS * 1e-9)
+        self.fusion.start(self.fused, seconds(k))
         self.health.restarts += 1
         self.keep(k)
 

@@ -7,8 +7,8 @@ difference: n is in the base frame here, as the paper prints it, so that (25) is
 State of a cross-section with ``m`` tubes (16 + 3m): p 0-2, quaternion h 3-6, q 7-9, omega 10-12, n 13-15, m_xy 16-17, m_z of the tubes,
 theta and gamma of tubes 2..m; q, omega and m are components in the frame of tube 1. Behind the plate every tube has (psi, psi_t, m_z).
 Fields, whose history enters (7 + 2N): q 0-2, omega 3-5, u of tube 1 6-8, u_z of tubes 2..N, gamma of tubes 2..N. ``par`` is the
-parameter block of :class:`ctr_dynamics.model.layout.Layout` and, last, the share of the derivative of R_z(theta_i)^T that omega_i,t holds (1 as
-derived, 0 as printed in (12) and (20)); ``ust`` (3N,) the precurvature in each tube's own frame, 1/m.
+parameter block of :class:`ctr_dynamics.model.layout.Layout` with one more row, ``TURNING``; ``ust`` (3N,) the precurvature in each tube's own
+frame, 1/m.
 """
 
 import numpy as np
@@ -24,6 +24,7 @@ EXCESS, INVERSE_SPEED, OVERLAP = (
     _FIRST[name] for name in ("stribeck_excess", "stribeck_inverse_speed", "overlap_friction")
 )
 TUBES = 14 + sum(size for _, size in EXTENDED)
+TURNING = -1  # share of the derivative of R_z(theta_i)^T that omega_i,t holds: 1 as derived, 0 as (12) and (20) are printed
 COMPLIANCE, INERTIA = (EXTENDED_TUBES.index(name) for name in ("drive_compliance", "drive_inertia"))
 
 
@@ -92,7 +93,7 @@ def slope(y, m, n, par, ust, hist, c0, out, w, f):
             f[Z + i] += rub
         ra += par[2 * n + i]
         ri += inertia
-        gyro += inertia * (oz + (1.0 + par[-1]) * gamma)
+        gyro += inertia * (oz + (1.0 + par[TURNING]) * gamma)
         mz += y[Z + i]
     a, b, c, d = y[3], y[4], y[5], y[6]
     k = 2.0 / (a * a + b * b + c * c + d * d)
@@ -223,8 +224,8 @@ def body(y, m, i, n, par, hist, c0, wrench):
         theta, g = y[17 + m + i], y[16 + 2 * m + i]
         co, s = np.cos(theta), np.sin(theta)
         ox, oy, oz = co * wx + s * wy, co * wy - s * wx, wz + g
-        tx = co * atx + s * aty + par[-1] * g * oy
-        ty = co * aty - s * atx - par[-1] * g * ox
+        tx = co * atx + s * aty + par[TURNING] * g * oy
+        ty = co * aty - s * atx - par[TURNING] * g * ox
         tz = atz + c0 * g + hist[7 + n + i]
         bx = hx * tx + (hz - hy) * oy * oz
         by = hy * ty + (hx - hz) * oz * ox

@@ -26,7 +26,7 @@ ABSENT = {
     "tip_spring",
 }
 EQUATIONS = {"derived": 1.0, "printed": 0.0}
-"""Share of the derivative of R_z(theta_i)^T in omega_i,t: (12) and (20) as printed leave it out (docs/model.md, *Gyroscopic term of (12)*)."""
+"""Share of each form, for row ``TURNING`` (docs/model.md, *Gyroscopic term of (12)*)."""
 OUTCOMES = {
     CONVERGED: "ok",
     1: "Newton's method did not converge",

@@ -198,7 +198,6 @@ def test_nothing_grows_when_the_estimator_fails(runs, case):
         # the opened loop leaves at most what the fading angle moves
         assert failed.swing_m(begin, begin + 0.2) < 1.05 * free.swing_m(begin, begin + 0.2) + 0.012
     assert np.abs(failed.delta).max() <= 0.15
-    # what grows reaches the limit of 0.15; a machine that holds the nodes up lets the last of it fade later
-    assert np.abs(failed.delta[failed.t > 4.5]).max() < 0.02
+    assert np.abs(failed.delta[failed.t > 4.5]).max() < 0.005
     if case == "outage":  # the loop is closed again and ends what is left
         assert failed.settled_s < free.settled_s
