@@ -8,55 +8,57 @@ from numpy.typing import NDArray
 from ctr_dynamics.model.model import Model
 from ctr_dynamics.model.simulator import Inputs
 
-from .signals import Signal
+from .inputs import InputBuffer
 
 Floats = NDArray[np.float64]
-_NO_LOAD = np.zeros(6)
+
+
+class Signals:
+    """Actuators and known load at the stages of a step; those of one step are kept, as both runs ask for them."""
+
+    def __init__(self, model: Model, inputs: InputBuffer) -> None:
+        self.n, self.count, self.inputs = model.n, model.input_count, inputs
+        self.clear()
+
+    def clear(self) -> None:
+        """Forget the step: other times or inputs come."""
+        self._known: dict[tuple[float, float], tuple[Floats, Floats]] = {}
+
+    def rows(self, times: Floats) -> tuple[Floats, Floats]:
+        """(stages, inputs) rows as :func:`ctr_dynamics.model.simulator.stage_inputs` orders them at ``times`` (stages,) s from t0, and beta's
+        rate (N,) m/s at the last."""
+        key = (float(times[0]), float(times[-1]))
+        if key not in self._known:
+            self._known[key] = self._at(times.tolist())
+        return self._known[key]
+
+    def _at(self, times: list[float]) -> tuple[Floats, Floats]:
+        n, inputs = self.n, self.inputs
+        assert inputs.t0_ns is not None
+        stamps = [inputs.t0_ns + round(t * 1e9) for t in times]
+        value, rate = inputs.joints.rows(stamps, inputs.timeout_ns if inputs.predicting else 0)
+        rows = np.zeros((len(times), self.count))
+        rows[:, :n], rows[:, n : 2 * n], rows[:, 2 * n : 3 * n] = value[:, :n], rate[:, :n], value[:, n:]
+        if inputs.load.stamps:
+            rows[:, 3 * n : 3 * n + 6] = inputs.load.rows(stamps)[0]
+        rows[:, 3 * n + 6 :] = rate[:, n : self.count - 2 * n - 6]
+        return rows, rate[-1, n:]
 
 
 class Actuation:
-    """Input signals with the corrections ``shift`` (inputs,) of one run, for the simulator.
+    """The ``signals`` with the corrections ``shift`` (inputs,) of one run, for the simulator."""
 
-    ``known`` keeps the bare signals of one step, which both runs share.
-    """
-
-    def __init__(
-        self,
-        model: Model,
-        t0_ns: int,
-        joints: Signal,
-        load: Signal,
-        extrapolate_ns: int,
-        shift: Floats,
-        known: dict,
-    ) -> None:
-        self.n, self.count, self.t0_ns, self.joints, self.load = (
-            model.n,
-            model.input_count,
-            t0_ns,
-            joints,
-            load,
-        )
-        self.extrapolate_ns, self.shift, self.known = extrapolate_ns, shift, known
+    def __init__(self, signals: Signals, shift: Floats) -> None:
+        self.signals, self.shift = signals, shift
 
     def __call__(self, t: float) -> Inputs:
         return self.stages(np.array([t]))[1]
 
     def stages(self, times: Floats) -> tuple[Floats, Inputs]:
         """Inputs at all stages of a step; see :func:`ctr_dynamics.model.simulator.stage_inputs`."""
-        n = self.n
-        key = (float(times[0]), float(times[-1]))
-        if key not in self.known:
-            parts: list[Floats] = []
-            for t in times.tolist():
-                time_ns = self.t0_ns + round(t * 1e9)
-                value, rate = self.joints.at(time_ns, self.extrapolate_ns)
-                load = self.load.at(time_ns)[0] if self.load.stamps else _NO_LOAD
-                parts += [value[:n], rate[:n], value[n:], load, rate[n : self.count - 2 * n - 6]]
-            self.known[key] = np.concatenate(parts).reshape(len(times), self.count), rate[n:]
-        bare, beta_rate = self.known[key]
+        bare, beta_rate = self.signals.rows(times)
         rows = bare + self.shift
-        last = rows[-1]
+        n, last = self.signals.n, rows[-1]
         return rows, Inputs(
             last[:n],
             last[n : 2 * n],

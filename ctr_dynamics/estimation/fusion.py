@@ -44,7 +44,7 @@ class FusionOptions:
     adaptation: float = 0.1
     force_time: float = 0.3
     window: float = 0.2
-    reduce_every: int = 8
+    reduce_between: tuple[int, int] = (6, 12)
 
 
 @dataclass(frozen=True)
@@ -106,6 +106,7 @@ class Fusion:
         self.inserted = 0.0  # share of beta's rate that the model's velocities hold already
         self.force_sigma = options.force_sigma
         self._refused = False
+        self._corrected = False  # by a sample, since the columns were reduced
         self._skipped = False  # whether the columns have not followed the last step
         self._followed: Key = ((), ())  # sections of the last step that they have
         self._filters: dict[tuple[int, int], ExtendedKalmanFilter] = {}
@@ -133,7 +134,7 @@ class Fusion:
         for axis, size in enumerate(scale):
             i = force.start + axis
             self.pi[i, i] = (self.options.force_sigma / size) ** 2
-        self._refused = self._skipped = False
+        self._refused = self._corrected = self._skipped = False
         self._followed = state.key
         self.force_sigma = self.options.force_sigma
         self.tips.clear(r)
@@ -160,8 +161,8 @@ class Fusion:
         self.theta[force] *= decay
         self.columns.theta[force] *= decay
         self._apply_theta()
-        every = self.options.reduce_every
-        reduce = self.unreduced >= (2 * every if sampled else every)
+        fewest, most = self.options.reduce_between
+        reduce = self.unreduced >= (2 * most if sampled else fewest if self._corrected else most)
         key = result.records[0].key
         follow = self._skipped or sampled or reduce or key != self._followed or len(result.records) > 1
         ok = True
@@ -232,7 +233,7 @@ class Fusion:
         self.pi = pi
         c.transform(T)
         self.tips.transform(T)
-        self.unreduced = 0
+        self.unreduced, self._corrected = 0, False
 
     def forget_parameters(self) -> None:
         """Have the parameters of the robot file again."""
@@ -266,7 +267,7 @@ class Fusion:
             compared = replace(
                 compared, reason="outside the gate twice in a row: fused with a widened covariance"
             )
-        self._refused = False
+        self._refused, self._corrected = False, True
         size = len(self.pi)
         if (size, dof) not in self._filters:
             self._filters[size, dof] = ExtendedKalmanFilter(dim_x=size, dim_z=dof)
@@ -371,7 +372,7 @@ class Fusion:
         """The filter's part of a state to which :meth:`restore` can return."""
         return (
             self.theta.copy(), self.bias.copy(), self.pi.copy(), self.unreduced, self.force_sigma,
-            (self._refused, self._skipped, self._followed), self.columns.snapshot(), self.tips.snapshot(),
+            (self._refused, self._corrected, self._skipped, self._followed), self.columns.snapshot(), self.tips.snapshot(),
         )  # fmt: skip
 
     def restore(self, snapshot: tuple) -> None:
@@ -382,7 +383,7 @@ class Fusion:
     def _restore(self, snapshot: tuple) -> None:
         """All but the tips."""
         theta, bias, pi, self.unreduced, self.force_sigma, course, columns, _ = snapshot
-        self._refused, self._skipped, self._followed = course
+        self._refused, self._corrected, self._skipped, self._followed = course
         self.theta, self.bias, self.pi = theta.copy(), bias.copy(), pi.copy()
         self.columns.restore(columns)
         self._apply_theta()

@@ -13,6 +13,17 @@ from_vector, to_vector = map(_compile, (rotations.from_vector, rotations.to_vect
 
 
 @_compile
+def between_samples(before, after, begin_ns, end_ns, times_ns, values, rates):
+    """Line from ``before`` (size,) at ``begin_ns`` to ``after`` at ``end_ns``: its ``values`` (times, size) and ``rates`` (times, size), 1/s, at
+    ``times_ns`` (times,)."""
+    for i in range(len(before)):
+        rate = (after[i] - before[i]) * (1e9 / (end_ns - begin_ns))
+        for k in range(len(times_ns)):
+            values[k, i] = before[i] + rate * ((times_ns[k] - begin_ns) * 1e-9)
+            rates[k, i] = rate
+
+
+@_compile
 def tip_rows(node, dnode, insertion_rate, mean, columns):
     """Tip from the last node's state (S,) and its columns (S, r): ``mean`` (13,) position, quaternion, velocity, rate; ``columns`` (12, r)."""
     w, x, y, z = node[3], node[4], node[5], node[6]

@@ -15,7 +15,7 @@ from ctr_dynamics.model.scheme import make_scheme
 from ctr_dynamics.model.simulator import Simulator, State, StepResult
 from ctr_dynamics.parameters import Settings, axes_mask
 
-from .actuation import Actuation, standing
+from .actuation import Actuation, Signals, standing
 from .fusion import Fusion, FusionOptions
 from .health import Health
 from .inputs import DT_NS, InputBuffer, Sample, seconds
@@ -82,6 +82,9 @@ class Runs:
             for i in range(model.n)
             if f"encoder_offset.tube{i + 1}" in names
         ]
+        self._signals = Signals(model, inputs)
+        self._load = np.zeros(model.input_count)  # of the robot file
+        self._load[3 * model.n : 3 * model.n + 3] = model.setup.tip_force
         if model.extended:
             self.fusion.inserted = float(model.setup.block[model.layout["insertion"]][0])
         self.clear()
@@ -95,7 +98,7 @@ class Runs:
         self.kept: deque[Kept] = deque()
         self.innovations: list[Innovation] = []
         self.sampled_ns: int | None = None
-        self._signals: dict[tuple[float, float], tuple[Floats, Floats]] = {}  # of one step
+        self._signals.clear()
 
     # -- steps --
 
@@ -163,18 +166,13 @@ class Runs:
 
     def _actuation(self, corrected: bool) -> Actuation:
         """Actuators and load at a time (s from t0), with the estimated offsets and force for the fused run."""
-        inputs, n = self.inputs, self.model.n
-        assert inputs.t0_ns is not None
-        shift = np.zeros(self.model.input_count)
-        shift[3 * n : 3 * n + 3] = self.model.setup.tip_force
-        if corrected:
-            for i, row in self._offset_rows:
-                shift[i] += self.fusion.theta[row]
-            shift[3 * n : 3 * n + 3] += self.fusion.force
-        extrapolate = inputs.timeout_ns if inputs.predicting else 0
-        return Actuation(
-            self.model, inputs.t0_ns, inputs.joints, inputs.load, extrapolate, shift, self._signals
-        )
+        if not corrected:
+            return Actuation(self._signals, self._load)
+        shift, n = self._load.copy(), self.model.n
+        for i, row in self._offset_rows:
+            shift[i] += self.fusion.theta[row]
+        shift[3 * n : 3 * n + 3] += self.fusion.force
+        return Actuation(self._signals, shift)
 
     def _start_filter(self, k: int) -> None:
         """Start the filter anew from the model alone at step ``k``: a correction has led the fused run astray."""

@@ -12,6 +12,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from .kernels import between_samples
+
 Floats = NDArray[np.float64]
 
 
@@ -66,6 +68,17 @@ class Signal:
         if ahead > extrapolate_ns:
             return values[-1] + rate * (extrapolate_ns * 1e-9), np.zeros(self.size)
         return values[-1] + rate * (ahead * 1e-9), rate
+
+    def rows(self, times_ns: list[int], extrapolate_ns: int = 0) -> tuple[Floats, Floats]:
+        """Values and rates (times, size) at increasing times; see :meth:`at`."""
+        stamps, values = self.stamps, self.values
+        i = bisect.bisect_left(stamps, times_ns[0])
+        if 0 < i < len(stamps) and times_ns[-1] <= stamps[i]:  # all between the same two samples
+            found, rates = np.empty((2, len(times_ns), self.size))
+            between_samples(values[i - 1], values[i], stamps[i - 1], stamps[i], np.array(times_ns), found, rates)
+            return found, rates
+        pairs = [self.at(t, extrapolate_ns) for t in times_ns]
+        return np.array([value for value, _ in pairs]), np.array([rate for _, rate in pairs])
 
     def bends(self, after_ns: float, until_ns: float, least: Floats) -> list[int]:
         """Stamps between two times at which the rate changes by more than ``least`` (size,), 1/s, in some component."""
@@ -124,6 +137,16 @@ class Drives(Signal):
         alpha, alpha_rate = super().at(time_ns - self.delay_ns, extrapolate_ns)
         n = self.n
         return np.concatenate([alpha[:n], value[n:]]), np.concatenate([alpha_rate[:n], rate[n:]])
+
+    def rows(self, times_ns: list[int], extrapolate_ns: int = 0) -> tuple[Floats, Floats]:
+        """Actuators and their rates at increasing times; see :meth:`Signal.rows`."""
+        value, rate = super().rows(times_ns, extrapolate_ns)
+        if self.delay_ns:
+            delayed = [t - self.delay_ns for t in times_ns]
+            n = self.n
+            alpha, alpha_rate = super().rows(delayed, extrapolate_ns)
+            value[:, :n], rate[:, :n] = alpha[:, :n], alpha_rate[:, :n]
+        return value, rate
 
     @property
     def known_until(self) -> int:
