@@ -131,9 +131,9 @@ class Estimator:
         return stamp <= now_ns if inputs.predicting else stamp <= now_ns - inputs.timeout_ns
 
     def advance(
-        self, now_ns: int | None = None, spare_s: Callable[[], float] | None = None
+        self, now_ns: int | None = None, spare_s: Callable[[], float] | None = None, most: int | None = None
     ) -> list[StepOutput]:
-        """Take every step that is due. ``now_ns``: time on the stamps' clock; None takes only steps that the joints cover.
+        """Take every step that is due, or ``most`` of them. ``now_ns``: time on the stamps' clock; None takes only steps that the joints cover.
 
         ``spare_s``: tells the time (s) until the next step falls due. Given it, a correction by late inputs goes only as far as there is time;
         steps on time are then taken on the course that is not yet corrected, and later calls go on with the correction.
@@ -145,7 +145,7 @@ class Estimator:
         outputs: list[StepOutput] = []
         if self.correcting and not self._due(self.k + 1, now_ns):
             self._go_back(spare_s)  # now, while nothing waits for it
-        while self._due(self.k + 1, now_ns):
+        while self._due(self.k + 1, now_ns) and (most is None or len(outputs) < most):
             begin = time.perf_counter()
             if self._return_to is not None and (spare_s is None or not self._may_wait()):
                 self._go_back(spare_s)

@@ -45,7 +45,7 @@ class Steps(Protocol):
     @property
     def correcting(self) -> bool: ...
     def advance(
-        self, now_ns: int | None = None, spare_s: Callable[[], float] | None = None
+        self, now_ns: int | None = None, spare_s: Callable[[], float] | None = None, most: int | None = None
     ) -> Sequence[Any]: ...
     def use_pause(self) -> None: ...
     def reset(self) -> None: ...
@@ -252,11 +252,12 @@ class StepLoop(threading.Thread):
         """Take what is due, and correct what inputs have changed while there is time."""
         if self._gathering_ns() > 0:
             return
+        predicting = self.timing.policy == "predict"
         for _ in range(SLICE_STEPS):
             until_ns, more = self._until(self._now_ns())
             corrects = self.estimator.correcting
             begin = time.perf_counter_ns()
-            steps = self.estimator.advance(until_ns, self._spare_s)
+            steps = self.estimator.advance(until_ns, self._spare_s, None if predicting else 1)
             spent_ns = time.perf_counter_ns() - begin
             if steps:
                 self._took_steps = True
@@ -305,7 +306,7 @@ class StepLoop(threading.Thread):
             return now_ns, False
         if self.timing.policy == "predict" and now_ns >= next_ns + STEP_NS:
             return next_ns, True  # one by one, so that each is out as soon as it can be
-        return now_ns, False
+        return now_ns, self.timing.policy != "predict"  # an input covers several
 
     def _sleep(self) -> None:
         if self._stopping or self._wake.is_set():

@@ -31,7 +31,7 @@ class Scripted:
     def use_pause(self):
         self.pauses += 1
 
-    def advance(self, now_ns=None, spare_s=None):
+    def advance(self, now_ns=None, spare_s=None, most=None):
         self.asked.append(now_ns)
         self.spare_s = spare_s()
         if self.fault is not None:
@@ -39,6 +39,8 @@ class Scripted:
             raise fault
         steps = []
         while self.t0_ns is not None and now_ns is not None and self.t0_ns + self.k * STEP_NS <= now_ns:
+            if len(steps) == most:
+                break
             steps.append(SimpleNamespace(k=self.k, stamp_ns=self.t0_ns + self.k * STEP_NS))
             self.k += 1
         return steps
