@@ -39,11 +39,9 @@ class Backbone:
         s, points = self._nodes[key]
         rows = np.empty((len(state.nodes), 15), np.float32)
         inserted = self.fusion.inserted
-        c = self.fusion.columns
-        r = c.theta.shape[1]
         backbone_rows(
             s, state.nodes, state.fields, points, self.model.n, float(state.inputs.beta_rate[0]) * (1.0 - inserted), turn, shift,
-            c.position_deviation(self.fusion.pi[:r, :r]), rows,
+            self.fusion.columns.position_deviation(self.fusion.pi), rows,
         )  # fmt: skip
         rates = state.inputs.beta_rate
         if inserted and np.any(rates):

@@ -88,6 +88,9 @@ class Columns:
         self.key: Key = ((), ())
         self.mesh: Mesh | None = None
         self.beta = np.zeros(model.n)
+        self._deviation: tuple[Floats, Floats, Floats] | None = (
+            None  # columns, their covariance, and what they give
+        )
         self._lent = False  # whether a snapshot holds `stored`
 
     def start(self, key: tuple, mesh: Mesh, beta: Floats, alpha: Floats, par: Floats, x: Floats) -> Floats:
@@ -200,9 +203,14 @@ class Columns:
         return change if self.transfer is None else self.transfer.nodes @ change
 
     def position_deviation(self, pi: Floats) -> Floats:
-        """(nodes,) deviation of the position per axis in m at the model's nodes, coefficients' covariance ``pi`` (r, r)."""
-        deviation = position_deviations(self.dnodes, 16 + 3 * self.model.n, pi)
-        return deviation if self.transfer is None else carried(self.transfer.nodes, deviation)
+        """(nodes,) deviation of the position per axis in m at the model's nodes, coefficients' covariance ``pi`` (r, r) or more. Kept while neither
+        the columns nor ``pi`` are other arrays."""
+        if self._deviation is None or self._deviation[0] is not self.dnodes or self._deviation[1] is not pi:
+            deviation = position_deviations(self.dnodes, 16 + 3 * self.model.n, pi)
+            if self.transfer is not None:
+                deviation = carried(self.transfer.nodes, deviation)
+            self._deviation = self.dnodes, pi, deviation
+        return self._deviation[2]
 
     def transform(self, T: Floats) -> None:
         """Replace the columns V by V T; those that ``theta`` alone has move no field yet."""

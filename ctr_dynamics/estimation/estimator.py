@@ -386,7 +386,7 @@ class Estimator:
         variance = self.fusion.force_variance()
         alone = self.runs.alone_tips.last
         predicted_q = alone.quaternion.copy()
-        if not (tip.finite and math.isfinite(float(alone.position.sum() + variance.sum()))):
+        if not (tip.finite and math.isfinite(sum(alone.position.tolist()) + sum(variance.tolist()))):
             self.runs.fused = None
             self.health.failed("not finite")
             self.health.restarts += 1

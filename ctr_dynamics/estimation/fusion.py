@@ -44,7 +44,7 @@ class FusionOptions:
     adaptation: float = 0.1
     force_time: float = 0.3
     window: float = 0.2
-    reduce_between: tuple[int, int] = (6, 12)
+    reduce_between: tuple[int, int] = (6, 12)  # steps: fewest behind a correction, most without one
 
 
 @dataclass(frozen=True)
@@ -151,8 +151,9 @@ class Fusion:
         """Steps (1)-(3) after the simulator took a step to ``stamp`` (s). False where the tangent does not exist; the columns then stay.
 
         The columns follow every second step, and every one after which a sample is fused (``sampled``) or they are reduced: they change little
-        within 3 ms. The tip of a step that they skipped gets those of its neighbours. They are reduced every eighth step, but after one without
-        a sample, so that no step does all the work.
+        within 3 ms. The tip of a step that they skipped gets those of its neighbours. They are reduced, and the force's new randomness is taken
+        in, behind a corrected step: randomness taken in just before a sample has moved nothing yet that the sample could show. At the latest
+        they are after ``reduce_between[1]`` steps, but not together with a sample, so that no step does all the work.
         """
         dt = self.simulator.scheme.dt
         self.unreduced += 1

@@ -208,7 +208,7 @@ def spreads(rows, pi):
 
 @_compile
 def position_deviations(dnodes, size, pi):
-    """(nodes,) deviation of the position per axis in m: root of a third of the trace of its covariance under ``pi`` (r, r).
+    """(nodes,) deviation of the position per axis in m: root of a third of the trace of its covariance under ``pi`` (at least r, r).
 
     ``dnodes`` (nodes * size, r): columns of the node states, position first.
     """

@@ -255,6 +255,7 @@ class ModeTracker:
             elif isinstance(part, ModalBasis):
                 assert self._own is not None
                 readout = part.readout if self._transfer is None else part.readout @ self._transfer.restrict
+                readout = np.ascontiguousarray(readout)  # read in every step
                 self._basis, self._pending = replace(part, readout=readout, rest=self._own.fields), None
         elif self._age > self.every:
             self._age = 0

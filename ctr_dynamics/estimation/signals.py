@@ -75,9 +75,11 @@ class Signal:
         i = bisect.bisect_left(stamps, times_ns[0])
         if 0 < i < len(stamps) and times_ns[-1] <= stamps[i]:  # all between the same two samples
             found, rates = np.empty((2, len(times_ns), self.size))
-            between_samples(values[i - 1], values[i], stamps[i - 1], stamps[i], np.array(times_ns), found, rates)
+            between_samples(
+                values[i - 1], values[i], stamps[i - 1], stamps[i], np.array(times_ns), found, rates
+            )
             return found, rates
-        pairs = [self.at(t, extrapolate_ns) for t in times_ns]
+        pairs = [Signal.at(self, t, extrapolate_ns) for t in times_ns]  # not a delayed one
         return np.array([value for value, _ in pairs]), np.array([rate for _, rate in pairs])
 
     def bends(self, after_ns: float, until_ns: float, least: Floats) -> list[int]:

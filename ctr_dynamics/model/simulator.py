@@ -270,7 +270,7 @@ class Simulator:
     ) -> StepResult:
         n, stages = self.model.n, scheme.stages
         inputs, last = stage_inputs(self.model, inputs_at, t + scheme.times * scheme.dt)
-        if not math.isfinite(float(inputs.sum())):
+        if not math.isfinite(np.vdot(inputs, inputs)):
             return StepResult(False, "actuators or load hold a number that is not finite", 0, 0, 0)
         bank, mesh = state.bank, state.mesh
         try:

@@ -5,7 +5,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from estimation_cases import BAGS, Message, check_outputs, play, rms, truth_error
+from estimation_cases import (
+    BAGS,
+    Message,
+    bag_messages,
+    check_outputs,
+    estimator,
+    play,
+    rms,
+    truth_error,
+)
 
 from ctr_dynamics.estimation.rotations import conjugate, from_vector, matrix, multiply
 from ctr_dynamics.estimation.tip import Tip
@@ -229,3 +238,14 @@ def test_snapshot_is_plain_data_with_named_parameters(plain):
     young = snapshot["parameters"]["youngs_modulus.tube1"]
     assert abs(young["value"]) < 0.02
     assert 0 < young["sigma"] <= 0.0041
+
+
+def test_outputs_keep_the_force_of_their_own_step():
+    made = estimator()
+    seen = []
+    for message in bag_messages("payload_protocol", 0.6):
+        message.give(made)
+        for out in made.advance(None):
+            seen.append((out, out.disturbance_force.copy()))
+    assert len({force.tobytes() for _, force in seen}) > 10
+    assert all(np.array_equal(out.disturbance_force, force) for out, force in seen)

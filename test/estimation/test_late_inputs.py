@@ -233,3 +233,14 @@ def test_predict_takes_a_step_on_time(sweep):
     sweep[0].give(made)
     start = 1_700_000_000_000_000_000
     assert [out.k for out in made.advance(start + 9_500_000)] == [0, 1, 2, 3]
+
+
+def test_no_more_steps_are_taken_at_once_than_asked_for(sweep):
+    made = estimator()
+    for message in sweep[:40]:
+        message.give(made)
+    first = made.advance(None, None, 2)
+    assert [out.k for out in first] == [0, 1]
+    rest = made.advance(None)
+    assert [out.k for out in rest] == list(range(2, 2 + len(rest)))
+    assert len(rest) > 10

@@ -295,3 +295,16 @@ def test_histogram_quantiles_are_upper_edges_and_the_maximum_is_exact():
     assert histogram.quantile(0.8) == pytest.approx(40e-6)
     assert histogram.quantile(1.0) == pytest.approx(12345e-6)
     assert histogram.summary()["max"] == round(12345e-6, 4)
+
+
+def test_under_wait_every_step_is_out_before_the_next_is_taken(clock):
+    estimator = Scripted(t0_ns=clock.now - 5 * STEP_NS)
+    taken = []
+
+    def publish(step):
+        taken.append((step.k, estimator.k))
+        return True
+
+    loop, _, _ = make_loop(estimator, clock, policy="wait", publish=publish)
+    loop._round()
+    assert taken == [(k, k + 1) for k in range(6)]
