@@ -28,9 +28,9 @@ from .uncertainty import bias_sigma, model_uncertainty
 
 Floats = NDArray[np.float64]
 
-PLAUSIBLE = (
-    8.0  # prior deviations that a parameter may move: what lies beyond is another effect, not this parameter
-)
+
+VAGUE = 1.0  # m^2 and rad^2: a covariance is not widened beyond
+DRIVEN = 4.0  # times its least: with a stronger drive of the tip force the columns follow every step
 
 
 @dataclass(frozen=True)
@@ -151,9 +151,10 @@ class Fusion:
         """Steps (1)-(3) after the simulator took a step to ``stamp`` (s). False where the tangent does not exist; the columns then stay.
 
         The columns follow every second step, and every one after which a sample is fused (``sampled``) or they are reduced: they change little
-        within 3 ms. The tip of a step that they skipped gets those of its neighbours. They are reduced, and the force's new randomness is taken
-        in, behind a corrected step: randomness taken in just before a sample has moved nothing yet that the sample could show. At the latest
-        they are after ``reduce_between[1]`` steps, but not together with a sample, so that no step does all the work.
+        within 3 ms. The tip of a step that they skipped gets those of its neighbours. With a strong drive of the tip force they follow every
+        step. They are reduced, and the force's new randomness is taken in, behind a corrected step: randomness taken in just before a sample has
+        moved nothing yet that the sample could show. At the latest they are after ``reduce_between[1]`` steps, but not together with a sample,
+        so that no step does all the work.
         """
         dt = self.simulator.scheme.dt
         self.unreduced += 1
@@ -165,7 +166,10 @@ class Fusion:
         fewest, most = self.options.reduce_between
         reduce = self.unreduced >= (2 * most if sampled else fewest if self._corrected else most)
         key = result.records[0].key
-        follow = self._skipped or sampled or reduce or key != self._followed or len(result.records) > 1
+        driven = self.force_sigma > DRIVEN * self.options.force_sigma
+        follow = (
+            driven or self._skipped or sampled or reduce or key != self._followed or len(result.records) > 1
+        )
         ok = True
         if follow:
             ok = self.columns.propagate(
@@ -323,7 +327,8 @@ class Fusion:
             self.pi[:r, :r] *= 2.0
             self.pi[:r, r:] *= math.sqrt(2.0)
             self.pi[r:, :r] *= math.sqrt(2.0)
-            if nu @ np.linalg.solve(H @ self.pi @ H.T + R, nu) < 0.5 * limit:
+            S = H @ self.pi @ H.T + R
+            if S.diagonal().max() > VAGUE or nu @ np.linalg.solve(S, nu) < 0.5 * limit:
                 return
 
     def _adapt(self, ratio: float) -> None:
@@ -332,15 +337,33 @@ class Fusion:
         size = self.force_sigma * math.exp(o.adaptation * (min(ratio, 10.0) - 1.0))
         self.force_sigma = min(max(size, o.force_sigma), o.force_sigma_max)
 
+    def _confined(self, x: Floats) -> Floats:
+        """The correction ``x`` (r + 13,), moved along the covariance where a parameter would leave its range: all else then takes the most likely
+        values beside that parameter at the range's end (Simon 2010, projection of the estimate)."""
+        u, rows = self.uncertainty, self.columns.theta
+        r = rows.shape[1]
+        for _ in range(len(u.names)):
+            theta = self.theta + rows @ x[:r]
+            beyond = np.clip(theta, u.lowest, u.highest) - theta
+            if not beyond.any():
+                break
+            i = int(np.argmax(np.abs(beyond) / np.maximum(u.sigma, 1e-300)))
+            gain = self.pi[:, :r] @ rows[i]
+            variance = float(rows[i] @ gain[:r])
+            if variance <= 1e-12 * u.sigma[i] ** 2:
+                break
+            x = x + gain * (beyond[i] / variance)
+        return x
+
     def _correct(self, state: State, x: Floats) -> None:
         """Step (7)."""
         c = self.columns
         r = c.theta.shape[1]
+        x = self._confined(x)
         a = x[:r]
         self.bias += x[r:]
         self.theta += c.theta @ a
-        limit = np.where(self.uncertainty.sigma > 0, PLAUSIBLE * self.uncertainty.sigma, np.inf)
-        np.clip(self.theta, -limit, limit, out=self.theta)
+        np.clip(self.theta, self.uncertainty.lowest, self.uncertainty.highest, out=self.theta)
         self._apply_theta()
         state.bank[:2] += c.fields_change(a)
         shift = c.dx @ a

@@ -15,6 +15,9 @@ from ctr_dynamics.robot import Robot
 
 FORCE = ("tip_force.x", "tip_force.y", "tip_force.z")
 
+# Ranges that a robot can have: of relative changes of a quantity, from a tenth of it to ten times, and of angles in rad.
+RELATIVE, ANGLE = (-0.9, 9.0), (-0.5, 0.5)
+
 # Tracker states: name and number of axes, in their order in the filter.
 BIASES = (
     ("registration_rotation", 3),
@@ -33,11 +36,14 @@ class ModelUncertainty:
         names: (n_theta,) names; the last three are the tip force's axes.
         sigma: (n_theta,) prior deviations; 0 for the tip force, which the filter drives itself.
         effect: (NP, n_theta) derivative of the parameter block.
+        lowest, highest: (n_theta,) range that a robot can have; without ends for the tip force.
     """
 
     names: tuple[str, ...]
     sigma: np.ndarray
     effect: np.ndarray
+    lowest: np.ndarray
+    highest: np.ndarray
 
     @property
     def force(self) -> slice:
@@ -52,12 +58,14 @@ def model_uncertainty(model: Model) -> ModelUncertainty:
     names: list[str] = []
     sigma: list[float] = []
     effect: list[np.ndarray] = []
+    ranges: list[tuple[float, float]] = []
 
-    def add(name: str, deviation: float, column: np.ndarray) -> None:
+    def add(name: str, deviation: float, column: np.ndarray, between: tuple[float, float] = RELATIVE) -> None:
         if deviation > 0.0 and np.any(column):
             names.append(name)
             sigma.append(deviation)
             effect.append(column)
+            ranges.append(between)
 
     def scaled(*groups: tuple[str, int]) -> np.ndarray:
         column = np.zeros(layout.size)
@@ -78,7 +86,9 @@ def model_uncertainty(model: Model) -> ModelUncertainty:
         if tube.end_body:
             column = np.zeros(layout.size)
             column[layout["body_mass"].start + i] = 1.0
-            add(f"payload_mass.tube{i + 1}", tube.end_body.mass.tolerance, column)
+            mass = tube.end_body.mass
+            least, most = (share * mass.value for share in RELATIVE)
+            add(f"payload_mass.tube{i + 1}", mass.tolerance, column, (least, most))
     # densities of one alloy vary together: one scale for all tubes
     groups = [(group, i) for i in range(n) for group in ("mass_per_length", "inertia_per_length")]
     add("density", max(tube.density.relative for tube in robot.tubes), scaled(*groups))
@@ -95,18 +105,20 @@ def model_uncertainty(model: Model) -> ModelUncertainty:
         for axis, direction in zip("12", across, strict=True):
             column = np.zeros(layout.size)
             column[layout["gravity"]] = np.cross(direction, g)
-            add(f"gravity_direction.{axis}", robot.gravity.direction_tolerance, column)
+            add(f"gravity_direction.{axis}", robot.gravity.direction_tolerance, column, ANGLE)
     for i in range(n):
         column = np.zeros(layout.size)
         column[layout["alpha"].start + i] = 1.0
-        add(f"encoder_offset.tube{i + 1}", robot.encoders.offset.tolerance, column)
+        add(f"encoder_offset.tube{i + 1}", robot.encoders.offset.tolerance, column, ANGLE)
     for number, name in enumerate(FORCE):
         column = np.zeros(layout.size)
         column[layout["force"].start + number] = 1.0
         names.append(name)
         sigma.append(0.0)
         effect.append(column)
-    return ModelUncertainty(tuple(names), np.array(sigma), np.array(effect).T)
+        ranges.append((-np.inf, np.inf))
+    lowest, highest = np.array(ranges).T
+    return ModelUncertainty(tuple(names), np.array(sigma), np.array(effect).T, lowest, highest)
 
 
 def bias_sigma(robot: Robot) -> np.ndarray:

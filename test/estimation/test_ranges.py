@@ -1,0 +1,93 @@
+"""Parameters that the filter finds: far from the robot file's values where the data say so, and never where no robot can be."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from estimation_cases import bag_messages, estimator, play, rms, truth_error
+
+from ctr_dynamics.estimation.uncertainty import model_uncertainty
+
+
+@pytest.fixture
+def fusion():
+    """The filter of a clean bag after half a second, which knows of parameters and tracker states together."""
+    return play(bag_messages("clean_sweep", 0.5)).estimator.fusion
+
+
+def parameter(fusion, name):
+    return fusion.uncertainty.names.index(name)
+
+
+def nearest(covariance, row, value):
+    """The x nearest to 0 in the norm of the inverse ``covariance`` with row x = value, by the conditions of Karush, Kuhn and Tucker."""
+    size = len(row)
+    system = np.zeros((size + 1, size + 1))
+    system[:size, :size] = np.linalg.inv(covariance)
+    system[:size, size] = system[size, :size] = row
+    return np.linalg.solve(system, np.append(np.zeros(size), value))[:size]
+
+
+def test_a_parameter_at_the_end_of_its_range_takes_the_rest_along(fusion):
+    u, rows = fusion.uncertainty, fusion.columns.theta
+    r = rows.shape[1]
+    i = parameter(fusion, "base_viscous")
+    gain = fusion.pi[:, :r] @ rows[i]
+    x = gain * (-3.0 / (rows[i] @ gain[:r]))  # three times less than nothing
+    assert (fusion.theta + rows @ x[:r])[i] < u.lowest[i] - 1.0
+    kept = fusion._confined(x)
+    theta = fusion.theta + rows @ kept[:r]
+    assert theta[i] == pytest.approx(u.lowest[i], abs=1e-9)
+    row = np.append(rows[i], np.zeros(len(x) - r))
+    wanted = x + nearest(fusion.pi, row, u.lowest[i] - fusion.theta[i] - rows[i] @ x[:r])
+    np.testing.assert_allclose(kept, wanted, atol=1e-6 * np.abs(wanted).max())
+    assert np.all(theta >= u.lowest - 1e-9)
+    assert np.all(theta <= u.highest + 1e-9)
+
+
+def test_corrections_inside_the_ranges_are_left_alone(fusion):
+    x = 0.1 * np.ones(len(fusion.pi))
+    np.testing.assert_array_equal(fusion._confined(x), x)
+
+
+def test_ranges_are_those_of_a_robot(fusion):
+    u = model_uncertainty(fusion.model)
+    at = dict(zip(u.names, zip(u.lowest, u.highest, strict=True), strict=True))
+    mass = fusion.model.robot.tubes[0].end_body.mass.value
+    assert at["youngs_modulus.tube1"] == (-0.9, 9.0)
+    assert at["payload_mass.tube1"] == pytest.approx((-0.9 * mass, 9.0 * mass))
+    assert at["encoder_offset.tube2"] == (-0.5, 0.5)
+    assert at["tip_force.x"] == (-np.inf, np.inf)
+    for end in (u.lowest, u.highest):
+        finite = np.where(np.isfinite(end), end, 0.0)
+        for name in (
+            "bending_stiffness",
+            "torsional_stiffness",
+            "body_mass",
+            "base_viscous",
+            "mass_per_length",
+        ):
+            rows = fusion.model.layout[name]
+            assert np.all((fusion.nominal + u.effect @ finite)[rows] >= 0.0), name
+
+
+def test_an_encoder_that_is_twenty_deviations_off_is_found():
+    off = 0.035
+    messages = []
+    for m in bag_messages("clean_sweep", 6.0):
+        if m.kind == "joints":
+            names, values = m.content
+            shown = [v - off * (name == "tube2_rotation") for name, v in zip(names, values, strict=True)]
+            m = replace(m, content=(names, shown))
+        messages.append(m)
+    run = play(messages)
+    fusion = run.estimator.fusion
+    i = parameter(fusion, "encoder_offset.tube2")
+    assert off > 19 * fusion.uncertainty.sigma[i]
+    assert fusion.theta[i] == pytest.approx(off, abs=0.2 * off)
+    error, _ = truth_error(run, "clean_sweep", "p_trk")
+    late = rms(error[len(error) // 2 :])
+    assert 1e3 * late < 0.4
+    wrong, _ = truth_error(play(messages, {"filter.enabled": "false"}), "clean_sweep", "p_trk")
+    assert rms(wrong[len(wrong) // 2 :]) > 5 * late
+    assert estimator().fusion.theta[i] == 0.0
