@@ -88,9 +88,7 @@ class Columns:
         self.key: Key = ((), ())
         self.mesh: Mesh | None = None
         self.beta = np.zeros(model.n)
-        self._deviation: tuple[Floats, Floats, Floats] | None = (
-            None  # columns, their covariance, and what they give
-        )
+        self._deviation: tuple[Floats, Floats, Floats] | None = None  # of columns, with their covariance
         self._lent = False  # whether a snapshot holds `stored`
 
     def start(self, key: tuple, mesh: Mesh, beta: Floats, alpha: Floats, par: Floats, x: Floats) -> Floats:

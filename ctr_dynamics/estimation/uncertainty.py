@@ -87,7 +87,7 @@ def model_uncertainty(model: Model) -> ModelUncertainty:
             column = np.zeros(layout.size)
             column[layout["body_mass"].start + i] = 1.0
             mass = tube.end_body.mass
-            least, most = (share * mass.value for share in RELATIVE)
+            least, most = RELATIVE[0] * mass.value, RELATIVE[1] * max(mass.value, mass.tolerance)
             add(f"payload_mass.tube{i + 1}", mass.tolerance, column, (least, most))
     # densities of one alloy vary together: one scale for all tubes
     groups = [(group, i) for i in range(n) for group in ("mass_per_length", "inertia_per_length")]
