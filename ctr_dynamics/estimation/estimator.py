@@ -398,7 +398,7 @@ class Estimator:
         self.health.tracker_age_s = max(0.0, (stamp - (since or stamp)) * 1e-9)
         return StepOutput(
             stamp, k, not problem, problem, tip.position, tip.quaternion, tip.covariance[:6, :6], tip.twist, tip.covariance[6:, 6:],
-            alone.position.copy(), predicted_q, self._backbone.rows(self.runs.fused), self._modes.measure(self.runs.fused), self.fusion.force.copy(),
+            alone.position.copy(), predicted_q, self._backbone.rows(self.runs.fused), self._modes.measure(self.runs.fused), self.fusion.force,
             np.sqrt(variance), self._take_innovations(), SolverStats(result.iterations, result.sweeps, result.reason),
         )  # fmt: skip
 

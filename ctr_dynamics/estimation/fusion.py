@@ -28,7 +28,6 @@ from .uncertainty import bias_sigma, model_uncertainty
 
 Floats = NDArray[np.float64]
 
-
 VAGUE = 1.0  # m^2 and rad^2: a covariance is not widened beyond
 DRIVEN = 4.0  # times its least: with a stronger drive of the tip force the columns follow every step
 
@@ -312,8 +311,8 @@ class Fusion:
 
     @property
     def force(self) -> Floats:
-        """(3,) estimated tip force, N, ``ctr_base`` axes."""
-        return self.theta[self.uncertainty.force]
+        """(3,) estimated tip force, N, ``ctr_base`` axes; the caller's own, as the filter goes on writing."""
+        return self.theta[self.uncertainty.force].copy()
 
     def force_variance(self) -> Floats:
         """(3,) variance of the estimated tip force, N^2."""

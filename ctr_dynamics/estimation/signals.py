@@ -79,7 +79,11 @@ class Signal:
                 values[i - 1], values[i], stamps[i - 1], stamps[i], np.array(times_ns), found, rates
             )
             return found, rates
-        pairs = [Signal.at(self, t, extrapolate_ns) for t in times_ns]  # not a delayed one
+        return self._each(times_ns, extrapolate_ns)
+
+    def _each(self, times_ns: list[int], extrapolate_ns: int) -> tuple[Floats, Floats]:
+        """What :meth:`at` gives at one time after another."""
+        pairs = [self.at(t, extrapolate_ns) for t in times_ns]
         return np.array([value for value, _ in pairs]), np.array([rate for _, rate in pairs])
 
     def bends(self, after_ns: float, until_ns: float, least: Floats) -> list[int]:
@@ -142,13 +146,9 @@ class Drives(Signal):
 
     def rows(self, times_ns: list[int], extrapolate_ns: int = 0) -> tuple[Floats, Floats]:
         """Actuators and their rates at increasing times; see :meth:`Signal.rows`."""
-        value, rate = super().rows(times_ns, extrapolate_ns)
         if self.delay_ns:
-            delayed = [t - self.delay_ns for t in times_ns]
-            n = self.n
-            alpha, alpha_rate = super().rows(delayed, extrapolate_ns)
-            value[:, :n], rate[:, :n] = alpha[:, :n], alpha_rate[:, :n]
-        return value, rate
+            return self._each(times_ns, extrapolate_ns)
+        return super().rows(times_ns, extrapolate_ns)
 
     @property
     def known_until(self) -> int:

@@ -109,8 +109,14 @@ def test_the_first_inputs_are_gathered_before_the_model_starts(clock, monkeypatc
     assert (len(estimator.asked), order, published) == (1, ["load"], [])
     loop._sleep()  # until it may start
     assert passed_ns == 20 * MS
+    passed_ns -= 1
+    loop._round()
+    assert published == []
+    assert loop._gathering_ns() == 1  # no longer than that does it sleep
+    passed_ns += 1
     loop._round()
     assert published == [clock.now]
+    assert published[0] == estimator.t0_ns
     loop.reset()
     estimator.t0_ns = clock.now
     loop._round()
