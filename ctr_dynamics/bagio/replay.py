@@ -23,6 +23,7 @@ import numpy as np
 from ctr_dynamics import __version__
 from ctr_dynamics.bagio.reader import Bag, InputMessage, open_bag
 from ctr_dynamics.bagio.writer import BagWriter, atomic_file, write_bag
+from ctr_dynamics.collector import seldom_collected
 from ctr_dynamics.errors import InputError
 from ctr_dynamics.messages.cdr import JointStateIn, PoseIn
 from ctr_dynamics.messages.encode import StepEncoder
@@ -253,6 +254,7 @@ def replay(
         report_part = stack.enter_context(atomic_file(Path(report))) if report is not None else None
         estimator = make(robot, settings)
         log = _report_log(estimator, opened) if report_part is not None else None
+        stack.enter_context(seldom_collected())
         numbers, times_s = _run(opened, estimator, robot, settings, writer, progress, log)
         content = plain({**numbers, **provenance, "notes": opened.notes})
         if summary_part is not None:

@@ -141,7 +141,7 @@ def _collect(bag: Bag, robot: Robot) -> tuple[Samples, Samples, Samples, list[st
     for item in bag.inputs():
         message = item.message
         if isinstance(message, JointStateIn):
-            order = joint_order(message.names, robot.n_tubes)
+            order = joint_order(tuple(message.names), robot.n_tubes)
             if isinstance(order, str):
                 wrong = order
                 continue

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from filterpy.kalman import ExtendedKalmanFilter
@@ -29,7 +30,8 @@ from .uncertainty import bias_sigma, model_uncertainty
 Floats = NDArray[np.float64]
 
 VAGUE = 1.0  # m^2 and rad^2: a covariance is not widened beyond
-DRIVEN = 4.0  # times its least: with a stronger drive of the tip force the columns follow every step
+SKIP = 2  # steps that the columns may skip
+DRIVEN = 4.0  # times its least: with a stronger drive of the tip force columns follow every step and are reduced twice as often
 
 
 @dataclass(frozen=True)
@@ -43,7 +45,7 @@ class FusionOptions:
     adaptation: float = 0.1
     force_time: float = 0.3
     window: float = 0.2
-    reduce_between: tuple[int, int] = (6, 12)  # steps: fewest behind a correction, most without one
+    reduce_between: tuple[int, int] = (14, 28)  # steps: fewest behind a correction, most without one
 
 
 @dataclass(frozen=True)
@@ -60,8 +62,7 @@ class Update:
     white: Floats
 
 
-@dataclass(frozen=True)
-class TipEstimate:
+class TipEstimate(NamedTuple):
     """Fused tip: position (3,) m, quaternion (4,) wxyz, twist (6,), covariance (12, 12) of pose and twist (base axes), and whether all is finite."""
 
     position: Floats
@@ -106,7 +107,7 @@ class Fusion:
         self.force_sigma = options.force_sigma
         self._refused = False
         self._corrected = False  # by a sample, since the columns were reduced
-        self._skipped = False  # whether the columns have not followed the last step
+        self._skipped = 0  # steps that the columns have not followed yet
         self._followed: Key = ((), ())  # sections of the last step that they have
         self._filters: dict[tuple[int, int], ExtendedKalmanFilter] = {}
         self._gate = {dof: float(chi2.ppf(options.gate_probability, dof)) for dof in range(1, 7)}
@@ -133,7 +134,8 @@ class Fusion:
         for axis, size in enumerate(scale):
             i = force.start + axis
             self.pi[i, i] = (self.options.force_sigma / size) ** 2
-        self._refused = self._corrected = self._skipped = False
+        self._refused = self._corrected = False
+        self._skipped = 0
         self._followed = state.key
         self.force_sigma = self.options.force_sigma
         self.tips.clear(r)
@@ -149,11 +151,11 @@ class Fusion:
     def predict(self, state: State, result: StepResult, stamp: float, sampled: bool = True) -> bool:
         """Steps (1)-(3) after the simulator took a step to ``stamp`` (s). False where the tangent does not exist; the columns then stay.
 
-        The columns follow every second step, and every one after which a sample is fused (``sampled``) or they are reduced: they change little
-        within 3 ms. The tip of a step that they skipped gets those of its neighbours. With a strong drive of the tip force they follow every
-        step. They are reduced, and the force's new randomness is taken in, behind a corrected step: randomness taken in just before a sample has
-        moved nothing yet that the sample could show. At the latest they are after ``reduce_between[1]`` steps, but not together with a sample,
-        so that no step does all the work.
+        The columns follow every third step, and every one after which a sample is fused (``sampled``) or they are reduced: they change little
+        within 3 ms. The tip of a step that they skipped gets those between its neighbours'. With a strong drive of the tip force they follow
+        every step and are reduced twice as often. They are reduced, and the force's new randomness is taken in, behind a corrected step:
+        randomness taken in just before a sample has moved nothing yet that the sample could show. At the latest they are after
+        ``reduce_between[1]`` steps, but not together with a sample, so that no step does all the work.
         """
         dt = self.simulator.scheme.dt
         self.unreduced += 1
@@ -161,24 +163,26 @@ class Fusion:
         force = self.uncertainty.force
         self.theta[force] *= decay
         self.columns.theta[force] *= decay
-        self._apply_theta()
-        fewest, most = self.options.reduce_between
+        driven = self.force_sigma > DRIVEN * self.options.force_sigma
+        fewest, most = (steps // (1 + driven) for steps in self.options.reduce_between)
         reduce = self.unreduced >= (2 * most if sampled else fewest if self._corrected else most)
         key = result.records[0].key
-        driven = self.force_sigma > DRIVEN * self.options.force_sigma
         follow = (
-            driven or self._skipped or sampled or reduce or key != self._followed or len(result.records) > 1
+            driven
+            or self._skipped >= SKIP
+            or sampled
+            or reduce
+            or key != self._followed
+            or len(result.records) > 1
         )
         ok = True
         if follow:
-            ok = self.columns.propagate(
-                result.records, self.simulator.parameters, dt if self._skipped else 0.0
-            )
+            ok = self.columns.propagate(result.records, self.simulator.parameters, dt * self._skipped)
             self._followed = result.records[-1].key
         self._keep_tip(state, stamp)
         if follow and self._skipped:
-            self.tips.interpolate()
-        self._skipped = not follow
+            self.tips.interpolate(self._skipped)
+        self._skipped = 0 if follow else self._skipped + 1
         if reduce:
             self._drive_drift(self.unreduced)
             self._drive_force(self.unreduced)

@@ -56,6 +56,7 @@ class InputBuffer:
         self.model, self.settings, self.health = model, settings, health
         self.window_ns = round(float(settings["filter.window_s"]) * 1e9)
         self._load_delay_ns = round(model.setup.load_shift * 1e9)
+        self._load_bend = model.load_kink / (DT_NS * 1e-9)
         self.clear()
 
     def clear(self) -> None:
@@ -222,7 +223,7 @@ class InputBuffer:
         if len(self.load.stamps) < 2:
             return []
         end_ns = self.t0_ns + k * DT_NS
-        bends = self.load.bends(end_ns - DT_NS, end_ns, self.model.load_kink / (DT_NS * 1e-9))
+        bends = self.load.bends(end_ns - DT_NS, end_ns, self._load_bend)
         return [(stamp - self.t0_ns) * 1e-9 for stamp in bends]
 
     def due_samples(self, tracker: TrackerModel, t: float) -> list[tuple[Sample, float, Floats]]:

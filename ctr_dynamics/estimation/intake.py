@@ -31,7 +31,7 @@ def joint_values(setup: Setup, stamp_ns: int, names: Sequence[str], positions: S
         Unusable: joints are missing or double, numbers are missing or not finite, or the robot cannot be there.
     """
     n = setup.n
-    order = joint_order(names, n)
+    order = joint_order(tuple(names), n)
     if isinstance(order, str):
         raise Unusable("names", order)
     if len(positions) < len(names):
@@ -45,7 +45,8 @@ def joint_values(setup: Setup, stamp_ns: int, names: Sequence[str], positions: S
         )
     value[:n] = setup.gain * value[:n] + setup.offset
     value[n:] += setup.beta_offset
-    reason = setup.robot.actuator_problem(value[n:], value[:n])
+    numbers = value.tolist()
+    reason = setup.robot.actuator_problem(numbers[n:], numbers[:n])
     if reason:
         raise Unusable("out of range", f"{reason}; the joint state was left out")
     return value

@@ -96,41 +96,44 @@ def registered_rows(mean, columns, rotation, lever, bias, pi, pose, covariance):
     size = r + 13
     R, C, N = registered_pose(mean, rotation, lever, bias, pose)
     arm = applied(R, bias[6:9])  # extra arm beyond the nominal lever moves the pose when the tip turns
-    J = np.zeros((12, size))
+    J = np.zeros((size, 12))  # transposed, so that the inner loops run over neighbours
     for c in range(r):
         ax, ay, az = columns[3, c], columns[4, c], columns[5, c]
         dx = columns[0, c] + ay * arm[2] - az * arm[1]
         dy = columns[1, c] + az * arm[0] - ax * arm[2]
         dz = columns[2, c] + ax * arm[1] - ay * arm[0]
         for i in range(3):
-            J[i, c] = C[i, 0] * dx + C[i, 1] * dy + C[i, 2] * dz
-            J[3 + i, c] = C[i, 0] * ax + C[i, 1] * ay + C[i, 2] * az
-            J[6 + i, c] = columns[6 + i, c]
-            J[9 + i, c] = columns[9 + i, c]
+            J[c, i] = C[i, 0] * dx + C[i, 1] * dy + C[i, 2] * dz
+            J[c, 3 + i] = C[i, 0] * ax + C[i, 1] * ay + C[i, 2] * az
+            J[c, 6 + i] = columns[6 + i, c]
+            J[c, 9 + i] = columns[9 + i, c]
     for c in range(3):
         nx, ny, nz = N[0, c], N[1, c], N[2, c]
-        J[0, r + c] = ny * pose[2] - nz * pose[1]
-        J[1, r + c] = nz * pose[0] - nx * pose[2]
-        J[2, r + c] = nx * pose[1] - ny * pose[0]
+        J[r + c, 0] = ny * pose[2] - nz * pose[1]
+        J[r + c, 1] = nz * pose[0] - nx * pose[2]
+        J[r + c, 2] = nx * pose[1] - ny * pose[0]
         for i in range(3):
-            J[3 + i, r + c] = N[i, c]
-            J[i, r + 3 + c] = N[i, c]
-            J[i, r + 6 + c] = C[i, 0] * R[0, c] + C[i, 1] * R[1, c] + C[i, 2] * R[2, c]
-    half = np.empty(size)
+            J[r + c, 3 + i] = N[i, c]
+            J[r + 3 + c, i] = N[i, c]
+            J[r + 6 + c, i] = C[i, 0] * R[0, c] + C[i, 1] * R[1, c] + C[i, 2] * R[2, c]
+    half = np.empty(12)
+    covariance[:] = 0.0
+    for p in range(size):
+        half[:] = 0.0
+        for q in range(size):
+            x = pi[p, q]
+            for i in range(12):
+                half[i] += x * J[q, i]
+        for i in range(12):
+            x = J[p, i]
+            for n in range(12):
+                covariance[i, n] += x * half[n]
     total = 0.0
     for i in range(12):
-        half[:] = 0.0
-        for p in range(size):
-            x = J[i, p]
-            for q in range(size):
-                half[q] += x * pi[p, q]
-        for n in range(i + 1):
-            value = 0.0
-            for q in range(size):
-                value += half[q] * J[n, q]
-            covariance[i, n] = value
-            covariance[n, i] = value
-            total += value
+        for n in range(i):
+            covariance[i, n] = covariance[n, i] = 0.5 * (covariance[i, n] + covariance[n, i])
+        for n in range(12):
+            total += covariance[i, n]
     for i in range(7):
         total += pose[i]
     return np.isfinite(total)
@@ -185,6 +188,29 @@ def sparse_product(indptr, indices, data, vector):
             total += data[k] * vector[indices[k]]
         result[row] = total
     return result
+
+
+@_compile
+def modal_coordinates(by_fields, fields, by_inputs, alpha, beta, force, torque, at_rest):
+    """(2m,) amplitudes and rates of modes: ``by_fields`` (2m, fields) times the ``fields``, less what the equilibrium at the inputs has."""
+    values = np.empty(len(at_rest))
+    for i in range(len(values)):
+        # eight sums: the processor adds them side by side
+        parts = np.zeros(8)
+        last = len(fields) - len(fields) % 8
+        for first in range(0, last, 8):
+            for k in range(8):
+                parts[k] += by_fields[i, first + k] * fields[first + k]
+        total = parts.sum() - at_rest[i]
+        for k in range(last, len(fields)):
+            total += by_fields[i, k] * fields[k]
+        column = 0
+        for part in (alpha, beta, force, torque):
+            for k in range(len(part)):
+                total -= by_inputs[i, column] * part[k]
+                column += 1
+        values[i] = total
+    return values
 
 
 @_compile

@@ -9,19 +9,22 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import eig
 
 from ctr_dynamics.model.mesh import Key
 from ctr_dynamics.model.model import Model
 from ctr_dynamics.model.newton import lanes_for
-from ctr_dynamics.model.simulator import State
+from ctr_dynamics.model.simulator import Inputs, State
 from ctr_dynamics.model.statics import Equilibrium, Statics
 from ctr_dynamics.model.tangent import linearise
 from ctr_dynamics.model.transfer import Transfer, transfer
 
 from .columns import field_weights
+from .kernels import modal_coordinates
 from .outputs import Modes
 from .rotations import matrix
 
@@ -42,7 +45,7 @@ class ModalBasis:
         frequency_hz, damping: (m,). exponent: (m,) complex mu in 1/s.
         readout: (2m, fields) real, then imaginary parts of the modal coordinate z = readout (y - rest): the tip's displacement along the mode's
             main direction is 2 Re z and its speed 2 Re(mu z).
-        rest: (fields,) fields of the equilibrium; inputs (2N + 6,): actuators and load there, as :func:`input_vector` orders them.
+        rest: (fields,) fields of the equilibrium; inputs (2N + 6,): alpha, beta, force and torque there.
         follow: (2m, 2N + 6) modal coordinates of the equilibrium that moves with alpha, beta, force and torque.
         direction: (m, 3) unit, main direction of the tip's motion in ``ctr_base``.
     """
@@ -56,28 +59,40 @@ class ModalBasis:
     inputs: Floats
     follow: Floats
 
-    def measure(self, fields: Floats, inputs: Floats) -> Modes:
-        """Amplitude and rate of each mode in ``fields`` (fields,) at the actuators and load ``inputs`` (2N + 6,)."""
-        z = self.readout @ (fields - self.rest) - self.follow @ (inputs - self.inputs)
-        real, imag = z[: len(z) // 2], z[len(z) // 2 :]
-        return Modes(
-            self.frequency_hz, self.damping, 2.0 * real, 2.0 * (self.exponent.real * real - self.exponent.imag * imag)
-        )  # fmt: skip
+    def measure(self, fields: Floats, now: Inputs) -> Modes:
+        """Amplitude and rate of each mode in ``fields`` (fields,) at the actuators and load ``now``."""
+        by_fields, by_inputs, at_rest = self._rows
+        m = len(self.damping)
+        values = modal_coordinates(
+            by_fields, fields, by_inputs, now.alpha, now.beta, now.force, now.torque, at_rest
+        )
+        return Modes(self.frequency_hz, self.damping, values[:m], values[m:])
+
+    @cached_property
+    def _rows(self) -> tuple[Floats, Floats, Floats]:
+        """Amplitudes and rates (2m,) by fields (2m, fields), by inputs (2m, 2N + 6), and in the fields and inputs of the equilibrium (2m,)."""
+        m = len(self.damping)
+        turn = 2.0 * np.block(
+            [[np.eye(m), np.zeros((m, m))], [np.diag(self.exponent.real), np.diag(-self.exponent.imag)]]
+        )
+        by_fields, by_inputs = turn @ self.readout, turn @ self.follow
+        return by_fields, by_inputs, by_fields @ self.rest - by_inputs @ self.inputs
 
 
-def input_vector(alpha: Floats, beta: Floats, force: Floats, torque: Floats) -> Floats:
-    """(2N + 6,) alpha, beta, force and torque in one vector."""
-    return np.concatenate([alpha, beta, force, torque])
+def lanes_of(model: Model) -> tuple[int, ...]:
+    """Lane tuple of the tangents: the base case and the unknowns, and as many columns as a block has."""
+    return lanes_for(6 + model.n + BLOCK)
 
 
-def equilibrium_slope(model: Model, equilibrium: Equilibrium, par: Floats) -> Floats | None:
-    """d(equilibrium's fields)/d(alpha, beta, force, torque), (fields, 2N + 6)."""
+def equilibrium_slope(
+    model: Model, equilibrium: Equilibrium, par: Floats, big: tuple[Floats, ...]
+) -> Floats | None:
+    """d(equilibrium's fields)/d(alpha, beta, force, torque), (fields, 2N + 6); ``big``: buffers of :func:`lanes_of` lanes."""
     n, layout = model.n, model.layout
     rows = np.concatenate([layout.rows(name) for name in ("alpha", "beta", "force", "torque")])
     m, count = 5 + n, len(rows)
-    lanes = lanes_for(1 + m + count)
+    lanes = lanes_of(model)
     L = 8 * len(lanes)
-    big = model.buffers(equilibrium.mesh, L)
     main, base = len(big[4]) // L, len(big[5]) // L
     scale = np.array([1e-2] * n + [1e-4] * n + [1e-4] * 3 + [1e-6] * 3)
     dpar = np.zeros((layout.size, count))
@@ -102,20 +117,21 @@ def modal_basis(
     Friction enters as its slope at rest.
     """
     found = None
-    for part in modal_parts(model, equilibrium, par, beta, count):
+    big = model.buffers(equilibrium.mesh, 8 * len(lanes_of(model)))
+    for part in modal_parts(model, equilibrium, par, beta, big, count):
         found = part
     return found
 
 
 def modal_parts(
-    model: Model, equilibrium: Equilibrium, par: Floats, beta: Floats, count: int = 4
+    model: Model, equilibrium: Equilibrium, par: Floats, beta: Floats, big: tuple[Floats, ...], count: int = 4
 ) -> Iterator[ModalBasis | None]:
-    """The work of :func:`modal_basis` in parts of about equal cost, each ended by a None; the last item is the result."""
+    """The work of :func:`modal_basis` in parts of about equal cost, each ended by a None; the last item is the result. ``big``: buffers of
+    :func:`lanes_of` lanes, in use until then."""
     mesh = equilibrium.mesh
     n, m = model.n, 5 + model.n
-    lanes = lanes_for(1 + m + BLOCK)
+    lanes = lanes_of(model)
     L = 8 * len(lanes)
-    big = model.buffers(mesh, L)
     main, base = len(big[4]) // L, len(big[5]) // L
     size = main + base
     c0 = 1.0 / SHIFT_STEP
@@ -132,7 +148,7 @@ def modal_parts(
         )  # fmt: skip
         return dfields / scale if ok else None
 
-    follow = equilibrium_slope(model, equilibrium, par)
+    follow = equilibrium_slope(model, equilibrium, par, big)
     if follow is None:
         return
     yield None
@@ -155,7 +171,6 @@ def modal_parts(
     whole: list[Floats] = []
     images: list[Floats] = []
     block = start
-    tip_rows = slice(main - (7 + 2 * n), main)
     for _ in range(ROUNDS):
         # Gram-Schmidt in the energy norm on whole vectors: the points at section ends have no energy of their own, but their
         # history carries the bodies' inertia
@@ -177,10 +192,9 @@ def modal_parts(
         yield None
     Q, image = np.concatenate(basis, axis=1), np.concatenate(images, axis=1)
     reduced = Q.T @ (weights[:, None] * image)
-    values, right = np.linalg.eig(reduced)
+    values, left, right = eig(reduced, left=True, check_finite=False)
     with np.errstate(divide="ignore", invalid="ignore"):
         mu = (1.0 - 1.0 / values) / SHIFT_STEP
-    left = np.linalg.pinv(right)
     wanted = (
         np.isfinite(mu)
         & (mu.imag > 1.0)
@@ -190,19 +204,19 @@ def modal_parts(
     order = [int(i) for i in np.flatnonzero(wanted)[np.argsort(np.abs(mu[wanted]))]][:count]
     if not order:
         return
-    R = matrix(equilibrium.tip_quaternion)
-    readout, direction = [], []
-    for i in order:
-        shape = image @ right[:, i] / values[i]  # the mode on all points, weighted or not
-        velocity = R @ shape[tip_rows][0:3]
-        displacement = velocity / mu[i]
-        # main direction: of the largest real part over the phase
-        spread = np.stack([displacement.real, displacement.imag], axis=1)
-        axis = np.linalg.svd(spread, full_matrices=False)[0][:, 0]
-        axis = axis * (1.0 if axis[np.argmax(np.abs(axis))] > 0 else -1.0)
-        readout.append((left[i] @ Q.T) * weights * (axis @ displacement))
-        direction.append(axis)
     chosen = mu[order].astype(complex)
+    left, right = left[:, order].conj().T, right[:, order]
+    left = left / np.einsum("ij,ji->i", left, right)[:, None]
+    coordinates = ((left.real @ Q.T) + 1j * (left.imag @ Q.T)) * weights  # of the modes, in any fields
+    tip = matrix(equilibrium.tip_quaternion) @ image[main - (7 + 2 * n) :][:3]  # velocity of the images
+    displacement = (tip @ (right / (values[order] * chosen))).T
+    readout, direction = [], []
+    for i, moved in enumerate(displacement):
+        # main direction: of the largest real part over the phase
+        axis = np.linalg.svd(np.stack([moved.real, moved.imag], axis=1), full_matrices=False)[0][:, 0]
+        axis = axis * (1.0 if axis[np.argmax(np.abs(axis))] > 0 else -1.0)
+        readout.append(coordinates[i] * (axis @ moved))
+        direction.append(axis)
     rows = np.concatenate([np.real(readout), np.imag(readout)])
     yield ModalBasis(
         np.abs(chosen.imag) / (2 * np.pi),
@@ -211,7 +225,7 @@ def modal_parts(
         rows,
         equilibrium.fields,
         np.array(direction),
-        input_vector(par[layout["alpha"]], beta, par[layout["force"]], par[layout["torque"]]),
+        np.concatenate([par[layout["alpha"]], beta, par[layout["force"]], par[layout["torque"]]]),
         rows @ follow,
     )
 
@@ -226,6 +240,7 @@ class ModeTracker:
         self.model, self.every = model, every
         self.coarse = model if model.nodes <= MODE_NODES else Model(model.robot, MODE_NODES, model.base_cells)
         self._transfers: dict[tuple[Key, Key], Transfer] = {}
+        self._buffers: dict[Key, tuple[Floats, ...]] = {}
         self.clear()
 
     def clear(self) -> None:
@@ -243,8 +258,7 @@ class ModeTracker:
             self.clear()
         if self._basis is None:
             return Modes.none()
-        now = state.inputs
-        return self._basis.measure(state.fields, input_vector(now.alpha, now.beta, now.force, now.torque))
+        return self._basis.measure(state.fields, state.inputs)
 
     def refresh(self, state: State, parameters: Floats) -> None:
         """A part of the work that renews the modes, where they are old, about ``state`` with the parameter block (NP,)."""
@@ -255,7 +269,6 @@ class ModeTracker:
             elif isinstance(part, ModalBasis):
                 assert self._own is not None
                 readout = part.readout if self._transfer is None else part.readout @ self._transfer.restrict
-                readout = np.ascontiguousarray(readout)  # read in every step
                 self._basis, self._pending = replace(part, readout=readout, rest=self._own.fields), None
         elif self._age > self.every:
             self._age = 0
@@ -283,4 +296,6 @@ class ModeTracker:
                 self._transfers[pair] = transfer(self.model.n, equilibrium.mesh, on.mesh)
             self._transfer = self._transfers[pair]
         self._own = equilibrium
-        self._pending = modal_parts(self.coarse, on, par, now.beta.copy())
+        if on.key not in self._buffers:
+            self._buffers[on.key] = self.coarse.buffers(on.mesh, 8 * len(lanes_of(self.coarse)))
+        self._pending = modal_parts(self.coarse, on, par, now.beta.copy(), self._buffers[on.key])

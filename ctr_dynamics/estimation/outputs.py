@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,8 +13,7 @@ Floats = NDArray[np.float64]
 OK, WARN, ERROR = 0, 1, 2
 
 
-@dataclass(frozen=True)
-class Modes:
+class Modes(NamedTuple):
     """Slowest vibration modes: frequency_hz (m,), damping ratio (m,), amplitude (m,) m and rate (m,) m/s of the tip's motion in each."""
 
     frequency_hz: Floats
@@ -65,13 +65,15 @@ class Innovation:
     moment: Moment | None = None
 
 
-@dataclass(frozen=True)
-class SolverStats:
+class SolverStats(NamedTuple):
     """Work of one step."""
 
     iterations: int
     sweeps: int
     outcome: str
+
+
+NO_WORK = SolverStats(0, 0, "")
 
 
 @dataclass(frozen=True)
@@ -102,7 +104,7 @@ class StepOutput:
     disturbance_force: Floats
     disturbance_sigma: Floats
     innovations: list[Innovation] = field(default_factory=list)
-    solver: SolverStats = SolverStats(0, 0, "")
+    solver: SolverStats = NO_WORK
 
     @classmethod
     def invalid(cls, stamp_ns: int, k: int, reason: str, innovations: list[Innovation]) -> StepOutput:

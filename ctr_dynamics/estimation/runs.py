@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 
 from ctr_dynamics.errors import InputError
 from ctr_dynamics.model.model import Model
+from ctr_dynamics.model.pair import Pair
 from ctr_dynamics.model.scheme import make_scheme
 from ctr_dynamics.model.simulator import Simulator, State, StepResult
 from ctr_dynamics.parameters import Settings, axes_mask
@@ -55,6 +57,7 @@ class Runs:
         tolerance = float(settings["model.tolerance"])
         self.simulator = Simulator(model, scheme, tolerance)
         self.reference = Simulator(model, scheme, tolerance)
+        self.pair = Pair(self.simulator, self.reference)
         self.tracker = tracker_model(
             model.setup,
             delay=float(settings["tracker.delay_s"]),
@@ -85,6 +88,7 @@ class Runs:
         self._signals = Signals(model, inputs)
         self._load = np.zeros(model.input_count)  # of the robot file
         self._load[3 * model.n : 3 * model.n + 3] = model.setup.tip_force
+        self._bare = Actuation(self._signals, self._load)  # of the model alone
         if model.extended:
             self.fusion.inserted = float(model.setup.block[model.layout["insertion"]][0])
         self.clear()
@@ -108,7 +112,7 @@ class Runs:
         self._signals.clear()
         self.fusion.forget_parameters()
         try:
-            self.fused = self.simulator.rest(self._actuation(False)(t))
+            self.fused = self.simulator.rest(self._bare(t))
         except InputError as error:
             self.fused = self.alone = None
             return str(error)
@@ -130,19 +134,7 @@ class Runs:
         assert self.fused is not None and self.alone is not None
         before, t = seconds(k - 1), seconds(k)
         self._signals.clear()
-        f, a = self.fused, self.alone
-        apart = (
-            3.0 * (a.unknowns - f.unknowns)
-            - 3.0 * (a.earlier[0] - f.earlier[0])
-            + (a.earlier[1] - f.earlier[1])
-        )
-        events = self.inputs.load_bends(k)
-        result = self.simulator.step(
-            f, before, self._actuation(True), record=False if track else "end", events=events
-        )
-        # the actuators' noise moves both runs alike: what lies between their unknowns is smooth, so a parabola meets it
-        start = f.unknowns + apart if result.ok else None
-        alone = self.reference.step(a, before, self._actuation(False), start=start, events=events)
+        result, alone = self._step_both(before, events=self.inputs.load_bends(k), record=track is None)
         if not alone.ok:
             return alone
         self._keep_alone_tip(t)
@@ -164,10 +156,21 @@ class Runs:
             self.keep(k)
         return result
 
-    def _actuation(self, corrected: bool) -> Actuation:
-        """Actuators and load at a time (s from t0), with the estimated offsets and force for the fused run."""
-        if not corrected:
-            return Actuation(self._signals, self._load)
+    def _step_both(self, t: float, events: Sequence[float], record: bool) -> tuple[StepResult, StepResult]:
+        """Both runs from ``t`` (s) on, together where they can go together."""
+        assert self.fused is not None and self.alone is not None
+        corrected = self._corrected()
+        if not events:
+            both = self.pair.step(self.fused, self.alone, t, corrected, self._bare, record=record)
+            if both is not None:
+                return both
+        return (
+            self.simulator.step(self.fused, t, corrected, record="end" if record else False, events=events),
+            self.reference.step(self.alone, t, self._bare, events=events),
+        )
+
+    def _corrected(self) -> Actuation:
+        """Actuators and load with the estimated offsets and force."""
         shift, n = self._load.copy(), self.model.n
         for i, row in self._offset_rows:
             shift[i] += self.fusion.theta[row]

@@ -8,6 +8,7 @@ from __future__ import annotations
 import bisect
 import math
 from collections.abc import Sequence
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -72,14 +73,22 @@ class Signal:
     def rows(self, times_ns: list[int], extrapolate_ns: int = 0) -> tuple[Floats, Floats]:
         """Values and rates (times, size) at increasing times; see :meth:`at`."""
         stamps, values = self.stamps, self.values
-        i = bisect.bisect_left(stamps, times_ns[0])
-        if 0 < i < len(stamps) and times_ns[-1] <= stamps[i]:  # all between the same two samples
-            found, rates = np.empty((2, len(times_ns), self.size))
+        if len(stamps) == 1 or (extrapolate_ns <= 0 and times_ns[0] > stamps[-1]):
+            return np.array([values[-1]] * len(times_ns)), np.zeros((len(times_ns), self.size))
+        if times_ns[0] <= stamps[0] or times_ns[-1] > stamps[-1]:
+            return self._each(times_ns, extrapolate_ns)
+        found, rates = np.empty((2, len(times_ns), self.size))
+        times, first = np.array(times_ns), 0
+        while first < len(times_ns):
+            i = bisect.bisect_left(stamps, times_ns[first])
+            after = bisect.bisect_right(
+                times_ns, stamps[i]
+            )  # the first time that is not between the same two samples
             between_samples(
-                values[i - 1], values[i], stamps[i - 1], stamps[i], np.array(times_ns), found, rates
-            )
-            return found, rates
-        return self._each(times_ns, extrapolate_ns)
+                values[i - 1], values[i], stamps[i - 1], stamps[i], times[first:after], found[first:after], rates[first:after]
+            )  # fmt: skip
+            first = after
+        return found, rates
 
     def _each(self, times_ns: list[int], extrapolate_ns: int) -> tuple[Floats, Floats]:
         """What :meth:`at` gives at one time after another."""
@@ -156,18 +165,19 @@ class Drives(Signal):
         return self.stamps[-1] + min(self.delay_ns, 0)
 
 
-def joint_order(names: Sequence[str], n: int) -> list[int] | str:
-    """Positions in a JointState's list of tube1_rotation.., tube1_translation..; or what is missing or double, in words."""
+@lru_cache(maxsize=16)  # of a driver, it is the same in every message
+def joint_order(names: tuple[str, ...], n: int) -> tuple[int, ...] | str:
+    """Positions in a JointState's names of tube1_rotation.., tube1_translation..; or what is missing or double, in words."""
     wanted = [f"tube{i + 1}_{kind}" for kind in ("rotation", "translation") for i in range(n)]
     where = {name: i for i, name in enumerate(names)}
     missing = [name for name in wanted if name not in where]
     if missing:
-        have = ", ".join(list(names)[:8]) or "none"
+        have = ", ".join(names[:8]) or "none"
         return f"joint state lacks {', '.join(missing)} (it has: {have}); name the joints tubeN_rotation and tubeN_translation"
-    double = sorted({name for name in wanted if list(names).count(name) > 1})
+    double = sorted({name for name in wanted if names.count(name) > 1})
     if double:
         return f"joint state names {', '.join(double)} more than once; name each joint once"
-    return [where[name] for name in wanted]
+    return tuple(where[name] for name in wanted)
 
 
 def finite(values: Sequence[float]) -> bool:

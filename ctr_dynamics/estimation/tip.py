@@ -51,6 +51,7 @@ class TipWindow:
     """
 
     MORE = 64  # rows of room
+    OPEN = 3  # newest rows whose columns may change yet
 
     def __init__(self, steps: int) -> None:
         self.size = steps
@@ -111,10 +112,13 @@ class TipWindow:
         )  # fmt: skip
         return tip
 
-    def interpolate(self) -> None:
-        """Give the tip before the newest the mean of its neighbours' columns."""
-        if self.end > 2:
-            self.columns[self.end - 2] = 0.5 * (self.columns[self.end - 3] + self.columns[self.end - 1])
+    def interpolate(self, count: int) -> None:
+        """Give the ``count`` tips before the newest, fewer than ``OPEN``, columns between those of their neighbours."""
+        first, last = self.end - 2 - count, self.end - 1
+        if first >= 0:
+            change = (self.columns[last] - self.columns[first]) / (count + 1)
+            for i in range(1, count + 1):
+                self.columns[first + i] = self.columns[first] + i * change
 
     def transform(self, T: Floats) -> None:
         """Replace all columns V by V T; columns that have been appended since do not move the past."""
@@ -128,8 +132,8 @@ class TipWindow:
         shift_tips(self.columns[self.begin : self.end], a, self.means[self.begin : self.end])
 
     def snapshot(self) -> tuple:
-        """What :meth:`restore` needs. The last two rows of columns may change yet (:meth:`interpolate`), the means with every correction."""
-        recent = self.columns[max(0, self.end - 2) : self.end].copy()
+        """What :meth:`restore` needs. The last rows of columns may change yet (:meth:`interpolate`), the means with every correction."""
+        recent = self.columns[max(0, self.end - self.OPEN) : self.end].copy()
         rows = slice(self.begin, self.end)
         return self.end, self.stamps[rows].copy(), self.means[rows].copy(), self.columns, recent
 

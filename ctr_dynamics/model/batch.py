@@ -6,7 +6,6 @@ together until the last one has converged. A case that meets a hard step, or who
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -14,9 +13,9 @@ from numba import njit
 from numpy.typing import NDArray
 
 from ctr_dynamics.errors import InputError
-from ctr_dynamics.model.kernels import sweep
+from ctr_dynamics.model.lockstep import solve_lanes
 from ctr_dynamics.model.model import Model
-from ctr_dynamics.model.newton import broyden, jacobian, lane_lengths, lanes_for
+from ctr_dynamics.model.newton import lane_lengths, lanes_for
 from ctr_dynamics.model.scheme import RATE_NOW, RATES, Y_BEFORE, Y_NOW, Scheme
 from ctr_dynamics.model.simulator import Inputs, Simulator, State
 from ctr_dynamics.model.step import EARLIER, RENEW, extrapolate, history, remember
@@ -34,153 +33,6 @@ from ctr_dynamics.model.workspace import input_row, lane_count
 Floats = NDArray[np.float64]
 LANES = 8  # cases in one batch: one pack, so that none waits for many
 LIMIT = 40  # iterations of a stage
-OLD, ANOTHER, OWN = 0, 1, 2
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _norms(res, scale, lanes, alive, norm):
-    """Largest scaled imbalance of every lane into ``norm`` (L,); lanes that are not finite die."""
-    L = lane_count(lanes)
-    for j in range(L):
-        worst = 0.0
-        for i in range(len(scale)):
-            value = abs(res[i * L + j]) / scale[i]
-            if not math.isfinite(value):
-                alive[j] = False
-                value = 0.0
-            worst = max(worst, value)
-        norm[j] = worst
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _pick(values, lanes, j, one):
-    """Lane ``j`` of ``values`` (rows * L,) into ``one`` (rows,)."""
-    L = lane_count(lanes)
-    for r in range(len(one)):
-        one[r] = values[r * L + j]
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _renew(tubes, lanes, few, mesh, c0, big, one, eight, x, j, perturb, inverse, scale, norm):
-    """New inverse Jacobian of lane ``j`` at its ``x``, with its imbalance and norm; False if it is singular or not finite."""
-    W, par, seclen, trial, hist, histb, out, outb, nodes, res = big
-    par1, seclen1, x1, hist1, histb1 = one
-    L, lanes8 = lane_count(lanes), lane_count(few)
-    _pick(par, lanes, j, par1)
-    _pick(seclen, lanes, j, seclen1)
-    _pick(x, lanes, j, x1)
-    _pick(hist, lanes, j, hist1)
-    _pick(histb, lanes, j, histb1)
-    if not jacobian(tubes, few, mesh, c0, par1, seclen1, x1, hist1, histb1, eight, perturb, inverse[j]):
-        return False
-    norm[j] = 0.0
-    for i in range(len(scale)):
-        res[i * L + j] = eight[9][i * lanes8]
-        norm[j] = max(norm[j], abs(res[i * L + j]) / scale[i])
-        trial[i * L + j] = x1[i]
-    return True
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _solve(
-    tubes,
-    lanes,
-    few,
-    mesh,
-    c0,
-    big,
-    one,
-    eight,
-    x,
-    inverse,
-    fresh,
-    alive,
-    scale,
-    perturb,
-    tolerance,
-    limit,
-    spent,
-):
-    """Unknowns ``x`` (m * L,) of all living lanes, in place; returns sweeps. Lanes that cannot be solved die.
-
-    ``fresh`` (L,): lanes whose ``inverse`` is not usable. ``spent`` (L,): sweeps of each lane, counted on. A new Jacobian of one lane serves all
-    that want one: the cases are alike. A lane that it does not help gets its own.
-    """
-    W, par, seclen, trial, hist, histb, out, outb, nodes, res = big
-    L, m = lane_count(lanes), len(scale)
-    norm, new = np.empty(L), np.empty(L)
-    newest = np.zeros(
-        L, np.int64
-    )  # whose Jacobian a lane has: an OLD one, a new one of ANOTHER lane, a new one of its OWN
-    dx, dr = np.empty(m), np.empty(m)
-    before = np.empty(m * L)
-    shared = -1
-    for j in range(L):
-        if fresh[j] and alive[j]:
-            if shared < 0:
-                alive[j] = _renew(
-                    tubes, lanes, few, mesh, c0, big, one, eight, x, j, perturb, inverse, scale, norm
-                )
-                shared = j if alive[j] else -1
-                newest[j] = OWN
-            else:
-                inverse[j] = inverse[shared]
-                newest[j] = ANOTHER
-            fresh[j] = False
-    trial[:] = x
-    sweep(tubes, lanes, W, c0, mesh, par, seclen, trial, hist, histb, out, outb, nodes, res)
-    sweeps = 1
-    _norms(res, scale, lanes, alive, norm)
-    for _ in range(limit):
-        waiting = False
-        before[:] = res
-        shared = -1
-        for j in range(L):
-            if alive[j] and norm[j] > tolerance:
-                waiting = True
-                spent[j] += 1
-                for i in range(m):
-                    step = 0.0
-                    for k in range(m):
-                        step -= inverse[j, i, k] * res[k * L + j]
-                    trial[i * L + j] = x[i * L + j] + step
-        if not waiting:
-            return sweeps
-        sweep(tubes, lanes, W, c0, mesh, par, seclen, trial, hist, histb, out, outb, nodes, res)
-        sweeps += 1
-        _norms(res, scale, lanes, alive, new)
-        for j in range(L):
-            if not alive[j] or norm[j] <= tolerance:
-                continue
-            better = new[j] < norm[j]
-            slow = new[j] > tolerance and new[j] > 0.6 * norm[j]
-            if better:
-                for i in range(m):
-                    dx[i] = trial[i * L + j] - x[i * L + j]
-                    dr[i] = res[i * L + j] - before[i * L + j]
-                    x[i * L + j] = trial[i * L + j]
-                broyden(inverse[j], dx, dr)
-                norm[j] = new[j]
-            if not better and newest[j] == OWN:
-                alive[j] = False
-            elif not better or slow:
-                if newest[j] == OLD and shared >= 0:
-                    inverse[j] = inverse[shared]
-                    newest[j] = ANOTHER
-                    if not better:  # back to where it was
-                        for i in range(m):
-                            res[i * L + j] = before[i * L + j]
-                else:
-                    alive[j] = _renew(
-                        tubes, lanes, few, mesh, c0, big, one, eight, x, j, perturb, inverse, scale, norm
-                    )
-                    newest[j] = OWN
-                    shared = j if alive[j] else -1
-            else:
-                newest[j] = OLD
-    for j in range(L):
-        alive[j] &= norm[j] <= tolerance
-    return sweeps
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -207,8 +59,8 @@ def _advance(tubes, lanes, few, mesh, c0, weights, inputs, bank, unknowns, earli
             lane_lengths(tubes, lanes, mesh, par, seclen)
             for i in range(m * L):
                 x[i] = guess[stage, i] + (found[stage - 1, i] - guess[stage - 1, i] if stage else 0.0)
-            total += _solve(tubes, lanes, few, mesh, c0[stage], big, one, eight, x, inverse, fresh, alive, scale, perturb, tolerance, limit,
-                            spent)  # fmt: skip
+            total += solve_lanes(tubes, lanes, few, mesh, c0[stage], big, one, eight, x, inverse, fresh, alive, scale, perturb, tolerance, limit,
+                                 spent, 0)[0]  # fmt: skip
             found[stage] = x
             rate = bank[RATES + stage]
             for i in range(main):

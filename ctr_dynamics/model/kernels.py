@@ -601,13 +601,19 @@ def _packs(tubes, lanes, *arguments):
         _block(tubes, (0,), first, lane_count(lanes), *arguments)
 
 
+def _short_pack(tubes, lanes, *arguments):
+    _block(tubes, lanes, 0, lane_count(lanes), *arguments)
+
+
 def _in_blocks(*args):
     raise NotImplementedError("for compiled code only")
 
 
 @overload(_in_blocks, jit_options={"error_model": "numpy", "nogil": True})
 def _choose_blocks(tubes, lanes, *arguments):
-    return _packs if len(lanes) else _one_lane
+    if not len(lanes):
+        return _one_lane
+    return _short_pack if isinstance(lanes.dtype, types.Boolean) else _packs
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

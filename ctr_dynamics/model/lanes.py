@@ -83,7 +83,9 @@ def _vector(number):
 
 def _number_of(lanes):
     """Type of the numbers of a block of lanes: float64 for an empty lane tuple, else packs."""
-    return Pack(PACK) if len(lanes) else types.float64
+    if not len(lanes):
+        return types.float64
+    return Pack(len(lanes) if isinstance(lanes.dtype, types.Boolean) else PACK)
 
 
 def _widened(context, builder, value, source, target):

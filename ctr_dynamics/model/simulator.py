@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 from scipy.interpolate import CubicSpline
@@ -46,8 +46,7 @@ InputsAt = Callable[[float], Inputs]
 """Inputs at a time in s. One that also has ``stages(times)``, which returns what :func:`stage_inputs` does, is asked for all stages at once."""
 
 
-@dataclass(frozen=True)
-class StepResult:
+class StepResult(NamedTuple):
     """What a step did. ``ok`` False leaves the state as it was; ``reason`` says why."""
 
     ok: bool
@@ -59,8 +58,7 @@ class StepResult:
     records: tuple[Record, ...] = ()
 
 
-@dataclass(frozen=True)
-class Record:
+class Record(NamedTuple):
     """What the tangent of a solved step needs.
 
     ``after`` (fields,): fields at its end; ``inputs`` (stages, 3N + 6) and ``found`` (stages, 5 + N) at its stages. :func:`step_tangent
@@ -179,21 +177,20 @@ class Simulator:
         inputs_at: InputsAt,
         *,
         record: bool | Literal["end"] = False,
-        start: np.ndarray | None = None,
         events: Sequence[float] = (),
     ) -> StepResult:
         """Advance ``state`` from t to t + dt (s) in place; ``inputs_at`` gives actuators and load at any time in between.
 
         A step that fails is tried again with a fresh Jacobian and, for one-step schemes, in up to 32 substeps. With ``record`` the result
         carries what the tangent of the step needs; with "end", of its last stage alone, and the record holds until the state is written
-        to. ``start`` (stages, 5 + N): where to look for the unknowns, in place of their extrapolation. ``events``: s, times at which the
-        inputs jump or bend; one-step schemes divide the step there, since a step across one is of first order only.
+        to. ``events``: s, times at which the inputs jump or bend; one-step schemes divide the step there, since a step across one is of first
+        order only.
         """
         if events and self.scheme.one_step:
             divided = self._divided(state, t, inputs_at, record, events)
             if divided is not None:
                 return divided
-        result = self._attempt(state, self.scheme, t, inputs_at, not state.usable, record, start)
+        result = self._attempt(state, self.scheme, t, inputs_at, not state.usable, record)
         if result.ok:
             return result
         totals = [result.iterations, result.sweeps, result.jacobians]

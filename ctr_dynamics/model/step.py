@@ -59,18 +59,22 @@ def remember(unknowns, earlier, found):
 def history(weights, bank, hist, histb):
     """h = sum of weights (slots,) times the stored fields ``bank`` (slots, fields), into the main and the base part."""
     main = len(hist)
-    for i in range(main):
-        hist[i] = 0.0
-    for i in range(len(histb)):
-        histb[i] = 0.0
+    first = True
     for slot in range(len(weights)):
         w = weights[slot]
         if w != 0.0:
             row, rowb = bank[slot, :main], bank[slot, main:]
-            for i in range(main):
-                hist[i] += w * row[i]
-            for i in range(len(histb)):
-                histb[i] += w * rowb[i]
+            if first:
+                for i in range(main):
+                    hist[i] = w * row[i]
+                for i in range(len(histb)):
+                    histb[i] = w * rowb[i]
+            else:
+                for i in range(main):
+                    hist[i] += w * row[i]
+                for i in range(len(histb)):
+                    histb[i] += w * rowb[i]
+            first = False
 
 
 @njit(cache=True, nogil=True)

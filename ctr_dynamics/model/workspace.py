@@ -34,7 +34,7 @@ Field rows (F = 7 + 2N): q 0-2, omega 3-5, u of tube 1 6-8, then u_z and gamma o
 
 import math
 
-from numba import njit
+from numba import njit, types
 from numba.extending import overload
 
 # Rows of the state that every robot has.
@@ -83,10 +83,15 @@ def extra(tubes):
     return 4 * state_rows(n) + 2 * field_rows(n) + (13 + 7 * n) + parameter_rows(n) + 4 * n
 
 
-@njit(cache=True, forceinline=True)
 def lane_count(lanes):
-    """Lanes that a lane tuple stands for: none for one, else eight for each entry."""
-    return max(1, 8 * len(lanes))
+    """Lanes that a lane tuple stands for: none for one; numbers for eight each; truth values for one each, side by side in one short pack."""
+    return len(lanes) if lanes and isinstance(lanes[0], bool) else max(1, 8 * len(lanes))
+
+
+@overload(lane_count, jit_options={"forceinline": True})
+def _lane_count(lanes):
+    count = len(lanes) if isinstance(getattr(lanes, "dtype", None), types.Boolean) else max(1, 8 * len(lanes))
+    return lambda lanes: count
 
 
 def unknown_lanes(tubes):

@@ -5,7 +5,7 @@ import pytest
 from scipy.optimize import curve_fit
 
 from ctr_dynamics.estimation.columns import Columns
-from ctr_dynamics.estimation.modes import input_vector, modal_basis
+from ctr_dynamics.estimation.modes import modal_basis
 from ctr_dynamics.estimation.uncertainty import bias_sigma, model_uncertainty
 from ctr_dynamics.model.mesh import build_mesh
 from ctr_dynamics.model.model import Model
@@ -196,11 +196,10 @@ def test_modes_equal_a_simulated_small_vibration(model):
     simulator = Simulator(model, tolerance=1e-10)
     state = simulator.rest(Inputs(ALPHA, ZERO, BETA, ZERO, 2e-3 * slowest))
     tips, modes = [], []
-    vector = input_vector(ALPHA, BETA, np.zeros(3), np.zeros(3))
     for k in range(500):
         assert simulator.step(state, k * DT, lambda t: inputs).ok
         tips.append(state.nodes[-1, :3].copy())
-        modes.append(basis.measure(state.fields, vector))
+        modes.append(basis.measure(state.fields, inputs))
     path = (np.array(tips) - equilibrium.nodes[-1, :3]) @ slowest
     t = DT * np.arange(1, 501)
 
@@ -238,10 +237,10 @@ def test_modes_at_rest_are_zero_also_where_actuators_have_moved(model):
     par = model.parameters.copy()
     par[model.layout["alpha"]], par[model.layout["beta"]] = ALPHA, BETA
     basis = modal_basis(model, equilibrium, par, BETA)
-    there = input_vector(ALPHA, BETA, np.zeros(3), np.zeros(3))
+    there = Inputs(ALPHA, ZERO, BETA, ZERO)
     assert np.abs(basis.measure(equilibrium.fields, there).amplitude).max() < 1e-9
     alpha = ALPHA + np.array([0.004, -0.002])
     near = Statics(model, 1e-10).solve(BETA, alpha, np.zeros(3), np.zeros(3))
-    moved = basis.measure(near.fields, input_vector(alpha, BETA, np.zeros(3), np.zeros(3)))
+    moved = basis.measure(near.fields, Inputs(alpha, ZERO, BETA, ZERO))
     still = basis.measure(near.fields, there)
     assert np.abs(moved.amplitude).max() < 0.1 * np.abs(still.amplitude).max()

@@ -103,10 +103,10 @@ def test_signal_forgets_only_what_no_later_time_needs():
 
 
 def test_joint_order():
-    names = ["tube2_translation", "x", "tube1_rotation", "tube2_rotation", "tube1_translation"]
-    assert joint_order(names, 2) == [2, 3, 4, 0]
+    names = ("tube2_translation", "x", "tube1_rotation", "tube2_rotation", "tube1_translation")
+    assert joint_order(names, 2) == (2, 3, 4, 0)
     assert "lacks tube3_rotation, tube3_translation" in joint_order(names, 3)
-    assert "tube1_rotation more than once" in joint_order([*names, "tube1_rotation"], 2)
+    assert "tube1_rotation more than once" in joint_order((*names, "tube1_rotation"), 2)
 
 
 def test_finite():

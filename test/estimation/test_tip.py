@@ -279,14 +279,19 @@ def test_window_follows_changes_of_the_columns():
     assert np.allclose(window.last.columns, np.c_[columns, np.zeros(12)] @ T)
 
 
-def test_a_step_without_columns_of_its_own_gets_the_mean_of_its_neighbours():
-    window = TipWindow(3)
+@pytest.mark.parametrize("count", [1, 2])
+def test_steps_without_columns_of_their_own_get_those_between_their_neighbours(count):
+    window = TipWindow(5)
     window.clear(2)
-    for k in range(4):
+    for k in range(5):
         window.append(k * DT, node_at(k * DT), RNG.normal(size=(22, 2)), 0.0)
-    first, _, last = (window.at(k * DT, DT).columns for k in (1, 2, 3))
-    window.interpolate()
-    assert np.allclose(window.at(2 * DT, DT).columns, 0.5 * (first + last))
+    first, last = window.columns[window.end - 2 - count].copy(), window.last.columns.copy()
+    older = window.columns[: window.end - 2 - count].copy()
+    window.interpolate(count)
+    for i in range(1, count + 1):
+        share = i / (count + 1)
+        assert np.allclose(window.columns[window.end - 2 - count + i], (1 - share) * first + share * last)
+    assert np.array_equal(window.columns[: len(older)], older)
 
 
 def test_snapshots_by_reference_are_as_good_as_copies():
@@ -306,8 +311,7 @@ def test_snapshots_by_reference_are_as_good_as_copies():
         if action == "step":
             window.append(step * k, node_at(step * k), rng.normal(size=(22, COLUMNS)), 0.0)
             k += 1
-            if rng.random() < 0.5:
-                window.interpolate()
+            window.interpolate(int(rng.integers(window.OPEN)))
             kept.append((k, window.snapshot(), copy.deepcopy(window)))
         elif action == "reduce" and k:
             window.transform(rng.normal(size=(COLUMNS + 3, COLUMNS)))

@@ -1,4 +1,4 @@
-"""Packs of eight lanes against NumPy arrays of eight numbers."""
+"""Packs of lanes against NumPy arrays of as many numbers."""
 
 import math
 
@@ -8,13 +8,14 @@ from numba import njit
 
 from ctr_dynamics.model.lanes import PACK, columns, fma, largest, local_copy, rows, where_above
 from ctr_dynamics.model.newton import aligned_zeros
-from ctr_dynamics.model.workspace import workspace_rows
+from ctr_dynamics.model.workspace import lane_count, workspace_rows
 
 
 @njit
 def _formulas(lanes, a, b, out):
     """Each operation once, row by row."""
-    x, y, z = rows(lanes, a, 0, 8), rows(lanes, b, 0, 8), rows(lanes, out, 0, 8)
+    L = lane_count(lanes)
+    x, y, z = rows(lanes, a, 0, L), rows(lanes, b, 0, L), rows(lanes, out, 0, L)
     for r in range(len(x)):
         total = 0.0
         total += x[r]
@@ -27,19 +28,20 @@ def _formulas(lanes, a, b, out):
         z[7 * r + 6] = 1.5
 
 
-def test_arithmetic_on_packs_is_that_of_every_lane():
-    rng = np.random.default_rng(0)
-    a, b = rng.standard_normal((5, PACK)), rng.standard_normal((5, PACK))
-    out = np.zeros((35, PACK))
-    _formulas((0,), a.ravel(), b.ravel(), out.reshape(-1))
+@pytest.mark.parametrize("lanes", [(0,), (False,) * 2, (False,) * 4], ids=["eight", "two", "four"])
+def test_arithmetic_on_packs_is_that_of_every_lane(lanes):
+    rng, L = np.random.default_rng(0), lane_count(lanes)
+    a, b = rng.standard_normal((5, L)), rng.standard_normal((5, L))
+    out = np.zeros((35, L))
+    _formulas(lanes, a.ravel(), b.ravel(), out.reshape(-1))
     expected = np.stack(
         [
             (a - 2.0 * b) / (1.0 + b * b), 3.0 * a - b, np.abs(a) + np.floor(b), np.where(a > b, a, 0.25), np.exp(b),
-            np.repeat(a.max(axis=1, keepdims=True), PACK, axis=1), np.full_like(a, 1.5),
+            np.repeat(a.max(axis=1, keepdims=True), L, axis=1), np.full_like(a, 1.5),
         ],
         axis=1,
     )  # fmt: skip
-    np.testing.assert_allclose(out.reshape(5, 7, PACK), expected, rtol=1e-14, atol=1e-15)
+    np.testing.assert_allclose(out.reshape(5, 7, L), expected, rtol=1e-14, atol=1e-15)
 
 
 @njit
@@ -82,6 +84,18 @@ def test_a_local_copy_leaves_the_workspace_alone():
     _copied((0, 0), (0,), values.reshape(-1))
     np.testing.assert_array_equal(values[3], before[1] + before[2])
     np.testing.assert_array_equal(np.delete(values, 3, axis=0), np.delete(before, 3, axis=0))
+
+
+@njit
+def _count(lanes):
+    return lane_count(lanes)
+
+
+@pytest.mark.parametrize(
+    ("lanes", "count"), [((), 1), ((0,), 8), ((0,) * 3, 24), ((False,) * 2, 2), ((False,) * 4, 4)]
+)
+def test_lane_tuples_stand_for_the_same_lanes_compiled_or_not(lanes, count):
+    assert lane_count(lanes) == _count(lanes) == count
 
 
 def test_buffers_begin_with_a_line_of_the_cache():

@@ -1,0 +1,176 @@
+"""Two simulations of one robot a step at a time, side by side in the same sweeps: four lanes, two of them probes, take no longer than one.
+
+Sections, mesh and time scheme are common; parameters, actuators, loads and histories are each one's own.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+
+from ctr_dynamics.errors import InputError
+from ctr_dynamics.model.lockstep import solve_lanes
+from ctr_dynamics.model.mesh import Key, Mesh, section_lengths
+from ctr_dynamics.model.newton import aligned_zeros
+from ctr_dynamics.model.scheme import RATE_NOW, RATES, Y_BEFORE, Y_NOW
+from ctr_dynamics.model.simulator import InputsAt, Record, Simulator, State, StepResult, stage_inputs
+from ctr_dynamics.model.step import extrapolate, history, remember
+from ctr_dynamics.model.workspace import input_row, state_rows
+
+LANES = (False,) * 4  # lane tuple of a pair: both cases, and a probe of each
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _spread(first, second, target):
+    """The numbers (rows,) of both cases to their lanes of ``target`` (rows, 4), flat."""
+    for i in range(len(first)):
+        target[4 * i] = target[4 * i + 2] = first[i]
+        target[4 * i + 1] = target[4 * i + 3] = second[i]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _gather(values, first, second):
+    """The opposite of :func:`_spread`."""
+    for i in range(len(first)):
+        first[i], second[i] = values[4 * i], values[4 * i + 1]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _rates(c0, out, hist, target):
+    """Rates of the fields after a stage, c0 ``out`` + ``hist``; the probes, whose fields are perturbed, go on with those of their cases."""
+    for i in range(0, len(out), 4):
+        target[i] = target[i + 2] = c0 * out[i] + hist[i]
+        target[i + 1] = target[i + 3] = c0 * out[i + 1] + hist[i + 1]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _step(tubes, few, mesh, c0, weights, pars, inputs, banks, unknowns, earlier, founds, inverses, usable, work, scale, perturb, tolerance, limit,
+          nodes, spent):  # fmt: skip
+    """A step of both cases, as :func:`ctr_dynamics.model.step.step` for one; False if one does not converge, and then nothing has
+    changed. ``work``: buffers of the four lanes, of one for a Jacobian, of the Jacobian's lanes, and (slots, fields * 4) for stored fields.
+    ``nodes`` (2, nodes, S): states at the nodes. ``spent`` (2,): sweeps of each."""
+    big, one, eight, stored = work
+    par, seclen, hist, histb, out, outb = big[1], big[2], big[4], big[5], big[6], big[7]
+    n, stages, m, main = len(tubes), len(c0), len(scale), len(big[4])
+    x, column = np.empty(2 * m), 0
+    guess, inverse = np.empty((2, stages, m)), np.empty((2, m, m))
+    lengths = np.empty(len(mesh.sec_cells))
+    alive, fresh = np.ones(2, np.bool_), np.empty(2, np.bool_)
+    _spread(pars[0], pars[1], par)
+    for slot in range(RATES):
+        if np.any(weights[:, slot]):
+            _spread(banks[0][slot], banks[1][slot], stored[slot])
+    for j in range(2):
+        inverse[j], fresh[j] = inverses[j], not usable[j]
+        extrapolate(unknowns[j], earlier[j], perturb, guess[j])
+    spent[:] = stages
+    for stage in range(stages):
+        history(weights[stage], stored, hist, histb)
+        for i in range(inputs[0].shape[1]):
+            row = 4 * input_row(tubes, i)
+            _spread(inputs[0][stage, i : i + 1], inputs[1][stage, i : i + 1], par[row : row + 4])
+        section_lengths(mesh.bp_tube, mesh.bp_offset, inputs[0][stage, 2 * n : 3 * n], lengths)
+        _spread(lengths, lengths, seclen)
+        for j in range(2):
+            for i in range(m):
+                # what the guess missed at the stage before, it misses here too
+                x[2 * i + j] = guess[j, stage, i] + (
+                    founds[j][stage - 1, i] - guess[j, stage - 1, i] if stage else 0.0
+                )
+        _, column = solve_lanes(tubes, LANES, few, mesh, c0[stage], big, one, eight, x, inverse, fresh, alive, scale, perturb, tolerance, limit,
+                                spent, column)  # fmt: skip
+        if not (alive[0] and alive[1]):
+            return False
+        _rates(c0[stage], out, hist, stored[RATES + stage, :main])
+        _rates(c0[stage], outb, histb, stored[RATES + stage, main:])
+        for j in range(2):
+            for i in range(m):
+                founds[j][stage, i] = x[2 * i + j]
+    for j in range(2):
+        inverses[j][:] = inverse[j]
+        banks[j][Y_BEFORE] = banks[j][Y_NOW]
+        remember(unknowns[j], earlier[j], founds[j])
+    last = RATES + stages - 1
+    _gather(out, banks[0][Y_NOW, : main // 4], banks[1][Y_NOW, : main // 4])
+    _gather(outb, banks[0][Y_NOW, main // 4 :], banks[1][Y_NOW, main // 4 :])
+    _gather(stored[last], banks[0][last], banks[1][last])  # no later step reads the others
+    for j in range(2):
+        banks[j][RATE_NOW] = banks[j][last]
+    S = nodes.shape[2]
+    for p in range(nodes.shape[1]):
+        _gather(big[8][4 * S * p : 4 * S * (p + 1)], nodes[0, p], nodes[1, p])
+    return True
+
+
+class Pair:
+    """Steps two simulators of one model, scheme and tolerance together."""
+
+    def __init__(self, first: Simulator, second: Simulator) -> None:
+        self.first, self.second = first, second
+        self._buffers: dict[Key, tuple] = {}
+
+    def step(
+        self, a: State, b: State, t: float, inputs_a: InputsAt, inputs_b: InputsAt, *, record: bool = False
+    ) -> tuple[StepResult, StepResult] | None:
+        """Advance the states ``a`` of the first simulator and ``b`` of the second from t to t + dt (s) in place, as :meth:`Simulator.step` does
+        each. With ``record`` the first result carries what the tangent of its last stage needs, until the state is written to.
+
+        None where they cannot go together: other sections or translations than each other's, sections that change, inputs that are not finite,
+        a hard step. Nothing is done then.
+        """
+        model, scheme = self.first.model, self.first.scheme
+        times = t + scheme.times * scheme.dt
+        rows_a, last_a = stage_inputs(model, inputs_a, times)
+        rows_b, last_b = stage_inputs(model, inputs_b, times)
+        beta = last_a.beta.tobytes()
+        if a.key != b.key or beta != last_b.beta.tobytes():
+            return None
+        if not math.isfinite(np.vdot(rows_a, rows_a) + np.vdot(rows_b, rows_b)):
+            return None
+        key, mesh = a.key, a.mesh
+        if model.moving_precurvature or beta != a.inputs.beta.tobytes():
+            try:
+                key, mesh = model.mesh(last_a.beta, a.key)
+            except InputError:
+                return None
+            if key != a.key:
+                return None
+        work, nodes = self._work(key, mesh)
+        nodes, spent = np.empty(nodes), np.empty(2, np.int64)
+        found_a, found_b = np.empty_like(a.unknowns), np.empty_like(b.unknowns)
+        ok = _step(
+            model.tubes, model.jacobian_lanes, mesh, scheme.c0, scheme.weights, (self.first.parameters, self.second.parameters), (rows_a, rows_b),
+            (a.bank, b.bank), (a.unknowns, b.unknowns), (a.earlier, b.earlier), (found_a, found_b), (a.inverse, b.inverse), (a.usable, b.usable),
+            work, model.scale, model.step, self.first.tolerance, self.first.limit, nodes, spent,
+        )  # fmt: skip
+        a.usable = b.usable = ok  # the probes keep the Jacobians so
+        if not ok:
+            return None
+        a.mesh = b.mesh = mesh
+        a.inputs, b.inputs, a.nodes, b.nodes = last_a, last_b, nodes[0], nodes[1]
+        records: tuple[Record, ...] = ()
+        if record:
+            rates = a.bank[RATES + scheme.stages - 1 : RATES + scheme.stages]
+            records = (Record(scheme, key, mesh, a.bank[:0], a.bank[Y_NOW], rates, rows_a, found_a, times),)
+        sweeps_a, sweeps_b = spent.tolist()
+        return (
+            StepResult(True, "ok", sweeps_a - scheme.stages, sweeps_a, 0, records=records),
+            StepResult(True, "ok", sweeps_b - scheme.stages, sweeps_b, 0),
+        )
+
+    def _work(self, key: Key, mesh: Mesh) -> tuple:
+        if key not in self._buffers:
+            model = self.first.model
+            big, alone = model.buffers(mesh, len(LANES)), model.buffers(mesh, 1)
+            stored = aligned_zeros((RATES + self.first.scheme.stages) * (len(big[4]) + len(big[5])))
+            work = (
+                big,
+                tuple(alone[i] for i in (1, 2, 3, 4, 5)),
+                model.buffers(mesh, 8 * len(model.jacobian_lanes)),
+                stored.reshape(RATES + self.first.scheme.stages, -1),
+            )
+            S = state_rows(model.n)
+            self._buffers[key] = work, (2, len(alone[8]) // S, S)
+        return self._buffers[key]

@@ -1,0 +1,144 @@
+"""Two simulations in the same sweeps against each alone, and the probes that keep their Jacobians."""
+
+import numpy as np
+import pytest
+
+from ctr_dynamics.model.lockstep import _learn
+from ctr_dynamics.model.model import Model
+from ctr_dynamics.model.pair import Pair
+from ctr_dynamics.model.scheme import make_scheme
+from ctr_dynamics.model.simulator import Inputs, Simulator
+from ctr_dynamics.robot import load_robot
+
+DT, TOLERANCE = 0.003, 1e-9
+ROBOT = load_robot("till2020_tissue")
+BETA = np.array(ROBOT.rest.beta.value)
+RATES = np.array([1.5, -1.0])
+
+
+@pytest.fixture(scope="module")
+def model():
+    return Model(ROBOT, nodes=12)
+
+
+def turning(force=0.0, slide=0.0):
+    """Both tubes turn, a force in y, tube 2 is drawn in at ``slide`` m/s."""
+
+    def at(t):
+        beta_rate = np.array([0.0, -slide])
+        return Inputs(
+            np.array([1.2, 1.6]) + RATES * t,
+            RATES,
+            BETA + beta_rate * t,
+            beta_rate,
+            np.array([0.0, force, 0.0]),
+        )
+
+    return at
+
+
+def simulators(model, scheme="sdirk3", stiffer=1.05):
+    """One of the robot file, and one of another stiffness."""
+    other = model.parameters.copy()
+    other[model.layout["bending_stiffness"]] *= stiffer
+    return tuple(
+        Simulator(model, make_scheme(scheme, DT), TOLERANCE, block) for block in (model.parameters, other)
+    )
+
+
+def at_rest(simulator, inputs_at):
+    start = inputs_at(0.0)
+    return simulator.rest(Inputs(start.alpha, np.zeros(2), start.beta, np.zeros(2), start.force))
+
+
+@pytest.mark.parametrize("scheme", ["sdirk3", "bdf2", "backward_euler"])
+@pytest.mark.parametrize("slide", [0.0, 0.004], ids=["turning", "sliding"])
+def test_a_pair_goes_where_each_goes_alone(model, scheme, slide):
+    first, second = simulators(model, scheme)
+    inputs = turning(0.02, slide), turning(0.0, slide)
+    states = [at_rest(s, at) for s, at in zip((first, second), inputs, strict=True)]
+    alone = [state.copy() for state in states]
+    pair = Pair(first, second)
+    for k in range(40):
+        results = pair.step(*states, k * DT, *inputs)
+        assert results is not None
+        assert all(result.ok and result.sweeps >= first.scheme.stages for result in results)
+        for simulator, state, at in zip((first, second), alone, inputs, strict=True):
+            assert simulator.step(state, k * DT, at).ok
+    for together, apart in zip(states, alone, strict=True):
+        assert np.abs(together.nodes[:, :7] - apart.nodes[:, :7]).max() < 1e-7
+        assert np.abs(together.fields - apart.fields).max() < 1e-4 * np.abs(apart.fields).max()
+        assert np.array_equal(together.inputs.alpha, apart.inputs.alpha)
+        # and either goes on alone from there
+        assert first.step(together, 40 * DT, inputs[0]).ok
+    assert np.abs(states[0].nodes[-1, :3] - states[1].nodes[-1, :3]).max() > 1e-3
+
+
+def test_the_record_is_that_of_a_step_alone(model):
+    first, second = simulators(model)
+    at = turning(0.02)
+    a, b = at_rest(first, at), at_rest(second, at)
+    alone = a.copy()
+    pair = Pair(first, second)
+    for k in range(5):
+        found = pair.step(a, b, k * DT, at, at, record=True)
+        expected = first.step(alone, k * DT, at, record="end")
+        assert found is not None
+        assert found[1].records == ()
+    for one, other in zip(found[0].records[0], expected.records[0], strict=True):
+        if isinstance(one, np.ndarray) and one.size:
+            assert np.abs(one - other).max() <= 1e-5 * np.abs(other).max()
+
+
+@pytest.mark.parametrize(
+    "case", ["other translations", "other sections", "not finite", "beyond the plate", "no solution"]
+)
+def test_where_they_cannot_go_together_nothing_is_done(model, case):
+    first, second = simulators(model)
+    at = other = turning()
+    if case == "other translations":
+        other = turning(slide=1e-3)
+    elif case == "other sections":
+        at = other = turning(slide=8.0)
+    elif case == "not finite":
+        other = turning(force=np.nan)
+    elif case == "beyond the plate":
+        at = other = turning(slide=1e3)
+    elif case == "no solution":
+        other = turning(force=1e9)
+    a, b = at_rest(first, turning()), at_rest(second, turning())
+    before = a.copy(), b.copy()
+    assert Pair(first, second).step(a, b, 0.0, at, other) is None
+    for state, was in zip((a, b), before, strict=True):
+        assert state.key == was.key
+        for name in ("bank", "unknowns", "earlier", "nodes"):
+            assert np.array_equal(getattr(state, name), getattr(was, name))
+    assert Pair(first, second).step(a, b, 0.0, turning(), turning()) is not None
+
+
+def test_a_probe_renews_its_column():
+    """Of an inverse that is a little wrong, one column of what it inverts becomes exact, the others stay; all of them after a round."""
+    rng, m = np.random.default_rng(0), 7
+    exact, units = rng.normal(size=(m, m)), 10.0 ** -rng.integers(5, 8, m)
+    wrong = exact + 0.1 * rng.normal(size=(m, m))
+    inverse = np.linalg.inv(wrong)[None].copy()
+    column = 3
+    for probed in (3, 4, 5, 6, 0, 1, 2):
+        imbalance = np.zeros((m, 2))
+        imbalance[:, 1] = exact[:, probed] * units[probed]
+        column = _learn((False, False), imbalance.ravel(), column, units, inverse)
+        wrong[:, probed] = exact[:, probed]
+        assert np.allclose(np.linalg.inv(inverse[0]), wrong, atol=1e-9)
+    assert column == 3
+    assert np.allclose(np.linalg.inv(inverse[0]), exact, atol=1e-9)
+
+
+@pytest.mark.parametrize("imbalance", [np.nan, np.inf, 0.0], ids=["nan", "infinite", "singular"])
+def test_a_probe_that_tells_nothing_changes_nothing(imbalance):
+    rng, m = np.random.default_rng(1), 7
+    inverse = rng.normal(size=(1, m, m))
+    before = inverse.copy()
+    found = np.zeros((m, 2))
+    found[:, 1] = imbalance
+    assert _learn((False, False), found.ravel(), 0, np.full(m, 1e-6), inverse) == 1
+    assert np.array_equal(inverse, before)
