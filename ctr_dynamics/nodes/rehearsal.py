@@ -12,13 +12,14 @@ from ctr_dynamics.robot import Robot
 START_NS = 1_000_000_000_000
 JOINT_PERIOD_NS = 10_000_000
 TICKS = 40
+JUMP = 10.0  # times the change of a load for which a step is divided
 
 
 def rehearse(robot: Robot, settings: Settings) -> int:
     """Run another estimator near the robot's rest position with every kind of input; returns how many steps.
 
-    The actuators turn and slide a little, a load comes and goes, and the tracker reports the predicted tip,
-    now and then late enough to be fused by roll-back.
+    The actuators turn and slide a little, a load comes and goes, and jumps once, so that each run takes a step by itself, and the tracker
+    reports the predicted tip, now and then late enough to be fused by roll-back.
     """
     estimator = Estimator(robot, settings)
     encoder = StepEncoder(settings["output.frame_id"], robot.name)
@@ -30,7 +31,8 @@ def rehearse(robot: Robot, settings: Settings) -> int:
         motion = 0.5 * (1.0 - math.cos(2.0 * math.pi * tick / TICKS))
         positions = [x for alpha, beta in rest for x in (alpha + 0.02 * motion, beta - 2e-4 * motion)]
         estimator.add_joint_state(stamp_ns, names, positions)
-        estimator.add_tip_load(stamp_ns, (0.0, -1e-3 * motion, 0.0), (0.0, 0.0, 0.0))
+        force = 1e-3 * motion + (JUMP * estimator.model.load_kink[1] if tick == TICKS // 2 else 0.0)
+        estimator.add_tip_load(stamp_ns, (0.0, -float(force), 0.0), (0.0, 0.0, 0.0))
         steps_now = estimator.advance(stamp_ns + JOINT_PERIOD_NS // 2)
         steps += len(steps_now)
         for out in steps_now:

@@ -1,0 +1,29 @@
+"""The dry run before the first message meets every kind of step, so that none is compiled or loaded while steps are due."""
+
+import pytest
+
+from ctr_dynamics.model.pair import Pair
+from ctr_dynamics.model.simulator import Simulator
+from ctr_dynamics.nodes.rehearsal import rehearse
+from ctr_dynamics.parameters import Settings
+from ctr_dynamics.robot import load_robot
+
+
+@pytest.mark.parametrize("policy", ["predict", "wait"])
+@pytest.mark.parametrize("name", ["till2020_tissue", "three_tube"])
+def test_both_runs_step_together_and_each_by_itself(monkeypatch, name, policy):
+    taken = {Pair: [], Simulator: []}
+    for kind in taken:
+        step = kind.step
+
+        def noted(self, *args, step=step, found=taken[kind], **kwargs):
+            result = step(self, *args, **kwargs)
+            found.append((self, result))
+            return result
+
+        monkeypatch.setattr(kind, "step", noted)
+    settings = Settings({"robot": name, "output.policy": policy})
+    assert rehearse(load_robot(name), settings) > 100
+    assert sum(result is not None for _, result in taken[Pair]) > 100
+    assert len({id(simulator) for simulator, _ in taken[Simulator]}) == 2
+    assert all(result.ok for _, result in taken[Simulator])
