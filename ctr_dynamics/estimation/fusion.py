@@ -31,6 +31,7 @@ Floats = NDArray[np.float64]
 
 VAGUE = 1.0  # m^2 and rad^2: a covariance is not widened beyond
 SKIP = 2  # steps that the columns may skip
+APART = 4  # steps between a correction and a reduction: of those that one joint state covers, none does both
 DRIVEN = 4.0  # times its least: with a stronger drive of the tip force columns follow every step and are reduced twice as often
 
 
@@ -107,6 +108,7 @@ class Fusion:
         self.force_sigma = options.force_sigma
         self._refused = False
         self._corrected = False  # by a sample, since the columns were reduced
+        self._rest = 0  # steps since the last correction
         self._skipped = 0  # steps that the columns have not followed yet
         self._followed: Key = ((), ())  # sections of the last step that they have
         self._filters: dict[tuple[int, int], ExtendedKalmanFilter] = {}
@@ -153,7 +155,7 @@ class Fusion:
 
         The columns follow every third step, and every one after which a sample is fused (``sampled``) or they are reduced: they change little
         within 3 ms. The tip of a step that they skipped gets those between its neighbours'. With a strong drive of the tip force they follow
-        every step and are reduced twice as often. They are reduced, and the force's new randomness is taken in, behind a corrected step:
+        every step and are reduced twice as often. They are reduced, and the force's new randomness is taken in, some steps behind a correction:
         randomness taken in just before a sample has moved nothing yet that the sample could show. At the latest they are after
         ``reduce_between[1]`` steps, but not together with a sample, so that no step does all the work.
         """
@@ -165,7 +167,9 @@ class Fusion:
         self.columns.theta[force] *= decay
         driven = self.force_sigma > DRIVEN * self.options.force_sigma
         fewest, most = (steps // (1 + driven) for steps in self.options.reduce_between)
-        reduce = self.unreduced >= (2 * most if sampled else fewest if self._corrected else most)
+        self._rest += 1
+        behind = self._corrected and (self._rest >= APART or self.unreduced >= fewest + 2 * APART)
+        reduce = self.unreduced >= (2 * most if sampled else fewest if behind else most)
         key = result.records[0].key
         follow = (
             driven
@@ -275,7 +279,7 @@ class Fusion:
             compared = replace(
                 compared, reason="outside the gate twice in a row: fused with a widened covariance"
             )
-        self._refused, self._corrected = False, True
+        self._refused, self._corrected, self._rest = False, True, 0
         size = len(self.pi)
         if (size, dof) not in self._filters:
             self._filters[size, dof] = ExtendedKalmanFilter(dim_x=size, dim_z=dof)
@@ -399,7 +403,7 @@ class Fusion:
         """The filter's part of a state to which :meth:`restore` can return."""
         return (
             self.theta.copy(), self.bias.copy(), self.pi.copy(), self.unreduced, self.force_sigma,
-            (self._refused, self._corrected, self._skipped, self._followed), self.columns.snapshot(), self.tips.snapshot(),
+            (self._refused, self._corrected, self._rest, self._skipped, self._followed), self.columns.snapshot(), self.tips.snapshot(),
         )  # fmt: skip
 
     def restore(self, snapshot: tuple) -> None:
@@ -410,7 +414,7 @@ class Fusion:
     def _restore(self, snapshot: tuple) -> None:
         """All but the tips."""
         theta, bias, pi, self.unreduced, self.force_sigma, course, columns, _ = snapshot
-        self._refused, self._corrected, self._skipped, self._followed = course
+        self._refused, self._corrected, self._rest, self._skipped, self._followed = course
         self.theta, self.bias, self.pi = theta.copy(), bias.copy(), pi.copy()
         self.columns.restore(columns)
         self._apply_theta()
