@@ -14,11 +14,14 @@ def seldom_collected() -> Iterator[None]:
     """Inside, what there is already is never searched, and the rest seldom: a step leaves hardly any cycles behind, and a search takes
     milliseconds."""
     before = gc.get_threshold()
+    outermost = gc.get_freeze_count() == 0
     gc.collect()
-    gc.freeze()
-    gc.set_threshold(SELDOM, *before[1:])
+    if outermost:
+        gc.freeze()
+    gc.set_threshold(max(SELDOM, before[0]) if before[0] else 0, *before[1:])
     try:
         yield
     finally:
         gc.set_threshold(*before)
-        gc.unfreeze()
+        if outermost:
+            gc.unfreeze()

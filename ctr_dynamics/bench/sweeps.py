@@ -11,10 +11,14 @@ from ctr_dynamics.model.kernels import sweep
 from ctr_dynamics.model.mesh import node_count, section_lengths
 from ctr_dynamics.model.model import Model
 from ctr_dynamics.model.newton import broadcast
+from ctr_dynamics.model.pair import LANES as PAIR
 from ctr_dynamics.model.scheme import make_scheme
 from ctr_dynamics.model.statics import Statics
 from ctr_dynamics.model.workspace import lane_count
 from ctr_dynamics.robot import Robot, load_robot, robot_from_dict, robot_to_dict
+
+# one lane; those of two runs at once; packs of eight
+LANES: tuple[tuple[int, ...], ...] = ((), PAIR, (0,), (0,) * 2, (0,) * 4)
 
 
 def sweep_cost(model: Model, lanes: tuple[int, ...], repeats: int) -> float:
@@ -67,13 +71,12 @@ def sweeps(quick: bool) -> list[dict[str, Any]]:
     rows = []
     for tubes in (2,) if quick else (1, 2, 3):
         robot = _robot_of(tubes)
-        for nodes in (24, 100) if quick else (24, 50, 100, 200, 400):
+        for nodes in (16, 100) if quick else (16, 24, 50, 100, 200, 400):
             model = Model(robot, nodes=nodes)
             repeats = max(3, (2000 if quick else 20000) // nodes)
             plain = sweep_cost(model, (), repeats)
-            for count in (0, 1, 2) if quick or tubes != 2 else (0, 1, 2, 4):
-                lanes = (0,) * count
-                cost = plain if not count else sweep_cost(model, lanes, max(3, repeats // (4 * count)))
+            for lanes in LANES if tubes == 2 else (LANES[0], *LANES[2:4]):
+                cost = sweep_cost(model, lanes, max(3, repeats // lane_count(lanes))) if lanes else plain
                 rows.append(
                     {
                         "tubes": tubes,

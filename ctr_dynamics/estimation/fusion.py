@@ -31,7 +31,7 @@ Floats = NDArray[np.float64]
 
 VAGUE = 1.0  # m^2 and rad^2: a covariance is not widened beyond
 SKIP = 2  # steps that the columns may skip
-APART = 4  # steps between a correction and a reduction: of those that one joint state covers, none does both
+APART = 4  # steps between a correction and a reduction where samples leave that room: of those that one joint state covers, none does both
 DRIVEN = 4.0  # times its least: with a stronger drive of the tip force columns follow every step and are reduced twice as often
 
 
@@ -137,7 +137,7 @@ class Fusion:
             i = force.start + axis
             self.pi[i, i] = (self.options.force_sigma / size) ** 2
         self._refused = self._corrected = False
-        self._skipped = 0
+        self._rest = self._skipped = 0
         self._followed = state.key
         self.force_sigma = self.options.force_sigma
         self.tips.clear(r)
@@ -157,7 +157,7 @@ class Fusion:
         within 3 ms. The tip of a step that they skipped gets those between its neighbours'. With a strong drive of the tip force they follow
         every step and are reduced twice as often. They are reduced, and the force's new randomness is taken in, some steps behind a correction:
         randomness taken in just before a sample has moved nothing yet that the sample could show. At the latest they are after
-        ``reduce_between[1]`` steps, but not together with a sample, so that no step does all the work.
+        ``reduce_between[1]`` steps, or, so that no step does all the work, at the first one without a sample within the next eight.
         """
         dt = self.simulator.scheme.dt
         self.unreduced += 1
@@ -169,7 +169,7 @@ class Fusion:
         fewest, most = (steps // (1 + driven) for steps in self.options.reduce_between)
         self._rest += 1
         behind = self._corrected and (self._rest >= APART or self.unreduced >= fewest + 2 * APART)
-        reduce = self.unreduced >= (2 * most if sampled else fewest if behind else most)
+        reduce = self.unreduced >= (most + 2 * APART if sampled else fewest if behind else most)
         key = result.records[0].key
         follow = (
             driven

@@ -192,6 +192,8 @@ def modal_parts(
         yield None
     Q, image = np.concatenate(basis, axis=1), np.concatenate(images, axis=1)
     reduced = Q.T @ (weights[:, None] * image)
+    if not np.isfinite(reduced).all():
+        return
     values, left, right = eig(reduced, left=True, check_finite=False)
     with np.errstate(divide="ignore", invalid="ignore"):
         mu = (1.0 - 1.0 / values) / SHIFT_STEP
@@ -200,6 +202,7 @@ def modal_parts(
         & (mu.imag > 1.0)
         & (-mu.real < MAX_DAMPING * np.abs(mu))
         & (mu.real < 0.05 * np.abs(mu))
+        & (np.abs(np.einsum("ji,ji->i", left.conj(), right)) > 1e-8)  # else defective
     )
     order = [int(i) for i in np.flatnonzero(wanted)[np.argsort(np.abs(mu[wanted]))]][:count]
     if not order:

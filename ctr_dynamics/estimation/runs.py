@@ -160,7 +160,7 @@ class Runs:
         """Both runs from ``t`` (s) on, together where they can go together."""
         assert self.fused is not None and self.alone is not None
         corrected = self._corrected()
-        if not events:
+        if len(self.simulator.divisions(t, events)) == 2:
             both = self.pair.step(self.fused, self.alone, t, corrected, self._bare, record=record)
             if both is not None:
                 return both

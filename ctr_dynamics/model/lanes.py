@@ -1,6 +1,6 @@
-"""Numbers of several lanes at once, as a type of the compiler: kernels are written for one number and compiled for one or eight.
+"""Numbers of several lanes at once, as a type of the compiler: kernels are written for one number and compiled for one, two, four or eight.
 
-A *lane* is one complete copy of the problem. A :class:`Pack` holds the same quantity of eight lanes in one vector of the processor (or more,
+A *lane* is one complete copy of the problem. A :class:`Pack` holds the same quantity of up to eight lanes in one vector of the processor (or more,
 where they are shorter); arithmetic on it is plain IEEE arithmetic on every lane. :class:`Rows` is a view of a flat array whose element ``r``
 is one number, or one pack, of row ``r``. Views count no references and check no bounds. A :func:`local_copy` of the workspace lies on the
 stack of the function that makes it: where all its indices are known to the compiler, it becomes registers.

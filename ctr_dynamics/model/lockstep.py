@@ -1,4 +1,4 @@
-"""Shooting for several cases at once: each has its own unknowns and Jacobian, and all are swept together until the last has converged.
+"""Shooting for several cases at once: each has its own unknowns and Jacobian, and all are swept together until the last has converged or failed.
 
 A sweep of a few lanes takes as long as one of a single lane. Lanes that no case needs are therefore probes: each perturbs one unknown of its case
 and so renews one column of that case's Jacobian, another one in every sweep.
@@ -99,7 +99,8 @@ def _learn(lanes, res, column, perturb, inverse):
 @njit(cache=True, nogil=True, error_model="numpy")
 def solve_lanes(tubes, lanes, few, mesh, c0, big, one, eight, x, inverse, fresh, alive, scale, perturb, tolerance, limit, spent,
                 column):  # fmt: skip
-    """Unknowns ``x`` (m * C,) of all living cases, in place; returns sweeps and the next column to probe. Cases that cannot be solved die.
+    """Unknowns ``x`` (m * C,) of all living cases, in place; returns sweeps, new Jacobians and the next column to probe. Cases that cannot be
+    solved die; with probes, all is over then.
 
     The cases have the first lanes; if there are more, these come to whole probes of all cases, each with the data of its case: lane j belongs to
     case j modulo C. ``fresh`` (C,): cases whose ``inverse`` is not usable. ``spent`` (C,): sweeps of each case, counted on. ``column``: the
@@ -108,7 +109,7 @@ def solve_lanes(tubes, lanes, few, mesh, c0, big, one, eight, x, inverse, fresh,
     """
     W, par, seclen, trial, hist, histb, out, outb, nodes, res = big
     L, C, m = lane_count(lanes), len(alive), len(scale)
-    share = L == C
+    share, renewed = L == C, 0
     norm, new = np.empty(C), np.empty(C)
     newest = np.zeros(
         C, np.int64
@@ -122,6 +123,7 @@ def solve_lanes(tubes, lanes, few, mesh, c0, big, one, eight, x, inverse, fresh,
                 alive[j] = _renew(
                     tubes, lanes, few, mesh, c0, big, one, eight, x, j, perturb, inverse, scale, norm
                 )
+                renewed += 1
                 shared = j if alive[j] and share else -1
                 newest[j] = OWN
             else:
@@ -149,8 +151,8 @@ def solve_lanes(tubes, lanes, few, mesh, c0, big, one, eight, x, inverse, fresh,
                     for k in range(m):
                         step -= inverse[j, i, k] * res[k * L + j]
                     trial[i * L + j] = x[i * C + j] + step
-        if not waiting:
-            return sweeps, column
+        if not waiting or not (share or alive.all()):
+            return sweeps, renewed, column
         _probe(lanes, trial, C, column, perturb)
         sweep(tubes, lanes, W, c0, mesh, par, seclen, trial, hist, histb, out, outb, nodes, res)
         column = _learn(lanes, res, column, perturb, inverse)
@@ -181,10 +183,11 @@ def solve_lanes(tubes, lanes, few, mesh, c0, big, one, eight, x, inverse, fresh,
                     alive[j] = _renew(
                         tubes, lanes, few, mesh, c0, big, one, eight, x, j, perturb, inverse, scale, norm
                     )
+                    renewed += 1
                     newest[j] = OWN
                     shared = j if alive[j] and share else -1
             else:
                 newest[j] = OLD
     for j in range(C):
         alive[j] &= norm[j] <= tolerance
-    return sweeps, column
+    return sweeps, renewed, column

@@ -47,17 +47,19 @@ def _rates(c0, out, hist, target):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _step(tubes, few, mesh, c0, weights, pars, inputs, banks, unknowns, earlier, founds, inverses, usable, work, scale, perturb, tolerance, limit,
-          nodes, spent):  # fmt: skip
-    """A step of both cases, as :func:`ctr_dynamics.model.step.step` for one; False if one does not converge, and then nothing has
-    changed. ``work``: buffers of the four lanes, of one for a Jacobian, of the Jacobian's lanes, and (slots, fields * 4) for stored fields.
-    ``nodes`` (2, nodes, S): states at the nodes. ``spent`` (2,): sweeps of each."""
+          column, nodes, alive):  # fmt: skip
+    """A step of both cases, as :func:`ctr_dynamics.model.step.step` for one; returns sweeps and new Jacobians.
+
+    ``work``: buffers of the four lanes, of one for a Jacobian, of the Jacobian's lanes, and (slots, fields * 4) for stored fields. ``column``: the
+    unknown to probe first. ``nodes`` (2, nodes, S): states at the nodes. ``alive`` (2,) becomes False where a case does not converge, and then
+    nothing else has changed."""
     big, one, eight, stored = work
     par, seclen, hist, histb, out, outb = big[1], big[2], big[4], big[5], big[6], big[7]
     n, stages, m, main = len(tubes), len(c0), len(scale), len(big[4])
-    x, column = np.empty(2 * m), 0
+    x, sweeps, jacobians, spent = np.empty(2 * m), 0, 0, np.zeros(2, np.int64)
     guess, inverse = np.empty((2, stages, m)), np.empty((2, m, m))
     lengths = np.empty(len(mesh.sec_cells))
-    alive, fresh = np.ones(2, np.bool_), np.empty(2, np.bool_)
+    fresh = np.empty(2, np.bool_)
     _spread(pars[0], pars[1], par)
     for slot in range(RATES):
         if np.any(weights[:, slot]):
@@ -65,7 +67,6 @@ def _step(tubes, few, mesh, c0, weights, pars, inputs, banks, unknowns, earlier,
     for j in range(2):
         inverse[j], fresh[j] = inverses[j], not usable[j]
         extrapolate(unknowns[j], earlier[j], perturb, guess[j])
-    spent[:] = stages
     for stage in range(stages):
         history(weights[stage], stored, hist, histb)
         for i in range(inputs[0].shape[1]):
@@ -79,10 +80,12 @@ def _step(tubes, few, mesh, c0, weights, pars, inputs, banks, unknowns, earlier,
                 x[2 * i + j] = guess[j, stage, i] + (
                     founds[j][stage - 1, i] - guess[j, stage - 1, i] if stage else 0.0
                 )
-        _, column = solve_lanes(tubes, LANES, few, mesh, c0[stage], big, one, eight, x, inverse, fresh, alive, scale, perturb, tolerance, limit,
-                                spent, column)  # fmt: skip
+        plain, renewed, column = solve_lanes(tubes, LANES, few, mesh, c0[stage], big, one, eight, x, inverse, fresh, alive, scale, perturb,
+                                             tolerance, limit, spent, column)  # fmt: skip
+        sweeps += plain
+        jacobians += renewed
         if not (alive[0] and alive[1]):
-            return False
+            return sweeps, jacobians
         _rates(c0[stage], out, hist, stored[RATES + stage, :main])
         _rates(c0[stage], outb, histb, stored[RATES + stage, main:])
         for j in range(2):
@@ -90,6 +93,8 @@ def _step(tubes, few, mesh, c0, weights, pars, inputs, banks, unknowns, earlier,
                 founds[j][stage, i] = x[2 * i + j]
     for j in range(2):
         inverses[j][:] = inverse[j]
+        for i in range(inputs[j].shape[1]):
+            pars[j][input_row(tubes, i)] = inputs[j][stages - 1, i]
         banks[j][Y_BEFORE] = banks[j][Y_NOW]
         remember(unknowns[j], earlier[j], founds[j])
     last = RATES + stages - 1
@@ -101,13 +106,16 @@ def _step(tubes, few, mesh, c0, weights, pars, inputs, banks, unknowns, earlier,
     S = nodes.shape[2]
     for p in range(nodes.shape[1]):
         _gather(big[8][4 * S * p : 4 * S * (p + 1)], nodes[0, p], nodes[1, p])
-    return True
+    return sweeps, jacobians
 
 
 class Pair:
     """Steps two simulators of one model, scheme and tolerance together."""
 
     def __init__(self, first: Simulator, second: Simulator) -> None:
+        assert first.model is second.model
+        assert first.scheme is second.scheme
+        assert first.tolerance == second.tolerance
         self.first, self.second = first, second
         self._buffers: dict[Key, tuple] = {}
 
@@ -118,46 +126,50 @@ class Pair:
         each. With ``record`` the first result carries what the tangent of its last stage needs, until the state is written to.
 
         None where they cannot go together: other sections or translations than each other's, sections that change, inputs that are not finite,
-        a hard step. Nothing is done then.
+        a hard step. Nothing is done then, but that the next step of a run that has failed begins with a new Jacobian.
         """
         model, scheme = self.first.model, self.first.scheme
         times = t + scheme.times * scheme.dt
         rows_a, last_a = stage_inputs(model, inputs_a, times)
         rows_b, last_b = stage_inputs(model, inputs_b, times)
-        beta = last_a.beta.tobytes()
-        if a.key != b.key or beta != last_b.beta.tobytes():
+        translations = slice(2 * model.n, 3 * model.n)
+        if a.key != b.key or rows_a[:, translations].tobytes() != rows_b[:, translations].tobytes():
             return None
         if not math.isfinite(np.vdot(rows_a, rows_a) + np.vdot(rows_b, rows_b)):
             return None
         key, mesh = a.key, a.mesh
-        if model.moving_precurvature or beta != a.inputs.beta.tobytes():
+        if model.moving_precurvature or last_a.beta.tobytes() != a.inputs.beta.tobytes():
             try:
                 key, mesh = model.mesh(last_a.beta, a.key)
             except InputError:
                 return None
             if key != a.key:
                 return None
-        work, nodes = self._work(key, mesh)
-        nodes, spent = np.empty(nodes), np.empty(2, np.int64)
+        work, shape = self._work(key, mesh)
+        nodes, alive = np.empty(shape), np.ones(2, np.bool_)
+        column = (
+            scheme.stages * round(t / scheme.dt) % len(model.step)
+        )  # a step may be too short for all of them
         found_a, found_b = np.empty_like(a.unknowns), np.empty_like(b.unknowns)
-        ok = _step(
+        sweeps, jacobians = _step(
             model.tubes, model.jacobian_lanes, mesh, scheme.c0, scheme.weights, (self.first.parameters, self.second.parameters), (rows_a, rows_b),
             (a.bank, b.bank), (a.unknowns, b.unknowns), (a.earlier, b.earlier), (found_a, found_b), (a.inverse, b.inverse), (a.usable, b.usable),
-            work, model.scale, model.step, self.first.tolerance, self.first.limit, nodes, spent,
+            work, model.scale, model.step, self.first.tolerance, self.first.limit, column, nodes, alive,
         )  # fmt: skip
-        a.usable = b.usable = ok  # the probes keep the Jacobians so
-        if not ok:
+        if not alive.all():
+            a.usable, b.usable = a.usable and bool(alive[0]), b.usable and bool(alive[1])
             return None
+        a.usable = b.usable = True  # the probes keep the Jacobians so
         a.mesh = b.mesh = mesh
         a.inputs, b.inputs, a.nodes, b.nodes = last_a, last_b, nodes[0], nodes[1]
         records: tuple[Record, ...] = ()
         if record:
             rates = a.bank[RATES + scheme.stages - 1 : RATES + scheme.stages]
             records = (Record(scheme, key, mesh, a.bank[:0], a.bank[Y_NOW], rates, rows_a, found_a, times),)
-        sweeps_a, sweeps_b = spent.tolist()
+        iterations = sweeps - scheme.stages
         return (
-            StepResult(True, "ok", sweeps_a - scheme.stages, sweeps_a, 0, records=records),
-            StepResult(True, "ok", sweeps_b - scheme.stages, sweeps_b, 0),
+            StepResult(True, "ok", iterations, sweeps, jacobians, records=records),
+            StepResult(True, "ok", iterations, sweeps, jacobians),
         )
 
     def _work(self, key: Key, mesh: Mesh) -> tuple:

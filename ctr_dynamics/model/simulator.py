@@ -186,8 +186,9 @@ class Simulator:
         to. ``events``: s, times at which the inputs jump or bend; one-step schemes divide the step there, since a step across one is of first
         order only.
         """
-        if events and self.scheme.one_step:
-            divided = self._divided(state, t, inputs_at, record, events)
+        times = self.divisions(t, events)
+        if len(times) > 2:
+            divided = self._divided(state, times, inputs_at, record)
             if divided is not None:
                 return divided
         result = self._attempt(state, self.scheme, t, inputs_at, not state.usable, record)
@@ -219,27 +220,24 @@ class Simulator:
                 return StepResult(True, how, totals[0], totals[1], totals[2], count, tuple(records))
         return StepResult(False, result.reason, totals[0], totals[1], totals[2])
 
-    def _divided(
-        self,
-        state: State,
-        t: float,
-        inputs_at: InputsAt,
-        record: bool | Literal["end"],
-        events: Sequence[float],
-    ) -> StepResult | None:
-        """The step in parts that end at the ``events`` within it; None where there is none, or a part fails."""
+    def divisions(self, t: float, events: Sequence[float]) -> list[float]:
+        """Where the step from t (s) begins, those of the ``events`` (s) at which it is divided, and where it ends."""
         dt = self.scheme.dt
         least = SHORTEST_PART * dt
         times = [t]
-        for event in sorted(events):
+        for event in sorted(events) if self.scheme.one_step else ():
             if event - times[-1] > least and t + dt - event > least:
                 times.append(event)
-        if len(times) == 1:
-            return None
+        return [*times, t + dt]
+
+    def _divided(
+        self, state: State, times: list[float], inputs_at: InputsAt, record: bool | Literal["end"]
+    ) -> StepResult | None:
+        """The step in parts between ``times``; None where a part fails."""
         trial = state.copy()
         trial.forget_course()
         parts = []
-        for begin, end in pairwise([*times, t + dt]):
+        for begin, end in pairwise(times):
             scheme = make_scheme(self.scheme.name, end - begin)
             part = self._attempt(trial, scheme, begin, inputs_at, True, record)
             if not part.ok:

@@ -1,13 +1,13 @@
 """Workspace of the arc-length kernels: where each number lies, for any tube count.
 
 A *lane* is one complete copy of the problem (its own history, parameters, loads and unknowns). The plain sweep has one lane; the
-Jacobian, the tangents of a step and batches of simulations are the same code with 8 to 64 lanes, in packs of eight
+Jacobian, the tangents of a step and batches of simulations are the same code with 4 to 64 lanes, in packs
 (:mod:`ctr_dynamics.model.lanes`). Arrays have the lane as their last index. Every number that the equations touch lies in one workspace
 ``W`` at rows that are constant once the tube count is known, so that the compiler can keep them in registers. For the same reason loops over
 the tubes count to the tubes of the robot and ask which are present: the rows of each tube are then constants too.
 
-``tubes`` and ``lanes`` are tuples whose *lengths* carry the counts into the compiler (one entry a tube; one entry for eight lanes, none for
-a single lane); their contents are not read.
+``tubes`` and ``lanes`` are tuples whose *lengths* carry the counts into the compiler (one entry a tube; one number for eight lanes, none for
+a single lane, or truth values for a short pack with one lane each); their contents are not read.
 
 Layout of the workspace, in rows of one number a lane (see :func:`offsets` and :func:`extra`):
 

@@ -119,7 +119,7 @@ def test_corrections_without_time_are_put_off_and_end_the_same(sweep, in_time, s
     assert run.estimator.health.rolled_back != straight.estimator.health.rolled_back
     for reference in (straight, in_time):
         fused, alone = corrected_apart(run, reference)
-        assert fused < 5e-6
+        assert fused < 1e-5  # the covariance of the first course is kept
         assert alone < 2e-6
     # samples are counted once, however often they were fused again
     health = run.estimator.health
