@@ -112,7 +112,7 @@ class _Shooting:
             new = self.imbalance(c0, self.x + dx)
             reached = size_of(new)
             if reached < size:
-                broyden(self.inverse, dx, new - res)
+                broyden(self.inverse, dx, new - res, np.empty((2, len(dx))))
                 slow = reached > 0.6 * size
                 self.x, res, size, share, newest = self.x + dx, new, reached, min(1.0, 2.0 * share), False
                 if slow:

@@ -14,6 +14,7 @@ from ctr_dynamics.bench.sweeps import sweep_cost
 from ctr_dynamics.collector import seldom_collected
 from ctr_dynamics.estimation.estimator import DT_NS, Estimator
 from ctr_dynamics.model.model import Model
+from ctr_dynamics.nodes.rehearsal import rehearse
 from ctr_dynamics.parameters import Settings
 from ctr_dynamics.robot import load_robot
 
@@ -38,6 +39,7 @@ def fused_replay(
     settings, robot = Settings(values), load_robot(robot_name)
     opened = open_bag(bag)
     start = min(block.start_ns for file in opened.files for block in file.blocks)
+    rehearse(robot, settings)  # as the node does before its first message
     for _ in Player(Estimator(robot, settings)).play(opened, until_ns=start + 300_000_000):
         pass
     until = None if seconds is None else start + round(seconds * 1e9)

@@ -27,7 +27,7 @@ class Size:
     replay_nodes: tuple[int | None, ...]
     replay_s: float | None
     ranks: tuple[int, ...]
-    rank_s: float
+    rank_s: float | None
     time_nodes: int
     time_s: float
     reference: tuple[str, float]
@@ -45,11 +45,11 @@ class Size:
 LONG = Size(
     cut=1.0,
     work_s=2.0,
-    work_nodes=(16, 24, 100, 400),
+    work_nodes=(16, 100, 400),
     replay_nodes=(None, 100),
     replay_s=None,
     ranks=(10, 16, 24, 40),
-    rank_s=4.0,
+    rank_s=None,
     time_nodes=100,
     time_s=6.0,
     reference=("sdirk3", 0.0005),

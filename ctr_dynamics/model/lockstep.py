@@ -74,11 +74,11 @@ def _probe(lanes, trial, cases, column, perturb):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _learn(lanes, res, column, perturb, inverse):
+def _learn(lanes, res, column, perturb, inverse, work):
     """Take over into the ``inverse`` (C, m, m) the columns of the Jacobian that the probes from ``column`` on have found (Sherman and Morrison);
-    returns the next column."""
+    returns the next column. ``work`` (2, m) is written to."""
     L, cases, m = lane_count(lanes), len(inverse), len(perturb)
-    moved, row = np.empty(m), np.empty(m)
+    moved, row = work[0], work[1]
     for lane in range(cases, L):
         k, case = (column + lane // cases - 1) % m, lane % cases
         moved[:] = 0.0
@@ -114,7 +114,7 @@ def solve_lanes(tubes, lanes, few, mesh, c0, big, one, eight, x, inverse, fresh,
     newest = np.zeros(
         C, np.int64
     )  # whose Jacobian a case has: an OLD one, a new one of ANOTHER case, a new one of its OWN
-    dx, dr = np.empty(m), np.empty(m)
+    dx, dr, work = np.empty(m), np.empty(m), np.empty((2, m))
     before = np.empty(m * L)
     shared = -1
     for j in range(C):
@@ -135,7 +135,7 @@ def solve_lanes(tubes, lanes, few, mesh, c0, big, one, eight, x, inverse, fresh,
             trial[i * L + j] = x[i * C + j]
     _probe(lanes, trial, C, column, perturb)
     sweep(tubes, lanes, W, c0, mesh, par, seclen, trial, hist, histb, out, outb, nodes, res)
-    column = _learn(lanes, res, column, perturb, inverse)
+    column = _learn(lanes, res, column, perturb, inverse, work)
     sweeps = 1
     _norms(res, scale, lanes, alive, norm)
     for _ in range(limit):
@@ -155,7 +155,7 @@ def solve_lanes(tubes, lanes, few, mesh, c0, big, one, eight, x, inverse, fresh,
             return sweeps, renewed, column
         _probe(lanes, trial, C, column, perturb)
         sweep(tubes, lanes, W, c0, mesh, par, seclen, trial, hist, histb, out, outb, nodes, res)
-        column = _learn(lanes, res, column, perturb, inverse)
+        column = _learn(lanes, res, column, perturb, inverse, work)
         sweeps += 1
         _norms(res, scale, lanes, alive, new)
         for j in range(C):
@@ -168,7 +168,7 @@ def solve_lanes(tubes, lanes, few, mesh, c0, big, one, eight, x, inverse, fresh,
                     dx[i] = trial[i * L + j] - x[i * C + j]
                     dr[i] = res[i * L + j] - before[i * L + j]
                     x[i * C + j] = trial[i * L + j]
-                broyden(inverse[j], dx, dr)
+                broyden(inverse[j], dx, dr, work)
                 norm[j] = new[j]
             if not better and newest[j] == OWN:
                 alive[j] = False

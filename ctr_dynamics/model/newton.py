@@ -118,11 +118,13 @@ def invert(matrix, inverse):
 
 
 @njit(cache=True, nogil=True)
-def broyden(inverse, dx, dr):
+def broyden(inverse, dx, dr, work):
     """Broyden's update of the inverse Jacobian (m, m) in place, (dx - inv dr) dx^T inv / (dx^T inv dr), after x moved by ``dx`` and the
-    imbalance by ``dr`` (m,)."""
+    imbalance by ``dr`` (m,). ``work`` (2, m) is written to."""
     m = len(dx)
-    product, left = np.zeros(m), np.zeros(m)
+    product, left = work[0], work[1]
+    product[:] = 0.0
+    left[:] = 0.0
     for i in range(m):
         for k in range(m):
             product[i] += inverse[i, k] * dr[k]
@@ -169,6 +171,7 @@ def solve(
     trial = np.empty(m)
     dx = np.empty(m)
     previous = np.empty(m)
+    work = np.empty((2, m))
     sweeps, jacobians = 0, 0
     newest = False
     L = lane_count(lanes)
@@ -216,7 +219,7 @@ def solve(
                 previous[i] = res[i] - previous[i]
                 dx[i] = trial[i] - x[i]
                 x[i] = trial[i]
-            broyden(inverse, dx, previous)
+            broyden(inverse, dx, previous, work)
             slow = best > 0.6 * norm
             norm = best
             newest = False

@@ -14,6 +14,7 @@ from estimation_cases import (
     play,
 )
 
+from ctr_dynamics.estimation.estimator import MAX_FAILURES
 from ctr_dynamics.messages.encode import StepEncoder
 from ctr_dynamics.messages.topics import DIAGNOSTICS
 from ctr_dynamics.robot import load_robot
@@ -254,7 +255,7 @@ def test_snap_of_the_tubes():
 
 
 def test_snap_is_announced_in_the_diagnostics_before_it_happens():
-    """Turned slowly up to its snap: /diagnostics warns well before the first step that fails, and after 30 ms the model goes on behind it."""
+    """Turned slowly up to its snap: /diagnostics warns well before the first step that fails, and after 30 ms at most the model goes on behind it."""
     robot = load_robot("till2020_snap")
     snap, rate = s_curve(robot, robot.rest.beta.value, points=300).snap[0], 2.0
     made, encoder = estimator(None, robot), StepEncoder()
@@ -271,11 +272,11 @@ def test_snap_is_announced_in_the_diagnostics_before_it_happens():
             if not out.valid:
                 failed.append((at, out.reason))
     assert 0.1 < warned[0] < 0.5  # the equilibrium is lost at 1 s
-    assert len(failed) <= 10
+    assert len(failed) <= MAX_FAILURES
     assert all("step failed" in reason and at > 0.99 for at, reason in failed)
     print(f"warned of at {warned[0]:.3f} s, failed {failed}")
     assert outputs[-1].valid
-    assert made.health.restarts == bool(failed)
+    assert made.health.restarts == (len(failed) == MAX_FAILURES)  # or a step behind the snap succeeds
     [stability] = [s for s in made.health.statuses() if s.name == "stability"]
     assert stability.message.startswith("stable")
 

@@ -152,7 +152,7 @@ def test_a_probe_renews_its_column():
     for probed in (3, 4, 5, 6, 0, 1, 2):
         imbalance = np.zeros((m, 2))
         imbalance[:, 1] = exact[:, probed] * units[probed]
-        column = _learn((False, False), imbalance.ravel(), column, units, inverse)
+        column = _learn((False, False), imbalance.ravel(), column, units, inverse, np.empty((2, m)))
         wrong[:, probed] = exact[:, probed]
         assert np.allclose(np.linalg.inv(inverse[0]), wrong, atol=1e-9)
     assert column == 3
@@ -166,5 +166,5 @@ def test_a_probe_that_tells_nothing_changes_nothing(imbalance):
     before = inverse.copy()
     found = np.zeros((m, 2))
     found[:, 1] = imbalance
-    assert _learn((False, False), found.ravel(), 0, np.full(m, 1e-6), inverse) == 1
+    assert _learn((False, False), found.ravel(), 0, np.full(m, 1e-6), inverse, np.empty((2, m))) == 1
     assert np.array_equal(inverse, before)
