@@ -40,8 +40,6 @@ def fused_replay(
     opened = open_bag(bag)
     start = min(block.start_ns for file in opened.files for block in file.blocks)
     rehearse(robot, settings)  # as the node does before its first message
-    for _ in Player(Estimator(robot, settings)).play(opened, until_ns=start + 300_000_000):
-        pass
     until = None if seconds is None else start + round(seconds * 1e9)
     estimator = Estimator(robot, settings)
     player = Player(estimator)

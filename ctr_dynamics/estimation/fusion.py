@@ -107,8 +107,7 @@ class Fusion:
         self.inserted = 0.0  # share of beta's rate that the model's velocities hold already
         self.force_sigma = options.force_sigma
         self._refused = False
-        self._corrected = False  # by a sample, since the columns were reduced
-        self._rest = 0  # steps since the last correction
+        self._rest = 0  # steps since the last correction; more than `unreduced` where none has come since the columns were reduced
         self._skipped = 0  # steps that the columns have not followed yet
         self._followed: Key = ((), ())  # sections of the last step that they have
         self._filters: dict[tuple[int, int], ExtendedKalmanFilter] = {}
@@ -136,8 +135,8 @@ class Fusion:
         for axis, size in enumerate(scale):
             i = force.start + axis
             self.pi[i, i] = (self.options.force_sigma / size) ** 2
-        self._refused = self._corrected = False
-        self._rest = self._skipped = 0
+        self._refused = False
+        self._rest, self._skipped = 1, 0
         self._followed = state.key
         self.force_sigma = self.options.force_sigma
         self.tips.clear(r)
@@ -168,7 +167,8 @@ class Fusion:
         driven = self.force_sigma > DRIVEN * self.options.force_sigma
         fewest, most = (steps // (1 + driven) for steps in self.options.reduce_between)
         self._rest += 1
-        behind = self._corrected and (self._rest >= APART or self.unreduced >= fewest + 2 * APART)
+        corrected = self._rest <= self.unreduced  # since the columns were reduced
+        behind = corrected and (self._rest >= APART or self.unreduced >= fewest + 2 * APART)
         reduce = self.unreduced >= (most + 2 * APART if sampled else fewest if behind else most)
         key = result.records[0].key
         follow = (
@@ -245,7 +245,7 @@ class Fusion:
         self.pi = pi
         c.transform(T)
         self.tips.transform(T)
-        self.unreduced, self._corrected = 0, False
+        self.unreduced = 0
 
     def forget_parameters(self) -> None:
         """Have the parameters of the robot file again."""
@@ -279,7 +279,7 @@ class Fusion:
             compared = replace(
                 compared, reason="outside the gate twice in a row: fused with a widened covariance"
             )
-        self._refused, self._corrected, self._rest = False, True, 0
+        self._refused, self._rest = False, 0
         size = len(self.pi)
         if (size, dof) not in self._filters:
             self._filters[size, dof] = ExtendedKalmanFilter(dim_x=size, dim_z=dof)
@@ -403,7 +403,7 @@ class Fusion:
         """The filter's part of a state to which :meth:`restore` can return."""
         return (
             self.theta.copy(), self.bias.copy(), self.pi.copy(), self.unreduced, self.force_sigma,
-            (self._refused, self._corrected, self._rest, self._skipped, self._followed), self.columns.snapshot(), self.tips.snapshot(),
+            (self._refused, self._rest, self._skipped, self._followed), self.columns.snapshot(), self.tips.snapshot(),
         )  # fmt: skip
 
     def restore(self, snapshot: tuple) -> None:
@@ -414,7 +414,7 @@ class Fusion:
     def _restore(self, snapshot: tuple) -> None:
         """All but the tips."""
         theta, bias, pi, self.unreduced, self.force_sigma, course, columns, _ = snapshot
-        self._refused, self._corrected, self._rest, self._skipped, self._followed = course
+        self._refused, self._rest, self._skipped, self._followed = course
         self.theta, self.bias, self.pi = theta.copy(), bias.copy(), pi.copy()
         self.columns.restore(columns)
         self._apply_theta()

@@ -195,6 +195,7 @@ def modal_parts(
     if not np.isfinite(reduced).all():
         return
     values, left, right = eig(reduced, left=True, check_finite=False)
+    overlap = np.einsum("ji,ji->i", left.conj(), right)
     with np.errstate(divide="ignore", invalid="ignore"):
         mu = (1.0 - 1.0 / values) / SHIFT_STEP
     wanted = (
@@ -202,14 +203,13 @@ def modal_parts(
         & (mu.imag > 1.0)
         & (-mu.real < MAX_DAMPING * np.abs(mu))
         & (mu.real < 0.05 * np.abs(mu))
-        & (np.abs(np.einsum("ji,ji->i", left.conj(), right)) > 1e-8)  # else defective
+        & (np.abs(overlap) > 1e-8)  # else defective
     )
     order = [int(i) for i in np.flatnonzero(wanted)[np.argsort(np.abs(mu[wanted]))]][:count]
     if not order:
         return
     chosen = mu[order].astype(complex)
-    left, right = left[:, order].conj().T, right[:, order]
-    left = left / np.einsum("ij,ji->i", left, right)[:, None]
+    left, right = left[:, order].conj().T / overlap[order, None], right[:, order]
     coordinates = ((left.real @ Q.T) + 1j * (left.imag @ Q.T)) * weights  # of the modes, in any fields
     tip = matrix(equilibrium.tip_quaternion) @ image[main - (7 + 2 * n) :][:3]  # velocity of the images
     displacement = (tip @ (right / (values[order] * chosen))).T

@@ -81,9 +81,7 @@ class Signal:
         times, first = np.array(times_ns), 0
         while first < len(times_ns):
             i = bisect.bisect_left(stamps, times_ns[first])
-            after = bisect.bisect_right(
-                times_ns, stamps[i]
-            )  # the first time that is not between the same two samples
+            after = bisect.bisect_right(times_ns, stamps[i])  # the first time behind these two samples
             between_samples(
                 values[i - 1], values[i], stamps[i - 1], stamps[i], times[first:after], found[first:after], rates[first:after]
             )  # fmt: skip

@@ -59,22 +59,15 @@ def remember(unknowns, earlier, found):
 def history(weights, bank, hist, histb):
     """h = sum of weights (slots,) times the stored fields ``bank`` (slots, fields), into the main and the base part."""
     main = len(hist)
-    first = True
+    hist[:] = 0.0
+    histb[:] = 0.0
     for slot in range(len(weights)):
         w = weights[slot]
         if w != 0.0:
-            row, rowb = bank[slot, :main], bank[slot, main:]
-            if first:
-                for i in range(main):
-                    hist[i] = w * row[i]
-                for i in range(len(histb)):
-                    histb[i] = w * rowb[i]
-            else:
-                for i in range(main):
-                    hist[i] += w * row[i]
-                for i in range(len(histb)):
-                    histb[i] += w * rowb[i]
-            first = False
+            for i in range(main):
+                hist[i] += w * bank[slot, i]
+            for i in range(len(histb)):
+                histb[i] += w * bank[slot, main + i]
 
 
 @njit(cache=True, nogil=True)
