@@ -9,6 +9,8 @@ from ctr_dynamics.model.model import Model
 from ctr_dynamics.model.simulator import Inputs
 
 from .inputs import InputBuffer
+from .kernels import stage_rows
+from .signals import Samples
 
 Floats = NDArray[np.float64]
 
@@ -18,29 +20,37 @@ class Signals:
 
     def __init__(self, model: Model, inputs: InputBuffer) -> None:
         self.n, self.count, self.inputs = model.n, model.input_count, inputs
+        self._no_load: Samples = (*np.zeros((3, 6)), 0, 1, 2)
         self.clear()
 
     def clear(self) -> None:
         """Forget the step: other times or inputs come."""
-        self._known: dict[tuple[float, float], tuple[Floats, Floats]] = {}
+        self._known: dict[bytes, tuple[Floats, Floats]] = {}
 
     def rows(self, times: Floats) -> tuple[Floats, Floats]:
         """(stages, inputs) rows as :func:`ctr_dynamics.model.simulator.stage_inputs` orders them at ``times`` (stages,) s from t0, and beta's
         rate (N,) m/s at the last."""
-        key = (float(times[0]), float(times[-1]))
+        key = times.tobytes()
         if key not in self._known:
-            self._known[key] = self._at(times.tolist())
+            self._known[key] = self._at(times)
         return self._known[key]
 
-    def _at(self, times: list[float]) -> tuple[Floats, Floats]:
-        n, inputs = self.n, self.inputs
-        assert inputs.t0_ns is not None
-        stamps = [inputs.t0_ns + round(t * 1e9) for t in times]
-        value, rate = inputs.joints.rows(stamps, inputs.timeout_ns if inputs.predicting else 0)
-        rows = np.zeros((len(times), self.count))
+    def _at(self, times: Floats) -> tuple[Floats, Floats]:
+        n, t0_ns, joints, load = self.n, self.inputs.t0_ns, self.inputs.joints, self.inputs.load
+        assert t0_ns is not None
+        ahead_ns = self.inputs.timeout_ns if self.inputs.predicting else 0
+        first_ns, last_ns = t0_ns + round(float(times[0]) * 1e9), t0_ns + round(float(times[-1]) * 1e9)
+        drives = joints.around(first_ns, last_ns, ahead_ns)
+        wrench = load.around(first_ns, last_ns) if load.stamps else self._no_load
+        rows = np.empty((len(times), self.count))
+        if drives is not None and wrench is not None:
+            beta_rate = np.empty(n)
+            stage_rows(times, t0_ns, drives, wrench, rows, beta_rate)
+            return rows, beta_rate
+        stamps = [t0_ns + round(t * 1e9) for t in times.tolist()]
+        value, rate = joints.rows(stamps, ahead_ns)
         rows[:, :n], rows[:, n : 2 * n], rows[:, 2 * n : 3 * n] = value[:, :n], rate[:, :n], value[:, n:]
-        if inputs.load.stamps:
-            rows[:, 3 * n : 3 * n + 6] = inputs.load.rows(stamps)[0]
+        rows[:, 3 * n : 3 * n + 6] = load.rows(stamps)[0] if load.stamps else 0.0
         rows[:, 3 * n + 6 :] = rate[:, n : self.count - 2 * n - 6]
         return rows, rate[-1, n:]
 

@@ -26,9 +26,11 @@ COLUMN_NODES = 12
 EPSILON = 5e-9  # of one standard deviation: small against the curvature of the step, large against rounding
 
 
-def carried(matrix: csr_array, vector: Floats) -> Floats:
-    """Product (rows,) of one of a transfer's matrices with ``vector`` (columns,)."""
-    return sparse_product(matrix.indptr, matrix.indices, matrix.data, vector)
+def carried(matrix: csr_array, values: Floats) -> Floats:
+    """Product (rows, k) of one of a transfer's matrices with ``values`` (columns, k), or (rows,) with (columns,)."""
+    columns = values if values.ndim == 2 else values[:, None]
+    product = sparse_product(matrix.indptr, matrix.indices, matrix.data, columns)
+    return product if values.ndim == 2 else product[:, 0]
 
 
 def field_weights(model: Model, mesh: Mesh, beta: Floats) -> Floats:
@@ -198,7 +200,7 @@ class Columns:
     def nodes_change(self, a: Floats) -> Floats:
         """(nodes, S) change of the model's node states by the coefficients ``a`` (r,)."""
         change = (self.dnodes @ a).reshape(-1, 16 + 3 * self.model.n)
-        return change if self.transfer is None else self.transfer.nodes @ change
+        return change if self.transfer is None else carried(self.transfer.nodes, change)
 
     def position_deviation(self, pi: Floats) -> Floats:
         """(nodes,) deviation of the position per axis in m at the model's nodes, coefficients' covariance ``pi`` (r, r) or more. Kept while neither

@@ -8,7 +8,7 @@ drift likewise; (3) columns are reduced to the rank; (4) a sample is compared wi
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -49,8 +49,7 @@ class FusionOptions:
     reduce_between: tuple[int, int] = (14, 28)  # steps: fewest behind a correction, most without one
 
 
-@dataclass(frozen=True)
-class Update:
+class Update(NamedTuple):
     """One tracker sample's outcome: residual (6,), its predicted variance (6,), NIS, degrees of freedom, accepted, reason, and ``white`` (6,):
     the residual by the inverse root of its covariance, NaN on axes that are not measured."""
 
@@ -274,10 +273,10 @@ class Fusion:
         if compared.nis > self._gate[dof]:
             if not self._refused:
                 self._refused = True
-                return replace(compared, reason="outside the gate")
+                return compared._replace(reason="outside the gate")
             self._inflate(nu, H, R, self._gate[dof])
-            compared = replace(
-                compared, reason="outside the gate twice in a row: fused with a widened covariance"
+            compared = compared._replace(
+                reason="outside the gate twice in a row: fused with a widened covariance"
             )
         self._refused, self._rest = False, 0
         size = len(self.pi)
@@ -288,13 +287,13 @@ class Fusion:
         ekf.update(nu[:, None], HJacobian=lambda x: H, Hx=lambda x: np.zeros((dof, 1)))
         self.pi = 0.5 * (ekf.P + ekf.P.T)
         self._correct(state, ekf.x[:, 0])
-        return replace(compared, accepted=True)
+        return compared._replace(accepted=True)
 
     def compare(self, stamp: float, position: Floats, quaternion: Floats) -> Update:
         """The innovation of a reading that is not fused."""
         innovation = self._innovation(stamp, position, quaternion)
         return (
-            innovation if isinstance(innovation, Update) else replace(innovation[3], reason="fusion is off")
+            innovation if isinstance(innovation, Update) else innovation[3]._replace(reason="fusion is off")
         )
 
     def _innovation(

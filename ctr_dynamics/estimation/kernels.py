@@ -13,14 +13,36 @@ from_vector, to_vector = map(_compile, (rotations.from_vector, rotations.to_vect
 
 
 @_compile
-def between_samples(before, after, begin_ns, end_ns, times_ns, values, rates):
-    """Line from ``before`` (size,) at ``begin_ns`` to ``after`` at ``end_ns``: its ``values`` (times, size) and ``rates`` (times, size), 1/s, at
-    ``times_ns`` (times,)."""
-    for i in range(len(before)):
-        rate = (after[i] - before[i]) * (1e9 / (end_ns - begin_ns))
-        for k in range(len(times_ns)):
-            values[k, i] = before[i] + rate * ((times_ns[k] - begin_ns) * 1e-9)
-            rates[k, i] = rate
+def on_lines(samples, time_ns, value, rate):
+    """``value`` (size,) and its ``rate``, 1/s, at a time on the lines through three ``samples``: values, then stamps in ns. At the middle one the
+    rate is that of the first line."""
+    before, middle, after, before_ns, middle_ns, after_ns = samples
+    first = time_ns <= middle_ns
+    begin, end = (before, middle) if first else (middle, after)
+    begin_ns, end_ns = (before_ns, middle_ns) if first else (middle_ns, after_ns)
+    for i in range(len(value)):
+        rate[i] = (end[i] - begin[i]) * (1e9 / (end_ns - begin_ns))
+        value[i] = begin[i] + rate[i] * ((time_ns - begin_ns) * 1e-9)
+
+
+@_compile
+def stage_rows(times, t0_ns, joints, load, rows, beta_rate):
+    """Fill ``rows`` (stages, inputs) and ``beta_rate`` (N,) as :meth:`ctr_dynamics.estimation.actuation.Signals.rows` gives them, from the samples
+    around ``times`` (s after ``t0_ns``); see :func:`on_lines`."""
+    n = len(beta_rate)
+    value, rate = np.empty(2 * n), np.empty(2 * n)
+    wrench, change = np.empty(6), np.empty(6)
+    for k in range(len(times)):
+        time_ns = t0_ns + np.int64(np.rint(times[k] * 1e9))
+        on_lines(joints, time_ns, value, rate)
+        on_lines(load, time_ns, wrench, change)
+        for i in range(n):
+            rows[k, i], rows[k, n + i], rows[k, 2 * n + i] = value[i], rate[i], value[n + i]
+        for i in range(6):
+            rows[k, 3 * n + i] = wrench[i]
+        for i in range(rows.shape[1] - 3 * n - 6):
+            rows[k, 3 * n + 6 + i] = rate[n + i]
+    beta_rate[:] = rate[n:]
 
 
 @_compile
@@ -179,14 +201,13 @@ def backbone_rows(s, nodes, fields, points, n, insertion_rate, turn, shift, devi
 
 
 @_compile
-def sparse_product(indptr, indices, data, vector):
-    """Product (rows,) of a matrix in compressed rows with ``vector`` (columns,)."""
-    result = np.empty(len(indptr) - 1)
+def sparse_product(indptr, indices, data, columns):
+    """Product (rows, k) of a matrix in compressed rows with ``columns`` (columns, k)."""
+    result = np.zeros((len(indptr) - 1, columns.shape[1]))
     for row in range(len(result)):
-        total = 0.0
-        for k in range(indptr[row], indptr[row + 1]):
-            total += data[k] * vector[indices[k]]
-        result[row] = total
+        for place in range(indptr[row], indptr[row + 1]):
+            for k in range(columns.shape[1]):
+                result[row, k] += data[place] * columns[indices[place], k]
     return result
 
 
@@ -293,15 +314,49 @@ def shift_tips(columns, a, means):
 
 
 @_compile
-def sensitivity_rows(R, Q, lever, position, velocity, rate, columns, H):
-    """Derivative H (6, r + 13) of the expected reading; see :func:`ctr_dynamics.estimation.tracker.sensitivity`.
+def expected_reading(mean, rotation, translation, lever, bias):
+    """(7,) position and quaternion of :func:`ctr_dynamics.estimation.tracker.expected`."""
+    registration = multiply(from_vector(bias[0:3]), rotation)
+    point = mean[0:3] + applied(matrix(mean[3:7]), lever + bias[6:9])
+    pose = np.empty(7)
+    pose[0:3] = applied(matrix(registration), point) + translation + bias[3:6] + bias[10:13]
+    pose[3:7] = multiply(registration, mean[3:7])
+    return pose
 
-    ``R``, ``Q`` (3, 3): rotations of the tip and of the registration, errors included; ``lever`` (3,) m with its error, tip frame.
-    """
+
+@_compile
+def pose_difference(position, quaternion, expected_position, expected_quaternion, free):
+    """(6,) difference of :func:`ctr_dynamics.estimation.tracker.residual`; ``free``: the rotation axis that is not measured, 1 to 3, or 0."""
+    turned = multiply(conjugate(expected_quaternion), quaternion)
+    if free:
+        size = turned[0] ** 2 + turned[free] ** 2
+        if size > 1e-12:
+            twist = np.zeros(4)
+            twist[0], twist[free] = turned[0] / math.sqrt(size), -turned[free] / math.sqrt(size)
+            turned = multiply(turned, twist)
+    difference = np.empty(6)
+    difference[0:3] = position - expected_position
+    difference[3:6] = to_vector(turned)
+    return difference
+
+
+@_compile
+def pose_in_base(position, quaternion, rotation, translation, lever):
+    """(7,) tip pose of :meth:`ctr_dynamics.estimation.tracker.TrackerModel.to_base`."""
+    back = conjugate(rotation)
+    pose = np.empty(7)
+    pose[3:7] = multiply(back, quaternion)
+    pose[0:3] = applied(matrix(back), position - translation) - applied(matrix(pose[3:7]), lever)
+    return pose
+
+
+@_compile
+def sensitivity_rows(mean, columns, rotation, lever, bias, H):
+    """Derivative H (6, r + 13) of the expected reading; see :func:`ctr_dynamics.estimation.tracker.sensitivity`."""
     r = columns.shape[1]
-    arm = np.empty(3)
-    for i in range(3):
-        arm[i] = R[i, 0] * lever[0] + R[i, 1] * lever[1] + R[i, 2] * lever[2]
+    R, Q = matrix(mean[3:7]), matrix(multiply(from_vector(bias[0:3]), rotation))
+    position, velocity, rate = mean[0:3], mean[7:10], mean[10:13]
+    arm = applied(R, lever + bias[6:9])
     d = np.empty(3)
     for c in range(r):
         tx, ty, tz = columns[3, c], columns[4, c], columns[5, c]

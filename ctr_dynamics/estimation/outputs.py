@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -28,8 +29,7 @@ class Modes(NamedTuple):
         return cls(empty, empty, empty, empty)
 
 
-@dataclass(frozen=True)
-class Moment:
+class Moment(NamedTuple):
     """The model alone at a tracker sample's own time, ``ctr_base``, SI units.
 
     Attributes:
@@ -47,8 +47,7 @@ class Moment:
     beta_rate: Floats
 
 
-@dataclass(frozen=True)
-class Innovation:
+class Innovation(NamedTuple):
     """A processed tracker sample: residual (6,) and its predicted variance (6,) (position m in the tracker's axes, rotation rad in the
     sensor's), NIS, degrees of freedom, whether it was fused, how late it came (s), and why it was not fused; for the misfit monitor
     ``white``, the whitened residual (6,), and the ``moment``, None where the model alone has no tip of that time."""
@@ -76,8 +75,7 @@ class SolverStats(NamedTuple):
 NO_WORK = SolverStats(0, 0, "")
 
 
-@dataclass(frozen=True)
-class StepOutput:
+class StepOutput(NamedTuple):
     """Everything that is published for one stamp; ``ctr_base``, SI units.
 
     Attributes:
@@ -103,7 +101,7 @@ class StepOutput:
     modes: Modes
     disturbance_force: Floats
     disturbance_sigma: Floats
-    innovations: list[Innovation] = field(default_factory=list)
+    innovations: Sequence[Innovation] = ()
     solver: SolverStats = NO_WORK
 
     @classmethod

@@ -15,6 +15,7 @@ from ctr_dynamics.model.model import Model
 from ctr_dynamics.model.pair import Pair
 from ctr_dynamics.model.scheme import make_scheme
 from ctr_dynamics.model.simulator import Simulator, State, StepResult
+from ctr_dynamics.model.workspace import input_row
 from ctr_dynamics.parameters import Settings, axes_mask
 
 from .actuation import Actuation, Signals, standing
@@ -79,12 +80,8 @@ class Runs:
                 window=float(settings["filter.window_s"]),
             ),
         )
-        names = self.fusion.uncertainty.names
-        self._offset_rows = [
-            (i, names.index(f"encoder_offset.tube{i + 1}"))
-            for i in range(model.n)
-            if f"encoder_offset.tube{i + 1}" in names
-        ]
+        rows = [input_row(model.tubes, i) for i in range(model.input_count)]
+        self._by_theta = self.fusion.uncertainty.effect[rows]  # encoder offsets and tip force
         self._signals = Signals(model, inputs)
         self._load = np.zeros(model.input_count)  # of the robot file
         self._load[3 * model.n : 3 * model.n + 3] = model.setup.tip_force
@@ -171,11 +168,7 @@ class Runs:
 
     def _corrected(self) -> Actuation:
         """Actuators and load with the estimated offsets and force."""
-        shift, n = self._load.copy(), self.model.n
-        for i, row in self._offset_rows:
-            shift[i] += self.fusion.theta[row]
-        shift[3 * n : 3 * n + 3] += self.fusion.force
-        return Actuation(self._signals, shift)
+        return Actuation(self._signals, self._load + self._by_theta @ self.fusion.theta)
 
     def _start_filter(self, k: int) -> None:
         """Start the filter anew from the model alone at step ``k``: a correction has led the fused run astray."""

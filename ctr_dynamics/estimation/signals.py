@@ -13,9 +13,8 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from .kernels import between_samples
-
 Floats = NDArray[np.float64]
+Samples = tuple[Floats, Floats, Floats, int, int, int]  # three values and their stamps, ns
 
 
 class Signal:
@@ -57,41 +56,36 @@ class Signal:
         """
         stamps, values = self.stamps, self.values
         i = bisect.bisect_left(stamps, time_ns)
+        if i == len(stamps):
+            if len(stamps) < 2 or extrapolate_ns <= 0:
+                return values[-1], np.zeros(self.size)
+            i -= 1
         if i == 0:
             return values[0], np.zeros(self.size)
-        if i < len(stamps):
-            rate = (values[i] - values[i - 1]) * (1e9 / (stamps[i] - stamps[i - 1]))
-            return values[i - 1] + rate * ((time_ns - stamps[i - 1]) * 1e-9), rate
-        ahead = time_ns - stamps[-1]
-        if extrapolate_ns <= 0 or len(stamps) < 2:
-            return values[-1], np.zeros(self.size)
-        rate = (values[-1] - values[-2]) * (1e9 / (stamps[-1] - stamps[-2]))
-        if ahead > extrapolate_ns:
-            return values[-1] + rate * (extrapolate_ns * 1e-9), np.zeros(self.size)
-        return values[-1] + rate * (ahead * 1e-9), rate
+        rate = (values[i] - values[i - 1]) * (1e9 / (stamps[i] - stamps[i - 1]))
+        held_ns = stamps[-1] + extrapolate_ns
+        value = values[i - 1] + rate * ((min(time_ns, held_ns) - stamps[i - 1]) * 1e-9)
+        return value, rate if time_ns <= held_ns else np.zeros(self.size)
 
     def rows(self, times_ns: list[int], extrapolate_ns: int = 0) -> tuple[Floats, Floats]:
-        """Values and rates (times, size) at increasing times; see :meth:`at`."""
-        stamps, values = self.stamps, self.values
-        if len(stamps) == 1 or (extrapolate_ns <= 0 and times_ns[0] > stamps[-1]):
-            return np.array([values[-1]] * len(times_ns)), np.zeros((len(times_ns), self.size))
-        if times_ns[0] <= stamps[0] or times_ns[-1] > stamps[-1]:
-            return self._each(times_ns, extrapolate_ns)
-        found, rates = np.empty((2, len(times_ns), self.size))
-        times, first = np.array(times_ns), 0
-        while first < len(times_ns):
-            i = bisect.bisect_left(stamps, times_ns[first])
-            after = bisect.bisect_right(times_ns, stamps[i])  # the first time behind these two samples
-            between_samples(
-                values[i - 1], values[i], stamps[i - 1], stamps[i], times[first:after], found[first:after], rates[first:after]
-            )  # fmt: skip
-            first = after
-        return found, rates
-
-    def _each(self, times_ns: list[int], extrapolate_ns: int) -> tuple[Floats, Floats]:
-        """What :meth:`at` gives at one time after another."""
+        """Values and rates (times, size) at several times; see :meth:`at`."""
         pairs = [self.at(t, extrapolate_ns) for t in times_ns]
         return np.array([value for value, _ in pairs]), np.array([rate for _, rate in pairs])
+
+    def around(self, first_ns: int, last_ns: int, extrapolate_ns: int = 0) -> Samples | None:
+        """Three samples on whose lines lies what :meth:`at` gives at all times between two; None where that is not so."""
+        stamps, values = self.stamps, self.values
+        i = bisect.bisect_left(stamps, last_ns)
+        if i == len(stamps):
+            if first_ns > stamps[-1] and (extrapolate_ns <= 0 or i == 1):
+                return (values[-1],) * 3 + (0, 1, 2)
+            if last_ns - stamps[-1] > extrapolate_ns:
+                return None
+            i -= 1
+        j = max(i - 2, 0)
+        if i == 0 or first_ns <= stamps[j]:
+            return None
+        return values[j], values[i - 1], values[i], stamps[j], stamps[i - 1], stamps[i]
 
     def bends(self, after_ns: float, until_ns: float, least: Floats) -> list[int]:
         """Stamps between two times at which the rate changes by more than ``least`` (size,), 1/s, in some component."""
@@ -151,11 +145,9 @@ class Drives(Signal):
         n = self.n
         return np.concatenate([alpha[:n], value[n:]]), np.concatenate([alpha_rate[:n], rate[n:]])
 
-    def rows(self, times_ns: list[int], extrapolate_ns: int = 0) -> tuple[Floats, Floats]:
-        """Actuators and their rates at increasing times; see :meth:`Signal.rows`."""
-        if self.delay_ns:
-            return self._each(times_ns, extrapolate_ns)
-        return super().rows(times_ns, extrapolate_ns)
+    def around(self, first_ns: int, last_ns: int, extrapolate_ns: int = 0) -> Samples | None:
+        """See :meth:`Signal.around`; angles that follow later than positions do not lie on their lines."""
+        return None if self.delay_ns else super().around(first_ns, last_ns, extrapolate_ns)
 
     @property
     def known_until(self) -> int:

@@ -6,7 +6,6 @@ clock of another rate) is taken off the readings first, an average over a window
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -14,7 +13,16 @@ from numpy.typing import NDArray
 
 from ctr_dynamics.effects import Setup
 
-from .kernels import conjugate, from_vector, matrix, multiply, registered_pose, sensitivity_rows, to_vector
+from .kernels import (
+    expected_reading,
+    from_vector,
+    matrix,
+    multiply,
+    pose_difference,
+    pose_in_base,
+    registered_pose,
+    sensitivity_rows,
+)
 from .tip import Tip
 
 Floats = NDArray[np.float64]
@@ -51,8 +59,8 @@ class TrackerModel:
 
     def to_base(self, position: Floats, quaternion: Floats) -> tuple[Floats, Floats]:
         """Reading as a tip pose in ``ctr_base`` with the nominal geometry."""
-        q = multiply(conjugate(self.rotation), quaternion)
-        return matrix(conjugate(self.rotation)) @ (position - self.translation) - matrix(q) @ self.lever, q
+        pose = pose_in_base(position, quaternion, self.rotation, self.translation, self.lever)
+        return pose[:3], pose[3:]
 
 
 def tracker_model(
@@ -86,14 +94,8 @@ def tracker_model(
 
 def expected(model: TrackerModel, bias: Floats, tip: Tip) -> tuple[Floats, Floats]:
     """Reading (position (3,) m, quaternion (4,) wxyz) that the tip and the tracker states (13,) predict."""
-    R = matrix(tip.quaternion)
-    registration = multiply(from_vector(bias[ROTATION]), model.rotation)
-    position = (
-        matrix(registration) @ (tip.position + R @ (model.lever + bias[LEVER]))
-        + model.translation
-        + bias[TRANSLATION]
-    )
-    return position + bias[DRIFT], multiply(registration, tip.quaternion)
+    pose = expected_reading(tip.mean, model.rotation, model.translation, model.lever, bias)
+    return pose[:3], pose[3:]
 
 
 def residual(
@@ -108,23 +110,14 @@ def residual(
     Where ``mask`` (6,) leaves out one rotation axis, the sensor's turn about it is arbitrary and often large.
     It is taken off first, or it would turn the other two components.
     """
-    turned = multiply(conjugate(expected_quaternion), quaternion)
-    if mask is not None and mask[3:].sum() == 2:
-        axis = 1 + int(np.argmin(mask[3:]))
-        twist = np.zeros(4)
-        twist[0], twist[axis] = turned[0], turned[axis]
-        if twist @ twist > 1e-12:
-            turned = multiply(turned, conjugate(twist / math.sqrt(twist @ twist)))
-    turn = to_vector(turned)
-    return np.concatenate([position - expected_position, turn])
+    free = 1 + int(np.argmin(mask[3:])) if mask is not None and mask[3:].sum() == 2 else 0
+    return pose_difference(position, quaternion, expected_position, expected_quaternion, free)
 
 
 def sensitivity(model: TrackerModel, bias: Floats, tip: Tip) -> Floats:
     """H (6, r + 13): derivative of the expected reading by the columns' coefficients and the tracker states."""
     H = np.empty((6, tip.columns.shape[1] + STATES))
-    Q = matrix(multiply(from_vector(bias[ROTATION]), model.rotation))
-    lever = model.lever + bias[LEVER]
-    sensitivity_rows(matrix(tip.quaternion), Q, lever, tip.position, tip.velocity, tip.rate, tip.columns, H)
+    sensitivity_rows(tip.mean, tip.columns, model.rotation, model.lever, bias, H)
     return H
 
 

@@ -17,7 +17,7 @@ from ctr_dynamics.model.newton import aligned_zeros
 from ctr_dynamics.model.scheme import RATE_NOW, RATES, Y_BEFORE, Y_NOW
 from ctr_dynamics.model.simulator import InputsAt, Record, Simulator, State, StepResult, stage_inputs
 from ctr_dynamics.model.step import extrapolate, history, remember
-from ctr_dynamics.model.workspace import input_row, state_rows
+from ctr_dynamics.model.workspace import input_row
 
 LANES = (False,) * 4  # lane tuple of a pair: both cases, and a probe of each
 
@@ -46,13 +46,29 @@ def _rates(c0, out, hist, target):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
+def _together(first, second, n):
+    """Whether all inputs (stages, inputs) of both cases are finite, and their translations the same."""
+    total = 0.0
+    for stage in range(len(first)):
+        for i in range(first.shape[1]):
+            total += abs(first[stage, i]) + abs(second[stage, i])
+        for i in range(2 * n, 3 * n):
+            if first[stage, i] != second[stage, i]:
+                return False
+    return math.isfinite(total)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def _step(tubes, few, mesh, c0, weights, pars, inputs, banks, unknowns, earlier, founds, inverses, usable, work, scale, perturb, tolerance, limit,
           column, nodes, alive):  # fmt: skip
-    """A step of both cases, as :func:`ctr_dynamics.model.step.step` for one; returns sweeps and new Jacobians.
+    """A step of both cases, as :func:`ctr_dynamics.model.step.step` for one; returns sweeps, 0 where they cannot go together, and new Jacobians.
 
     ``work``: buffers of the four lanes, of one for a Jacobian, of the Jacobian's lanes, and (slots, fields * 4) for stored fields. ``column``: the
-    unknown to probe first. ``nodes`` (2, nodes, S): states at the nodes. ``alive`` (2,) becomes False where a case does not converge, and then
+    unknown to probe first. ``nodes``: states at the nodes (nodes, S) of both. ``alive`` (2,): set; False where a case does not converge, and then
     nothing else has changed."""
+    alive[:] = True
+    if not _together(inputs[0], inputs[1], len(tubes)):
+        return 0, 0
     big, one, eight, stored = work
     par, seclen, hist, histb, out, outb = big[1], big[2], big[4], big[5], big[6], big[7]
     n, stages, m, main = len(tubes), len(c0), len(scale), len(big[4])
@@ -103,9 +119,9 @@ def _step(tubes, few, mesh, c0, weights, pars, inputs, banks, unknowns, earlier,
     _gather(stored[last], banks[0][last], banks[1][last])  # no later step reads the others
     for j in range(2):
         banks[j][RATE_NOW] = banks[j][last]
-    S = nodes.shape[2]
-    for p in range(nodes.shape[1]):
-        _gather(big[8][4 * S * p : 4 * S * (p + 1)], nodes[0, p], nodes[1, p])
+    S = nodes[0].shape[1]
+    for p in range(len(nodes[0])):
+        _gather(big[8][4 * S * p : 4 * S * (p + 1)], nodes[0][p], nodes[1][p])
     return sweeps, jacobians
 
 
@@ -117,7 +133,9 @@ class Pair:
         assert first.scheme is second.scheme
         assert first.tolerance == second.tolerance
         self.first, self.second = first, second
-        self._buffers: dict[Key, tuple] = {}
+        self._times = first.scheme.times * first.scheme.dt
+        self._key: Key = ((), ())  # sections that the buffers are for
+        self._buffers: tuple = ()
 
     def step(
         self, a: State, b: State, t: float, inputs_a: InputsAt, inputs_b: InputsAt, *, record: bool = False
@@ -129,60 +147,57 @@ class Pair:
         a hard step. Nothing is done then, but that the next step of a run that has failed begins with a new Jacobian.
         """
         model, scheme = self.first.model, self.first.scheme
-        times = t + scheme.times * scheme.dt
+        times = t + self._times
         rows_a, last_a = stage_inputs(model, inputs_a, times)
         rows_b, last_b = stage_inputs(model, inputs_b, times)
-        translations = slice(2 * model.n, 3 * model.n)
-        if a.key != b.key or rows_a[:, translations].tobytes() != rows_b[:, translations].tobytes():
-            return None
-        if not math.isfinite(np.vdot(rows_a, rows_a) + np.vdot(rows_b, rows_b)):
+        if a.key != b.key:
             return None
         key, mesh = a.key, a.mesh
         if model.moving_precurvature or last_a.beta.tobytes() != a.inputs.beta.tobytes():
+            if not math.isfinite(last_a.beta.sum()):
+                return None
             try:
                 key, mesh = model.mesh(last_a.beta, a.key)
             except InputError:
                 return None
             if key != a.key:
                 return None
-        work, shape = self._work(key, mesh)
-        nodes, alive = np.empty(shape), np.ones(2, np.bool_)
+        if key != self._key:
+            self._key, self._buffers = key, self._make(mesh)
+        work, found_a, found_b, alive = self._buffers
         column = (
             scheme.stages * round(t / scheme.dt) % len(model.step)
         )  # a step may be too short for all of them
-        found_a, found_b = np.empty_like(a.unknowns), np.empty_like(b.unknowns)
         sweeps, jacobians = _step(
             model.tubes, model.jacobian_lanes, mesh, scheme.c0, scheme.weights, (self.first.parameters, self.second.parameters), (rows_a, rows_b),
             (a.bank, b.bank), (a.unknowns, b.unknowns), (a.earlier, b.earlier), (found_a, found_b), (a.inverse, b.inverse), (a.usable, b.usable),
-            work, model.scale, model.step, self.first.tolerance, self.first.limit, column, nodes, alive,
+            work, model.scale, model.step, self.first.tolerance, self.first.limit, column, (a.nodes, b.nodes), alive,
         )  # fmt: skip
-        if not alive.all():
+        if not (sweeps and alive[0] and alive[1]):
             a.usable, b.usable = a.usable and bool(alive[0]), b.usable and bool(alive[1])
             return None
         a.usable = b.usable = True  # the probes keep the Jacobians so
         a.mesh = b.mesh = mesh
-        a.inputs, b.inputs, a.nodes, b.nodes = last_a, last_b, nodes[0], nodes[1]
+        a.inputs, b.inputs = last_a, last_b
         records: tuple[Record, ...] = ()
         if record:
             rates = a.bank[RATES + scheme.stages - 1 : RATES + scheme.stages]
             records = (Record(scheme, key, mesh, a.bank[:0], a.bank[Y_NOW], rates, rows_a, found_a, times),)
         iterations = sweeps - scheme.stages
         return (
-            StepResult(True, "ok", iterations, sweeps, jacobians, records=records),
+            StepResult(True, "ok", iterations, sweeps, jacobians, 1, records),
             StepResult(True, "ok", iterations, sweeps, jacobians),
         )
 
-    def _work(self, key: Key, mesh: Mesh) -> tuple:
-        if key not in self._buffers:
-            model = self.first.model
-            big, alone = model.buffers(mesh, len(LANES)), model.buffers(mesh, 1)
-            stored = aligned_zeros((RATES + self.first.scheme.stages) * (len(big[4]) + len(big[5])))
-            work = (
-                big,
-                tuple(alone[i] for i in (1, 2, 3, 4, 5)),
-                model.buffers(mesh, 8 * len(model.jacobian_lanes)),
-                stored.reshape(RATES + self.first.scheme.stages, -1),
-            )
-            S = state_rows(model.n)
-            self._buffers[key] = work, (2, len(alone[8]) // S, S)
-        return self._buffers[key]
+    def _make(self, mesh: Mesh) -> tuple:
+        """Buffers of the kernel, the unknowns found at the stages of both, and whether they converged."""
+        model, stages = self.first.model, self.first.scheme.stages
+        big, alone = model.buffers(mesh, len(LANES)), model.buffers(mesh, 1)
+        stored = aligned_zeros((RATES + stages) * (len(big[4]) + len(big[5])))
+        work = (
+            big,
+            tuple(alone[i] for i in (1, 2, 3, 4, 5)),
+            model.buffers(mesh, 8 * len(model.jacobian_lanes)),
+            stored.reshape(RATES + stages, -1),
+        )
+        return work, *np.empty((2, stages, 5 + model.n)), np.ones(2, np.bool_)

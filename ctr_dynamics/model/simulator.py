@@ -26,9 +26,12 @@ OUTCOMES = {
 }
 
 
-@dataclass(frozen=True)
+@dataclass(slots=True)  # not frozen: those take three times as long to make
 class Inputs:
-    """Actuators and tip wrench at one time: alpha (N,) rad, alpha_rate (N,) rad/s, beta (N,) m, beta_rate (N,) m/s, wrench in ``ctr_base``."""
+    """Actuators and tip wrench at one time: alpha (N,) rad, alpha_rate (N,) rad/s, beta (N,) m, beta_rate (N,) m/s, wrench in ``ctr_base``.
+
+    Never written to once made: states and their copies share it.
+    """
 
     alpha: np.ndarray
     alpha_rate: np.ndarray

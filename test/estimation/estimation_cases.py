@@ -141,7 +141,7 @@ def check_outputs(run: Run) -> None:
         assert (out.stamp_ns - run.outputs[0].stamp_ns) % DT_NS == 0
         if out.valid:
             assert out.reason == ""
-            for name, value in vars(out).items():
+            for name, value in out._asdict().items():
                 if isinstance(value, np.ndarray):
                     assert np.isfinite(value).all(), (out.k, name)
         else:

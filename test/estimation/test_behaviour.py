@@ -150,7 +150,7 @@ def test_two_runs_are_the_same_bytes(release, plain):
     again = play(release)
     assert len(again.outputs) == len(plain.outputs)
     for a, b in zip(again.outputs, plain.outputs, strict=True):
-        for name, value in vars(a).items():
+        for name, value in a._asdict().items():
             other = getattr(b, name)
             if isinstance(value, np.ndarray):
                 assert value.tobytes() == other.tobytes(), (a.k, name)

@@ -165,7 +165,7 @@ def causes_of(residual_of, seconds=12.0, seed=0):
     for t in np.arange(0.0, seconds, 0.025):
         moment = motion(t)
         residual = residual_of(t, moment) + NOISE * rng.standard_normal(3)
-        regression.add(float(t), Moment(residual, *list(vars(moment).values())[1:]))
+        regression.add(float(t), moment._replace(residual=residual))
     return regression.causes()
 
 

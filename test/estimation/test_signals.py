@@ -1,8 +1,11 @@
 """Input signals: all stages of a step at once against one after another, and what drives both runs."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
+from ctr_dynamics.estimation.actuation import Signals
 from ctr_dynamics.estimation.signals import Drives, Signal
 
 MS = 1_000_000
@@ -27,13 +30,14 @@ def signal(make):
 @pytest.fixture(params=["plain", "played", "delayed"])
 def sampled(request):
     makes = {
-        "plain": lambda: Signal(4),
+        "plain": lambda: Drives(2, np.zeros(2), 0),
         "played": lambda: Drives(2, np.array([0.3, 0.0]), 0),
         "delayed": lambda: Drives(2, np.zeros(2), 4 * MS),
     }
     return signal(makes[request.param])
 
 
+@pytest.mark.parametrize("load", ["none", "held", "moving"])
 @pytest.mark.parametrize(
     ("first", "extrapolate"),
     [
@@ -51,22 +55,34 @@ def sampled(request):
         (58, 30),
         (70, 30),
         (70, 5),
+        (70, 0),
     ],
 )
-def test_stages_together_are_the_stages_alone(sampled, first, extrapolate):
-    times = [round((first + part) * MS) for part in (0.4359, 0.718, 1.0)]
-    values, rates = sampled.rows(times, extrapolate * MS)
-    assert values.shape == rates.shape == (3, 4)
-    for k, time in enumerate(times):
-        value, rate = sampled.at(time, extrapolate * MS)
-        np.testing.assert_array_equal(values[k], value)
-        np.testing.assert_array_equal(rates[k], rate)
+def test_stages_together_are_the_stages_alone(sampled, first, extrapolate, load):
+    t0_ns = -3 * MS
+    wrench = Signal(6)
+    for k in range({"none": 0, "held": 1, "moving": 9}[load]):
+        wrench.add((10 * k - 12) * MS, RNG.normal(size=6))
+    inputs = SimpleNamespace(
+        t0_ns=t0_ns, joints=sampled, load=wrench, timeout_ns=extrapolate * MS, predicting=extrapolate > 0
+    )
+    signals = Signals(SimpleNamespace(n=2, input_count=14), inputs)
+    stamps = [round((first + part) * MS) for part in (0.4359, 0.718, 1.0)]
+    rows, beta_rate = signals.rows(np.array([(stamp - t0_ns) * 1e-9 for stamp in stamps]))
+    assert rows.shape == (3, 14)
+    for k, stamp in enumerate(stamps):
+        value, rate = sampled.at(stamp, extrapolate * MS)
+        force = wrench.at(stamp)[0] if wrench.stamps else np.zeros(6)
+        wanted = np.concatenate([value[:2], rate[:2], value[2:], force, rate[2:]])
+        np.testing.assert_allclose(rows[k, :12], wanted[:12], rtol=1e-12, atol=1e-15)
+        np.testing.assert_allclose(rows[k, 12:], rate[2:], rtol=1e-12)
+    np.testing.assert_allclose(beta_rate, rate[2:], rtol=1e-12)
 
 
-def test_stages_between_two_samples_lie_on_their_line():
+def test_a_value_between_two_samples_lies_on_their_line():
     made = signal(lambda: Signal(4))
     times = [21 * MS, 24 * MS, 30 * MS]
-    values, rates = made.rows(times)
     wanted = line(made.values[2], made.values[3], 20 * MS, 30 * MS, times)
-    np.testing.assert_allclose(values, wanted[0], rtol=0, atol=1e-15)
-    np.testing.assert_allclose(rates, wanted[1], rtol=1e-15)
+    for k, found in enumerate(zip(*made.rows(times), strict=True)):
+        np.testing.assert_allclose(found[0], wanted[0][k], rtol=0, atol=1e-15)
+        np.testing.assert_allclose(found[1], wanted[1][k], rtol=1e-15)
