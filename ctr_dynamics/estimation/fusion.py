@@ -109,6 +109,8 @@ class Fusion:
         self._rest = 0  # steps since the last correction; more than `unreduced` where none has come since the columns were reduced
         self._skipped = 0  # steps that the columns have not followed yet
         self._followed: Key = ((), ())  # sections of the last step that they have
+        self._force = self.uncertainty.force
+        self._force_decay = math.exp(-simulator.scheme.dt / options.force_time)
         self._filters: dict[tuple[int, int], ExtendedKalmanFilter] = {}
         self._gate = {dof: float(chi2.ppf(options.gate_probability, dof)) for dof in range(1, 7)}
 
@@ -128,7 +130,7 @@ class Fusion:
         self.pi[:r, :r] = pi_aa
         sigma = bias_sigma(self.model.robot)
         self.pi[r:, r:] = np.diag(sigma**2)
-        force = self.uncertainty.force
+        force = self._force
         # the unknown force starts with its stationary spread, in columns of its own
         scale = np.diag(self.columns.theta)[force]
         for axis, size in enumerate(scale):
@@ -159,12 +161,12 @@ class Fusion:
         """
         dt = self.simulator.scheme.dt
         self.unreduced += 1
-        decay = math.exp(-dt / self.options.force_time)
-        force = self.uncertainty.force
-        self.theta[force] *= decay
-        self.columns.theta[force] *= decay
+        self.theta[self._force] *= self._force_decay
+        self.columns.theta[self._force] *= self._force_decay
+        fewest, most = self.options.reduce_between
         driven = self.force_sigma > DRIVEN * self.options.force_sigma
-        fewest, most = (steps // (1 + driven) for steps in self.options.reduce_between)
+        if driven:
+            fewest, most = fewest // 2, most // 2
         self._rest += 1
         corrected = self._rest <= self.unreduced  # since the columns were reduced
         behind = corrected and (self._rest >= APART or self.unreduced >= fewest + 2 * APART)
@@ -211,7 +213,7 @@ class Fusion:
         wide = r + 3
         theta = np.zeros((len(c.theta), wide))
         theta[:, :r] = c.theta
-        theta[self.uncertainty.force, r:] = self.force_sigma * np.eye(3)
+        theta[self._force, r:] = self.force_sigma * np.eye(3)
         c.theta = theta
         pi = np.zeros((wide + STATES, wide + STATES))
         pi[:r, :r], pi[:r, wide:] = self.pi[:r, :r], self.pi[:r, r:]
@@ -319,11 +321,11 @@ class Fusion:
     @property
     def force(self) -> Floats:
         """(3,) estimated tip force, N, ``ctr_base`` axes; the caller's own, as the filter goes on writing."""
-        return self.theta[self.uncertainty.force].copy()
+        return self.theta[self._force].copy()
 
     def force_variance(self) -> Floats:
         """(3,) variance of the estimated tip force, N^2."""
-        return spreads(self.columns.theta[self.uncertainty.force], self.pi)
+        return spreads(self.columns.theta[self._force], self.pi)
 
     def _inflate(self, nu: Floats, H: Floats, R: Floats, limit: float) -> None:
         """Two readings in a row outside the gate are no outliers: the model has lost the robot. Widen the fields' part of the covariance until

@@ -8,6 +8,8 @@ from numba import njit
 from . import rotations
 
 _compile = njit(cache=True, nogil=True, error_model="numpy")
+# sums in any order, so that the processor adds several at a time; what is not finite stays so
+_compile_sums = njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "contract"})
 matrix, multiply, conjugate = map(_compile, (rotations.matrix, rotations.multiply, rotations.conjugate))
 from_vector, to_vector = map(_compile, (rotations.from_vector, rotations.to_vector))
 
@@ -108,7 +110,7 @@ def registered_pose(mean, rotation, lever, bias, pose):
     return R, C, N
 
 
-@_compile
+@_compile_sums
 def registered_rows(mean, columns, rotation, lever, bias, pi, pose, covariance):
     """Pose (7,) of :func:`registered_pose` and the covariance (12, 12) of pose and twist (base axes) under ``pi`` (r + 13, r + 13).
 
@@ -118,42 +120,40 @@ def registered_rows(mean, columns, rotation, lever, bias, pi, pose, covariance):
     size = r + 13
     R, C, N = registered_pose(mean, rotation, lever, bias, pose)
     arm = applied(R, bias[6:9])  # extra arm beyond the nominal lever moves the pose when the tip turns
-    J = np.zeros((size, 12))  # transposed, so that the inner loops run over neighbours
+    J = np.zeros((12, size - 4))  # delay and drift are left out
     for c in range(r):
         ax, ay, az = columns[3, c], columns[4, c], columns[5, c]
         dx = columns[0, c] + ay * arm[2] - az * arm[1]
         dy = columns[1, c] + az * arm[0] - ax * arm[2]
         dz = columns[2, c] + ax * arm[1] - ay * arm[0]
         for i in range(3):
-            J[c, i] = C[i, 0] * dx + C[i, 1] * dy + C[i, 2] * dz
-            J[c, 3 + i] = C[i, 0] * ax + C[i, 1] * ay + C[i, 2] * az
-            J[c, 6 + i] = columns[6 + i, c]
-            J[c, 9 + i] = columns[9 + i, c]
+            J[i, c] = C[i, 0] * dx + C[i, 1] * dy + C[i, 2] * dz
+            J[3 + i, c] = C[i, 0] * ax + C[i, 1] * ay + C[i, 2] * az
+            J[6 + i, c] = columns[6 + i, c]
+            J[9 + i, c] = columns[9 + i, c]
     for c in range(3):
         nx, ny, nz = N[0, c], N[1, c], N[2, c]
-        J[r + c, 0] = ny * pose[2] - nz * pose[1]
-        J[r + c, 1] = nz * pose[0] - nx * pose[2]
-        J[r + c, 2] = nx * pose[1] - ny * pose[0]
+        J[0, r + c] = ny * pose[2] - nz * pose[1]
+        J[1, r + c] = nz * pose[0] - nx * pose[2]
+        J[2, r + c] = nx * pose[1] - ny * pose[0]
         for i in range(3):
-            J[r + c, 3 + i] = N[i, c]
-            J[r + 3 + c, i] = N[i, c]
-            J[r + 6 + c, i] = C[i, 0] * R[0, c] + C[i, 1] * R[1, c] + C[i, 2] * R[2, c]
-    half = np.empty(12)
-    covariance[:] = 0.0
-    for p in range(size):
-        half[:] = 0.0
-        for q in range(size):
-            x = pi[p, q]
-            for i in range(12):
-                half[i] += x * J[q, i]
-        for i in range(12):
-            x = J[p, i]
-            for n in range(12):
-                covariance[i, n] += x * half[n]
+            J[3 + i, r + c] = N[i, c]
+            J[i, r + 3 + c] = N[i, c]
+            J[i, r + 6 + c] = C[i, 0] * R[0, c] + C[i, 1] * R[1, c] + C[i, 2] * R[2, c]
+    half = np.empty(J.shape[1])
+    for n in range(12):
+        for p in range(len(half)):
+            product = 0.0
+            for q in range(len(half)):
+                product += pi[p, q] * J[n, q]
+            half[p] = product
+        for i in range(n + 1):
+            product = 0.0
+            for p in range(len(half)):
+                product += J[i, p] * half[p]
+            covariance[i, n] = covariance[n, i] = product
     total = 0.0
     for i in range(12):
-        for n in range(i):
-            covariance[i, n] = covariance[n, i] = 0.5 * (covariance[i, n] + covariance[n, i])
         for n in range(12):
             total += covariance[i, n]
     for i in range(7):
@@ -211,19 +211,13 @@ def sparse_product(indptr, indices, data, columns):
     return result
 
 
-@_compile
+@_compile_sums
 def modal_coordinates(by_fields, fields, by_inputs, alpha, beta, force, torque, at_rest):
     """(2m,) amplitudes and rates of modes: ``by_fields`` (2m, fields) times the ``fields``, less what the equilibrium at the inputs has."""
     values = np.empty(len(at_rest))
     for i in range(len(values)):
-        # eight sums: the processor adds them side by side
-        parts = np.zeros(8)
-        last = len(fields) - len(fields) % 8
-        for first in range(0, last, 8):
-            for k in range(8):
-                parts[k] += by_fields[i, first + k] * fields[first + k]
-        total = parts.sum() - at_rest[i]
-        for k in range(last, len(fields)):
+        total = -at_rest[i]
+        for k in range(len(fields)):
             total += by_fields[i, k] * fields[k]
         column = 0
         for part in (alpha, beta, force, torque):
@@ -234,22 +228,24 @@ def modal_coordinates(by_fields, fields, by_inputs, alpha, beta, force, torque, 
     return values
 
 
+@_compile_sums
+def quadratic(row, pi):
+    """row pi row^T of ``row`` (r,) under ``pi`` (at least r, r)."""
+    total = 0.0
+    for i in range(len(row)):
+        product = 0.0
+        for k in range(len(row)):
+            product += pi[i, k] * row[k]
+        total += row[i] * product
+    return total
+
+
 @_compile
 def spreads(rows, pi):
     """(rows,) variances rows pi rows^T of ``rows`` (rows, r) under ``pi`` (at least r, r), none below zero."""
     result = np.empty(len(rows))
-    r = rows.shape[1]
-    product = np.empty(r)
     for n in range(len(rows)):
-        product[:] = 0.0
-        for i in range(r):
-            x = rows[n, i]
-            for k in range(r):
-                product[k] += x * pi[i, k]
-        total = 0.0
-        for k in range(r):
-            total += product[k] * rows[n, k]
-        result[n] = max(total, 0.0)
+        result[n] = max(quadratic(rows[n], pi), 0.0)
     return result
 
 
@@ -259,12 +255,25 @@ def position_deviations(dnodes, size, pi):
 
     ``dnodes`` (nodes * size, r): columns of the node states, position first.
     """
-    nodes = len(dnodes) // size
-    result = np.empty(nodes)
-    for node in range(nodes):
-        variances = spreads(dnodes[node * size : node * size + 3], pi)
-        result[node] = math.sqrt((variances[0] + variances[1] + variances[2]) / 3.0)
+    result = np.empty(len(dnodes) // size)
+    for node in range(len(result)):
+        trace = 0.0
+        for axis in range(3):
+            trace += quadratic(dnodes[node * size + axis], pi)
+        result[node] = math.sqrt(max(trace, 0.0) / 3.0)
     return result
+
+
+@_compile
+def interpolate_columns(columns, count):
+    """Columns (tips, 12, r) of the ``count`` tips before the last, between those of their neighbours."""
+    last = len(columns) - 1
+    first = last - 1 - count
+    for i in range(1, count + 1):
+        for row in range(columns.shape[1]):
+            for c in range(columns.shape[2]):
+                change = columns[last, row, c] - columns[first, row, c]
+                columns[first + i, row, c] = columns[first, row, c] + i * (change / (count + 1))
 
 
 @_compile

@@ -7,11 +7,12 @@ where to look first, not to name a cause; that takes `ctr-dynamics diagnose`.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from .kernels import matrix
 from .outputs import Moment
@@ -28,95 +29,129 @@ CLOSE = 0.4 / INDEPENDENT  # s: a few samples for each independent residual are 
 LEAST = 0.3  # part of the residual above the tracker's noise that a cause must explain to be listed
 RIVAL = 0.9  # a cause that alone explains this part of what the best does is its rival
 MOST = 3  # causes listed
+TOGETHER = 32  # moments taken in at once
 
 
-def _turn(m: Moment) -> Floats:
-    """Displacement per rad of turn about the base's axis."""
-    return np.array([-m.position[1], m.position[0], 0.0])
+class Course(NamedTuple):
+    """Moments one after another, arrays of them (k, ...) as in :class:`ctr_dynamics.estimation.outputs.Moment`, and what the signatures share:
+    ``frame`` (k, 3, 3) of the tip, ``moving`` (k,) from 0 at rest to 1, and the sign of each tube's last motion ``held`` (k, n)."""
+
+    residual: Floats
+    position: Floats
+    velocity: Floats
+    acceleration: Floats
+    alpha: Floats
+    alpha_rate: Floats
+    beta_rate: Floats
+    frame: Floats
+    moving: Floats
+    held: Floats
 
 
-def _moving(m: Moment) -> float:
-    rate = math.hypot(*m.alpha_rate) + 100.0 * math.hypot(*m.beta_rate)
-    return rate * rate / (rate * rate + MOVING * MOVING)
+def course(moments: Sequence[Moment], held: Floats) -> Course:
+    """The ``moments`` as a course; ``held`` (n,): sign of each tube's motion before them."""
+    every = [np.array(values) for values in zip(*moments, strict=True)]
+    residual, position, quaternion, velocity, acceleration, alpha, alpha_rate, beta_rate = every
+    size = np.hypot.reduce(alpha_rate, axis=1) + 100.0 * np.hypot.reduce(beta_rate, axis=1)
+    signs = np.empty_like(alpha_rate)
+    for sign, rate in zip(signs, alpha_rate, strict=True):
+        sign[:] = held = np.where(np.abs(rate) > MOVING, np.sign(rate), held)
+    return Course(
+        residual, position, velocity, acceleration, alpha, alpha_rate, beta_rate, np.array([matrix(q) for q in quaternion]),
+        size**2 / (size**2 + MOVING**2), signs,
+    )  # fmt: skip
 
 
-def _swinging(m: Moment) -> Floats:
+def _always(c: Course, vectors: ArrayLike) -> Floats:
+    """The same columns (3, m) in every moment."""
+    vectors = np.asarray(vectors, float)
+    return np.broadcast_to(vectors, (len(c.residual), *vectors.shape))
+
+
+def _turn(c: Course, sizes: Floats) -> Floats:
+    """Columns for turns by ``sizes`` (k, m) rad about the base's axis."""
+    per_rad = np.stack([-c.position[:, 1], c.position[:, 0], np.zeros(len(c.position))], axis=1)
+    return per_rad[:, :, None] * sizes[:, None, :]
+
+
+def _swinging(c: Course) -> Floats:
     """Velocity while the actuators stand still: a wrong frequency shows as a phase that runs away."""
-    return (1.0 - _moving(m)) * m.velocity
+    return ((1.0 - c.moving)[:, None] * c.velocity)[:, :, None]
 
 
-def _cross(m: Moment) -> Floats:
-    x, y, z = m.position
-    return np.array([[0.0, z, -y], [-z, 0.0, x], [y, -x, 0.0]])
+def _cross(c: Course) -> Floats:
+    x, y, z = c.position.T
+    nil = np.zeros_like(x)
+    return np.stack(
+        [np.stack([nil, z, -y], axis=1), np.stack([-z, nil, x], axis=1), np.stack([y, -x, nil], axis=1)],
+        axis=1,
+    )
 
 
 @dataclass(frozen=True)
 class Signature:
-    """What a small ``effect`` adds to the reading: ``columns(moment, held)`` (3, m), one column per unknown; ``held`` (n,) is the sign of each
-    tube's last motion. ``text`` says what it looks for."""
+    """What a small ``effect`` adds to the readings of a course of k moments: ``columns(course)`` (k, 3, m), one column per unknown. ``text`` says
+    what it looks for."""
 
     effect: str
-    columns: Callable[[Moment, Floats], Floats]
+    columns: Callable[[Course], Floats]
     text: str
 
 
 SIGNATURES: tuple[Signature, ...] = (
-    Signature("tracker_latency", lambda m, held: m.velocity[:, None], "along the tip's velocity"),
+    Signature("tracker_latency", lambda c: c.velocity[:, :, None], "along the tip's velocity"),
     Signature(
         "actuator_latency",
-        lambda m, held: _moving(m) * m.velocity[:, None],
+        lambda c: (c.moving[:, None] * c.velocity)[:, :, None],
         "along the tip's velocity, only while actuators move",
     ),
-    Signature("tracker_averaging", lambda m, held: m.acceleration[:, None], "along the tip's acceleration"),
-    Signature("registration_translation", lambda m, held: np.eye(3), "constant"),
-    Signature("tip_force", lambda m, held: np.eye(3)[:, :2], "constant, across the base's axis"),
-    Signature("gravity_direction", lambda m, held: np.eye(3)[:, [0]], "constant, across gravity"),
-    Signature("registration_rotation", lambda m, held: _cross(m), "turn about the base"),
-    Signature("tracker_scale", lambda m, held: m.position[:, None], "grows with the distance from the base"),
-    Signature("tracker_lever_arm", lambda m, held: matrix(m.quaternion), "constant in the tip's frame"),
-    Signature(
-        "exposed_length", lambda m, held: matrix(m.quaternion)[:, 2:], "constant, along the tip's tangent"
-    ),
+    Signature("tracker_averaging", lambda c: c.acceleration[:, :, None], "along the tip's acceleration"),
+    Signature("registration_translation", lambda c: _always(c, np.eye(3)), "constant"),
+    Signature("tip_force", lambda c: _always(c, np.eye(3)[:, :2]), "constant, across the base's axis"),
+    Signature("gravity_direction", lambda c: _always(c, np.eye(3)[:, [0]]), "constant, across gravity"),
+    Signature("registration_rotation", _cross, "turn about the base"),
+    Signature("tracker_scale", lambda c: c.position[:, :, None], "grows with the distance from the base"),
+    Signature("tracker_lever_arm", lambda c: c.frame, "constant in the tip's frame"),
+    Signature("exposed_length", lambda c: c.frame[:, :, 2:], "constant, along the tip's tangent"),
     Signature(
         "youngs_modulus",
-        lambda m, held: np.column_stack([m.position * [1.0, 1.0, 0.0], [0.0, 1.0, 0.0], _swinging(m)]),
+        lambda c: np.concatenate(
+            [(c.position * [1.0, 1.0, 0.0])[:, :, None], _always(c, [[0.0], [1.0], [0.0]]), _swinging(c)],
+            axis=2,
+        ),
         "along the deflection from the base's axis, sag, and the lag of a swing",
     ),
     Signature(
         "payload_mass",
-        lambda m, held: np.column_stack([m.acceleration + [0.0, GRAVITY, 0.0], _swinging(m)]),
+        lambda c: np.concatenate([(c.acceleration + [0.0, GRAVITY, 0.0])[:, :, None], _swinging(c)], axis=2),
         "along gravity and the tip's acceleration together, and the lag of a swing",
     ),
     Signature(
         "precurvature",
-        lambda m, held: (m.position * [1.0, 1.0, 0.0])[:, None],
+        lambda c: (c.position * [1.0, 1.0, 0.0])[:, :, None],
         "radial, turning with the tubes",
     ),
-    Signature("encoder_offset", lambda m, held: _turn(m)[:, None], "turn about the base's axis"),
-    Signature(
-        "encoder_gain", lambda m, held: np.outer(_turn(m), m.alpha), "turn that grows with each tube's angle"
-    ),
+    Signature("encoder_offset", lambda c: _turn(c, np.ones((len(c.alpha), 1))), "turn about the base's axis"),
+    Signature("encoder_gain", lambda c: _turn(c, c.alpha), "turn that grows with each tube's angle"),
     Signature(
         "shear_modulus",
-        lambda m, held: np.outer(_turn(m), m.alpha[:-1] - m.alpha[1:]),
+        lambda c: _turn(c, c.alpha[:, :-1] - c.alpha[:, 1:]),
         "turn that grows with the angle between the tubes",
     ),
-    Signature(
-        "backlash", lambda m, held: np.outer(_turn(m), held), "turn by the sign of each tube's last motion"
-    ),
+    Signature("backlash", lambda c: _turn(c, c.held), "turn by the sign of each tube's last motion"),
     Signature(
         "base_coulomb",
-        lambda m, held: np.outer(_turn(m), held * _moving(m)),
+        lambda c: _turn(c, c.held * c.moving[:, None]),
         "turn by the sign of each tube's rate, while it moves",
     ),
     Signature(
         "tube_coulomb",
-        lambda m, held: np.outer(_turn(m), np.tanh((m.alpha_rate[:-1] - m.alpha_rate[1:]) / MOVING)),
+        lambda c: _turn(c, np.tanh((c.alpha_rate[:, :-1] - c.alpha_rate[:, 1:]) / MOVING)),
         "turn by the sign of the tubes' relative rate",
     ),
     Signature(
         "insertion_velocity",
-        lambda m, held: m.beta_rate[0] * matrix(m.quaternion)[:, 2:],
+        lambda c: c.beta_rate[:, :1, None] * c.frame[:, :, 2:],
         "along the tangent, with the rate of insertion",
     ),
 )
@@ -135,6 +170,7 @@ class Cause:
 class Regression:
     """Sums of the normal equations of all signatures together, with a memory that fades over ``memory`` (s).
 
+    Moments are collected and taken in ``TOGETHER``, which costs hardly more than taking in one.
     ``noise``: standard deviation of the tracker's position, m per axis.
     """
 
@@ -144,39 +180,55 @@ class Regression:
 
     def clear(self) -> None:
         """Forget everything."""
-        self._last: float | None = None
+        self._waiting: list[tuple[float, Moment]] = []
+        self._time: float | None = None  # of the newest moment
+        self._last: float | None = None  # of the newest that has been taken in
         self._held: Floats | None = None
         self.seconds = 0.0
         self.samples = 0.0
 
     def add(self, time: float, moment: Moment) -> None:
         """Take in the moment of a sample of ``time`` (s), unless it follows the last one too closely to say anything new."""
-        if self._last is not None and abs(time - self._last) < CLOSE:
+        if self._time is not None and abs(time - self._time) < CLOSE:
             return
-        rates = moment.alpha_rate
-        if self._held is None:
-            self._held = np.zeros(len(rates))
-        self._held = np.where(np.abs(rates) > MOVING, np.sign(rates), self._held)
-        blocks = [s.columns(moment, self._held) for s in SIGNATURES]
-        X = np.concatenate(blocks, axis=1)
-        y = moment.residual
-        if not np.isfinite(X.sum() + y.sum()):
+        self._time = time
+        self._waiting.append((time, moment))
+        if len(self._waiting) >= TOGETHER:
+            self._take_in()
+
+    def _take_in(self) -> None:
+        """The moments that wait, each worth less the older it is."""
+        waiting, self._waiting = self._waiting, []
+        if not waiting:
+            return
+        times = np.array([time for time, _ in waiting])
+        c = course([moment for _, moment in waiting], np.zeros(1) if self._held is None else self._held)
+        self._held = c.held[-1]
+        blocks = [s.columns(c) for s in SIGNATURES]
+        X, y = np.concatenate(blocks, axis=2), c.residual
+        finite = np.isfinite(X.sum(axis=(1, 2)) + y.sum(axis=1))
+        times, X, y = times[finite], X[finite], y[finite]
+        if not len(times):
             return
         if self._last is None:
-            ends = np.cumsum([0, *(b.shape[1] for b in blocks)])
+            ends = np.cumsum([0, *(b.shape[2] for b in blocks)])
             self._slices = [
                 np.arange(a, b) for a, b in zip(ends[:-1].tolist(), ends[1:].tolist(), strict=True)
             ]
             self._gram, self._moment = np.zeros((ends[-1], ends[-1])), np.zeros(ends[-1])
             self._square = 0.0
-        step = min(max(time - self._last, 0.0), self.memory) if self._last is not None else 0.0
-        fade = math.exp(-step / self.memory)
-        self._gram = fade * self._gram + X.T @ X
-        self._moment = fade * self._moment + X.T @ y
-        self._square = fade * self._square + float(y @ y)
-        self.samples = fade * self.samples + 1.0
-        self.seconds = fade * self.seconds + step
-        self._last = time
+        steps = np.clip(
+            np.diff(times, prepend=times[0] if self._last is None else self._last), 0.0, self.memory
+        )
+        fades = np.exp((np.cumsum(steps) - steps.sum()) / self.memory)
+        fade = math.exp(-steps.sum() / self.memory)
+        weighted = (fades[:, None, None] * X).reshape(-1, X.shape[2])
+        self._gram = fade * self._gram + weighted.T @ X.reshape(-1, X.shape[2])
+        self._moment = fade * self._moment + weighted.T @ y.ravel()
+        self._square = fade * self._square + float(fades @ np.einsum("ki,ki->k", y, y))
+        self.samples = fade * self.samples + float(fades.sum())
+        self.seconds = fade * self.seconds + float(fades @ steps)
+        self._last = float(times[-1])
 
     def _left(self, chosen: list[int]) -> float:
         """Sum of squares that the signatures ``chosen`` leave, at least the noise."""
@@ -198,6 +250,7 @@ class Regression:
         A cause is worth the logarithm of what it leaves, times the number of independent residuals, less a penalty for each unknown (the
         Bayesian information criterion): the best one, its rivals, then what explains most of the rest.
         """
+        self._take_in()
         excess = self._square - self._floor if self._last is not None else 0.0
         count = 3.0 * INDEPENDENT * self.seconds
         if excess <= 0.0 or count < 6.0:

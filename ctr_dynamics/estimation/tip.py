@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from .kernels import shift_tips, tip_between, tip_rows
+from .kernels import interpolate_columns, shift_tips, tip_between, tip_rows
 
 Floats = NDArray[np.float64]
 
@@ -114,11 +114,8 @@ class TipWindow:
 
     def interpolate(self, count: int) -> None:
         """Give the ``count`` tips before the newest, fewer than ``OPEN``, columns between those of their neighbours."""
-        first, last = self.end - 2 - count, self.end - 1
-        if first >= 0:
-            change = (self.columns[last] - self.columns[first]) / (count + 1)
-            for i in range(1, count + 1):
-                self.columns[first + i] = self.columns[first] + i * change
+        if self.end >= count + 2:
+            interpolate_columns(self.columns[self.end - 2 - count : self.end], count)
 
     def transform(self, T: Floats) -> None:
         """Replace all columns V by V T; columns that have been appended since do not move the past."""
