@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
+from numba import njit
 from numpy.typing import ArrayLike
 
 from ctr_dynamics.model.kernels import sweep
@@ -204,6 +205,38 @@ def _continue(work: _Work, par: np.ndarray, x: np.ndarray, rows: np.ndarray, tol
     return True
 
 
+@njit(cache=True, nogil=True)
+def _end_angles(
+    sec_cells: np.ndarray,
+    sec_tubes: np.ndarray,
+    seclen: np.ndarray,
+    out: np.ndarray,
+    states: np.ndarray,
+    angles: np.ndarray,
+) -> None:
+    """Fill ``angles`` (N, lanes), see :meth:`_Work.end_angles`; u_1z is integrated by the weights of the Runge-Kutta stages."""
+    n, lanes = angles.shape
+    psi = np.empty(lanes)
+    for j in range(lanes):
+        psi[j] = 2.0 * math.atan2(states[0, 6, j], states[0, 3, j])
+    row, node = 8, 0  # of u_1z at the section's first point; the section's first node
+    for k in range(len(sec_cells)):
+        weight = seclen[k] / sec_cells[k] / 6.0
+        for _ in range(sec_cells[k]):
+            for stage in range(4):
+                share = 2.0 * weight if stage in (1, 2) else weight
+                for j in range(lanes):
+                    psi[j] += share * out[row, j]
+                row += 7 + 2 * n
+        row += 7 + 2 * n
+        node += sec_cells[k] + 1
+        after = sec_tubes[k + 1] if k + 1 < len(sec_cells) else 0
+        if after < sec_tubes[k]:
+            i = sec_tubes[k] - 1
+            for j in range(lanes):
+                angles[i, j] = psi[j] + (states[node - 1, 17 + n + i, j] if i else 0.0)
+
+
 class _Work:
     """Buffers of one static problem on one mesh."""
 
@@ -216,14 +249,14 @@ class _Work:
         section_lengths(mesh.bp_tube, mesh.bp_offset, beta, self.seclen)
         self.inverse = np.zeros((5 + model.n, 5 + model.n))
 
-    def newton(self, par: np.ndarray, x: np.ndarray, tolerance: float) -> bool:
-        """Solve for ``x`` in place; ``x`` is left as it was when there is no solution."""
+    def newton(self, par: np.ndarray, x: np.ndarray, tolerance: float, fresh: bool = True) -> bool:
+        """Solve for ``x`` in place; ``x`` is left as it was when there is no solution. ``fresh`` False: the Jacobian's inverse is at hand."""
         model = self.model
         W, _, _, _, hist, histb, out, outb, nodes, res = self.plain
         trial = x.copy()
         outcome, *_ = solve(
             model.tubes, model.lane, self.lanes, self.mesh, 0.0, par, self.seclen, trial, hist, histb,
-            (W, out, outb, nodes, res), self.many, model.scale, model.step, self.inverse, True, tolerance, 40,
+            (W, out, outb, nodes, res), self.many, model.scale, model.step, self.inverse, fresh, tolerance, 40,
         )  # fmt: skip
         if outcome == CONVERGED:
             x[:] = trial
@@ -249,30 +282,13 @@ class _Work:
             nodes=states,
             mesh=self.mesh,
             key=key,
-            end_angles=self._end_angles(out[None], states[None])[0],
+            end_angles=self.end_angles(out[:, None], states[:, :, None])[:, 0],
         )
 
-    def _end_angles(self, out: np.ndarray, states: np.ndarray) -> np.ndarray:
-        """psi_L (lanes, N) from fields (lanes, points * F) and states (lanes, nodes, S): base angle plus the integral of u_1z, plus theta."""
-        n, mesh = self.model.n, self.mesh
-        F = 7 + 2 * n
-        u_z = out.reshape(len(out), -1, F)[:, :, 8]
-        h0 = states[:, 0, 3:7]
-        psi = 2.0 * np.arctan2(h0[:, 3], h0[:, 0])
-        integral = np.zeros(len(out))
-        angles = np.zeros((len(out), n))
-        point = node = 0
-        for k, cells in enumerate(mesh.sec_cells):
-            step = self.seclen[k] / cells
-            stage = u_z[:, point : point + 4 * cells].reshape(len(out), cells, 4)
-            integral += step / 6.0 * (stage @ np.array([1.0, 2.0, 2.0, 1.0])).sum(axis=1)
-            point += 4 * cells + 1
-            node += cells + 1
-            after = mesh.sec_tubes[k + 1] if k + 1 < len(mesh.sec_cells) else 0
-            if after < mesh.sec_tubes[k]:
-                i = mesh.sec_tubes[k] - 1
-                theta = states[:, node - 1, 18 + n + i - 1] if i else 0.0
-                angles[:, i] = psi + integral + theta
+    def end_angles(self, out: np.ndarray, states: np.ndarray) -> np.ndarray:
+        """psi_L (N, lanes) from fields (points * F, lanes) and states (nodes, S, lanes): base angle plus the integral of u_1z, plus theta."""
+        angles = np.zeros((self.model.n, out.shape[1]))
+        _end_angles(self.mesh.sec_cells, self.mesh.sec_tubes, self.seclen, out, states, angles)
         return angles
 
     def joint_jacobian(
@@ -293,9 +309,8 @@ class _Work:
             model.tubes, self.lanes, W, 0.0, mesh,
             parL, seclenL, xL, histL, histbL, outL, outbL, nodesL, resL,
         )  # fmt: skip
-        out = np.ascontiguousarray(outL.reshape(-1, L).T)
-        states = np.ascontiguousarray(nodesL.reshape(-1, L).T).reshape(L, -1, 16 + 3 * n)
-        values = np.concatenate([resL.reshape(m, L), self._end_angles(out, states).T])
+        angles = self.end_angles(outL.reshape(-1, L), nodesL.reshape(-1, 16 + 3 * n, L))
+        values = np.concatenate([resL.reshape(m, L), angles])
         steps = np.concatenate([step, np.full(n, 1e-7)])
         change = values[:, 1 : 1 + m + n] - values[:, :1]
         # the base angle is that of a quaternion, which begins anew after two turns

@@ -89,7 +89,7 @@ def s_curve(
             par[layout["alpha"]] = alpha
             work.sweep(par, guess[:m])
             _, _, _, _, _, _, out, _, states, res = work.plain
-            psi = work._end_angles(out[None], states.reshape(1, -1, 16 + 3 * n))[0]
+            psi = work.end_angles(out[:, None], states.reshape(-1, 16 + 3 * n, 1))[:, 0]
             value = np.concatenate([res / model.scale, [psi[1] - psi[0] - target]])
             if np.abs(value).max() < 1e-10:
                 break

@@ -66,6 +66,7 @@ class StabilityWatch:
         self.model = model
         self.parameters = (model.parameters if parameters is None else parameters).copy()
         self._x: np.ndarray | None = None
+        self._solved: _Work | None = None  # what that was found with
         self._last: tuple[float, float] | None = None
         self._work: dict[int, tuple[Mesh, _Work]] = {}
 
@@ -91,8 +92,7 @@ class StabilityWatch:
             InputError: translations out of range.
         """
         layout, par = self.model.layout, self.parameters
-        _, mesh = self.model.mesh(beta)
-        work = self._problem(mesh, beta)
+        work = self._problem(beta)
         par[layout["alpha"]], par[layout["alpha_rate"]], par[layout["beta"]] = alpha, 0.0, beta
         par[layout["force"]] = 0.0 if force is None else force
         par[layout["torque"]] = 0.0 if torque is None else torque
@@ -101,20 +101,24 @@ class StabilityWatch:
         for start in (self._x, guess, None if followed else x):
             if start is not None and not found:
                 x = np.array(start, float)
-                found = bool(np.isfinite(x).all()) and work.newton(par, x, TOLERANCE)
+                known = start is self._x and work is self._solved  # then so is the Jacobian, nearly
+                found = bool(np.isfinite(x).all()) and work.newton(par, x, TOLERANCE, fresh=not known)
                 if found and start is not self._x:
                     self._last = None  # another branch: no common line
         if not found:
             self.reset()
             return Stability(math.nan, None, True)
-        self._x = x
+        self._x, self._solved = x, work
         measure = work.stability(par, x)
         ahead = time_to_snap(*self._last, t, measure) if self._last is not None else None
         if self._last is None or t > self._last[0]:
             self._last = (t, measure)
         return Stability(measure, ahead, not math.isfinite(measure))
 
-    def _problem(self, mesh: Mesh, beta: np.ndarray) -> _Work:
+    def _problem(self, beta: np.ndarray) -> _Work:
+        if self._solved is not None and np.array_equal(beta, self._solved.beta):
+            return self._solved
+        _, mesh = self.model.mesh(beta)
         kept = self._work.get(id(mesh))
         if kept is None or kept[0] is not mesh:
             if len(self._work) > 8:
@@ -122,6 +126,6 @@ class StabilityWatch:
             kept = (mesh, _Work(self.model, mesh, beta))
             self._work[id(mesh)] = kept
         work = kept[1]
-        work.beta = beta
-        section_lengths(mesh.bp_tube, mesh.bp_offset, np.asarray(beta, float), work.seclen)
+        work.beta = np.array(beta)
+        section_lengths(mesh.bp_tube, mesh.bp_offset, work.beta, work.seclen)
         return work
