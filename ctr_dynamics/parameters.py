@@ -35,7 +35,7 @@ PARAMETERS: tuple[Parameter, ...] = (
     Parameter("model.scheme", "str", "sdirk3", "", "Time scheme.", choices=SCHEMES, read_only=True),
     Parameter("model.alpha", "float", -0.45, "", "Alpha of scheme bdf_alpha.", -0.5, 0.5, read_only=True),
     Parameter("model.dt_s", "float", 0.003, "s", "Step of the output grid.", 0.003, 0.003, read_only=True),
-    Parameter("model.nodes", "int", 16, "", "Arc-length nodes in all.", 8, 1000, read_only=True),
+    Parameter("model.nodes", "int", 12, "", "Arc-length nodes in all.", 8, 1000, read_only=True),
     Parameter(
         "model.tolerance",
         "float",

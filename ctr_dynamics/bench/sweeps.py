@@ -71,7 +71,7 @@ def sweeps(quick: bool) -> list[dict[str, Any]]:
     rows = []
     for tubes in (2,) if quick else (1, 2, 3):
         robot = _robot_of(tubes)
-        for nodes in (16, 100) if quick else (16, 24, 50, 100, 200, 400):
+        for nodes in (12, 100) if quick else (12, 16, 24, 50, 100, 200, 400):
             model = Model(robot, nodes=nodes)
             repeats = max(3, (2000 if quick else 20000) // nodes)
             plain = sweep_cost(model, (), repeats)

@@ -385,8 +385,8 @@ class Estimator:
         tip = self.fusion.tip_estimate()
         variance = self.fusion.force_variance()
         alone = self.runs.alone_tips.last
-        predicted_q = alone.quaternion.copy()
-        if not (tip.finite and math.isfinite(sum(alone.position.tolist()) + sum(variance.tolist()))):
+        predicted = alone.mean[:7].copy()
+        if not (tip.finite and math.isfinite(predicted.sum() + variance.sum())):
             self.runs.fused = None
             self.health.failed("not finite")
             self.health.restarts += 1
@@ -398,7 +398,7 @@ class Estimator:
         self.health.tracker_age_s = max(0.0, (stamp - (since or stamp)) * 1e-9)
         return StepOutput(
             stamp, k, not problem, problem, tip.position, tip.quaternion, tip.covariance[:6, :6], tip.twist, tip.covariance[6:, 6:],
-            alone.position.copy(), predicted_q, self._backbone.rows(self.runs.fused), self._modes.measure(self.runs.fused), self.fusion.force,
+            predicted[:3], predicted[3:], self._backbone.rows(self.runs.fused), self._modes.measure(self.runs.fused), self.fusion.force,
             np.sqrt(variance), self._take_innovations(), SolverStats(result.iterations, result.sweeps, result.reason),
         )  # fmt: skip
 

@@ -22,9 +22,9 @@ from ctr_dynamics.model.model import Model
 from ctr_dynamics.model.simulator import Inputs, Simulator, State, StepResult
 
 from .columns import Columns
-from .kernels import registered_rows, spreads
+from .kernels import move_unknowns, outside, registered_rows, spreads
 from .tip import TipWindow
-from .tracker import DELAY, DRIFT, STATES, TrackerModel, expected, residual, sensitivity
+from .tracker import DELAY, DRIFT, STATES, TrackerModel, innovation
 from .uncertainty import bias_sigma, model_uncertainty
 
 Floats = NDArray[np.float64]
@@ -266,10 +266,10 @@ class Fusion:
 
     def update(self, state: State, stamp: float, position: Floats, quaternion: Floats) -> Update:
         """Steps (4)-(7) with a reading of time stamp ``stamp`` (s): position (3,) m, quaternion (4,) wxyz, in the tracker's frame."""
-        innovation = self._innovation(stamp, position, quaternion)
-        if isinstance(innovation, Update):
-            return innovation
-        nu, H, R, compared = innovation
+        found = self._innovation(stamp, position, quaternion)
+        if isinstance(found, Update):
+            return found
+        nu, H, R, compared = found
         dof = compared.dof
         self._adapt(compared.nis / dof)
         if compared.nis > self._gate[dof]:
@@ -306,16 +306,13 @@ class Fusion:
         tip = self.tips.at(stamp - self.tracker.delay - self.bias[DELAY], self.simulator.scheme.dt)
         if tip is None:
             return Update(unknown, unknown, math.nan, 0, False, "outside the window of kept steps", unknown)
-        mask = self.tracker.mask
-        nu = residual(position, quaternion, *expected(self.tracker, self.bias, tip), mask)[mask]
-        H = sensitivity(self.tracker, self.bias, tip)[mask]
-        R = np.diag(self.tracker.variance[mask])
-        S = H @ self.pi @ H.T + R
-        if not math.isfinite(float(nu.sum() + S.sum())):
+        nu, H, S, whitened = innovation(self.tracker, self.bias, tip, self.pi, position, quaternion)
+        if not math.isfinite(nu.sum() + S.sum() + whitened.sum()):
             return Update(unknown, unknown, math.nan, 0, False, "the innovation is not finite", unknown)
-        whitened = _roots(S)[1] @ nu
-        full, variance, white = unknown.copy(), unknown.copy(), unknown.copy()
-        full[mask], variance[mask], white[mask] = nu, S.diagonal(), whitened
+        axes = self.tracker.axes
+        full, variance, white = np.full((3, 6), np.nan)
+        full[axes], variance[axes], white[axes] = nu, S.diagonal(), whitened
+        R = np.diag(self.tracker.variance[axes])
         return nu, H, R, Update(full, variance, float(whitened @ whitened), len(nu), False, "", white)
 
     @property
@@ -350,6 +347,8 @@ class Fusion:
         values beside that parameter at the range's end (Simon 2010, projection of the estimate)."""
         u, rows = self.uncertainty, self.columns.theta
         r = rows.shape[1]
+        if not outside(self.theta, rows, x[:r], u.lowest, u.highest):
+            return x
         for _ in range(len(u.names)):
             theta = self.theta + rows @ x[:r]
             beyond = np.clip(theta, u.lowest, u.highest) - theta
@@ -374,9 +373,7 @@ class Fusion:
         np.clip(self.theta, self.uncertainty.lowest, self.uncertainty.highest, out=self.theta)
         self._apply_theta()
         state.bank[:2] += c.fields_change(a)
-        shift = c.dx @ a
-        state.unknowns += shift
-        state.earlier += shift
+        move_unknowns(c.dx, a, state.unknowns, state.earlier)
         state.nodes += c.nodes_change(a)
         self.tips.shift(a)
 

@@ -49,12 +49,15 @@ class InputBuffer:
     Attributes:
         t0_ns: stamp of step 0, that of the first complete joint state; None before it.
         joints, load: by stamp. samples: tracker poses by stamp. backwards: joint states in a row whose time ran backwards.
-        window_ns: how late an input may come.
+        window_ns: how late an input may come. timeout_ns: how long after the last joints steps are taken without.
+        predicting: whether steps are taken on time, with extrapolated joints.
     """
 
     def __init__(self, model: Model, settings: Settings, health: Health) -> None:
         self.model, self.settings, self.health = model, settings, health
         self.window_ns = round(float(settings["filter.window_s"]) * 1e9)
+        self.timeout_ns = round(float(settings["input_timeout_s"]) * 1e9)
+        self.predicting = settings["output.policy"] == "predict"
         self._load_delay_ns = round(model.setup.load_shift * 1e9)
         self._load_bend = model.load_kink / (DT_NS * 1e-9)
         self.clear()
@@ -67,16 +70,6 @@ class InputBuffer:
         self.load = Signal(6)
         self.samples: list[Sample] = []
         self.backwards = 0
-
-    @property
-    def timeout_ns(self) -> int:
-        """How long after the last joints steps are taken without."""
-        return round(float(self.settings["input_timeout_s"]) * 1e9)
-
-    @property
-    def predicting(self) -> bool:
-        """Whether steps are taken on time, with extrapolated joints."""
-        return self.settings["output.policy"] == "predict"
 
     def stamp(self, k: int) -> int | None:
         """ns of step ``k``; None before the first."""

@@ -111,6 +111,24 @@ def registered_pose(mean, rotation, lever, bias, pose):
 
 
 @_compile_sums
+def covariance_of(rows, pi, covariance):
+    """``covariance`` (k, k) = rows pi rows^T of ``rows`` (k, s) under ``pi`` (at least s, s)."""
+    size = rows.shape[1]
+    half = np.empty(size)
+    for n in range(len(rows)):
+        for p in range(size):
+            product = 0.0
+            for q in range(size):
+                product += pi[p, q] * rows[n, q]
+            half[p] = product
+        for i in range(n + 1):
+            product = 0.0
+            for p in range(size):
+                product += rows[i, p] * half[p]
+            covariance[i, n] = covariance[n, i] = product
+
+
+@_compile
 def registered_rows(mean, columns, rotation, lever, bias, pi, pose, covariance):
     """Pose (7,) of :func:`registered_pose` and the covariance (12, 12) of pose and twist (base axes) under ``pi`` (r + 13, r + 13).
 
@@ -140,18 +158,7 @@ def registered_rows(mean, columns, rotation, lever, bias, pi, pose, covariance):
             J[3 + i, r + c] = N[i, c]
             J[i, r + 3 + c] = N[i, c]
             J[i, r + 6 + c] = C[i, 0] * R[0, c] + C[i, 1] * R[1, c] + C[i, 2] * R[2, c]
-    half = np.empty(J.shape[1])
-    for n in range(12):
-        for p in range(len(half)):
-            product = 0.0
-            for q in range(len(half)):
-                product += pi[p, q] * J[n, q]
-            half[p] = product
-        for i in range(n + 1):
-            product = 0.0
-            for p in range(len(half)):
-                product += J[i, p] * half[p]
-            covariance[i, n] = covariance[n, i] = product
+    covariance_of(J, pi, covariance)
     total = 0.0
     for i in range(12):
         for n in range(12):
@@ -324,7 +331,7 @@ def shift_tips(columns, a, means):
 
 @_compile
 def expected_reading(mean, rotation, translation, lever, bias):
-    """(7,) position and quaternion of :func:`ctr_dynamics.estimation.tracker.expected`."""
+    """(7,) position and quaternion that a tip and tracker states predict."""
     registration = multiply(from_vector(bias[0:3]), rotation)
     point = mean[0:3] + applied(matrix(mean[3:7]), lever + bias[6:9])
     pose = np.empty(7)
@@ -335,7 +342,8 @@ def expected_reading(mean, rotation, translation, lever, bias):
 
 @_compile
 def pose_difference(position, quaternion, expected_position, expected_quaternion, free):
-    """(6,) difference of :func:`ctr_dynamics.estimation.tracker.residual`; ``free``: the rotation axis that is not measured, 1 to 3, or 0."""
+    """(6,) reading minus expectation: position, then rotation vector in the sensor's axes, without the turn about the axis ``free``, 1 to 3, if
+    not 0."""
     turned = multiply(conjugate(expected_quaternion), quaternion)
     if free:
         size = turned[0] ** 2 + turned[free] ** 2
@@ -361,7 +369,7 @@ def pose_in_base(position, quaternion, rotation, translation, lever):
 
 @_compile
 def sensitivity_rows(mean, columns, rotation, lever, bias, H):
-    """Derivative H (6, r + 13) of the expected reading; see :func:`ctr_dynamics.estimation.tracker.sensitivity`."""
+    """Derivative H (6, r + 13) of the expected reading; see :func:`ctr_dynamics.estimation.tracker.innovation`."""
     r = columns.shape[1]
     R, Q = matrix(mean[3:7]), matrix(multiply(from_vector(bias[0:3]), rotation))
     position, velocity, rate = mean[0:3], mean[7:10], mean[10:13]
@@ -404,3 +412,72 @@ def sensitivity_rows(mean, columns, rotation, lever, bias, H):
     for i in range(3):
         H[i, r + 9] = -(Q[i, 0] * d[0] + Q[i, 1] * d[1] + Q[i, 2] * d[2])
         H[3 + i, r + 9] = -(R[0, i] * rate[0] + R[1, i] * rate[1] + R[2, i] * rate[2])
+
+
+@_compile
+def innovation_rows(
+    position,
+    quaternion,
+    mean,
+    columns,
+    rotation,
+    translation,
+    lever,
+    bias,
+    free,
+    measured,
+    variance,
+    pi,
+    nu,
+    H,
+    S,
+):
+    """Fill ``nu``, ``H`` and ``S`` of :func:`ctr_dynamics.estimation.tracker.innovation` on the axes ``measured`` (k,); returns the whitened
+    innovation."""
+    pose = expected_reading(mean, rotation, translation, lever, bias)
+    difference = pose_difference(position, quaternion, pose[0:3], pose[3:7], free)
+    whole = np.empty((6, len(pi)))
+    sensitivity_rows(mean, columns, rotation, lever, bias, whole)
+    size = len(measured)
+    for i in range(size):
+        nu[i], H[i] = difference[measured[i]], whole[measured[i]]
+    covariance_of(H, pi, S)
+    for i in range(size):
+        S[i, i] += variance[measured[i]]
+    root, white = np.zeros((size, size)), np.empty(size)
+    for i in range(size):
+        for k in range(i + 1):
+            entry = S[i, k]
+            for q in range(k):
+                entry -= root[i, q] * root[k, q]
+            root[i, k] = entry / root[k, k] if k < i else math.sqrt(entry)
+        white[i] = nu[i]
+        for k in range(i):
+            white[i] -= root[i, k] * white[k]
+        white[i] /= root[i, i]
+    return white
+
+
+@_compile
+def outside(theta, rows, a, lowest, highest):
+    """Whether ``theta`` (n,) moved by ``rows`` (n, r) times ``a`` (r,) leaves its range anywhere."""
+    for i in range(len(theta)):
+        moved = theta[i]
+        for k in range(len(a)):
+            moved += rows[i, k] * a[k]
+        if not lowest[i] <= moved <= highest[i]:
+            return True
+    return False
+
+
+@_compile
+def move_unknowns(dx, a, unknowns, earlier):
+    """Add ``dx`` (m, r) times ``a`` (r,) to the ``unknowns`` (stages, m) and the ``earlier`` (steps, stages, m)."""
+    for i in range(len(dx)):
+        shift = 0.0
+        for k in range(len(a)):
+            shift += dx[i, k] * a[k]
+        for stage in range(len(unknowns)):
+            unknowns[stage, i] += shift
+            for step in range(len(earlier)):
+                earlier[step, stage, i] += shift

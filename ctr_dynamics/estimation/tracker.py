@@ -7,22 +7,14 @@ clock of another rate) is taken off the readings first, an average over a window
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ctr_dynamics.effects import Setup
 
-from .kernels import (
-    expected_reading,
-    from_vector,
-    matrix,
-    multiply,
-    pose_difference,
-    pose_in_base,
-    registered_pose,
-    sensitivity_rows,
-)
+from .kernels import from_vector, innovation_rows, matrix, multiply, pose_in_base, registered_pose
 from .tip import Tip
 
 Floats = NDArray[np.float64]
@@ -51,6 +43,16 @@ class TrackerModel:
     scale: float = 1.0
     drift: Floats = field(default_factory=lambda: np.zeros(3))
     skew: float = 0.0
+
+    @cached_property
+    def axes(self) -> NDArray[np.int64]:
+        """(k,) measured axes, 0 to 5."""
+        return np.flatnonzero(self.mask)
+
+    @cached_property
+    def free(self) -> int:
+        """1 to 3: the one rotation axis of the sensor that is not measured; 0 where none or several are not."""
+        return 1 + int(np.argmin(self.mask[3:])) if self.mask[3:].sum() == 2 else 0
 
     def reading(self, time_s: float, position: Floats) -> tuple[float, Floats]:
         """Time (s) and position (m) of a reading of stamp ``time_s`` without the clock's rate, the steady drift and the scale."""
@@ -92,33 +94,26 @@ def tracker_model(
     )
 
 
-def expected(model: TrackerModel, bias: Floats, tip: Tip) -> tuple[Floats, Floats]:
-    """Reading (position (3,) m, quaternion (4,) wxyz) that the tip and the tracker states (13,) predict."""
-    pose = expected_reading(tip.mean, model.rotation, model.translation, model.lever, bias)
-    return pose[:3], pose[3:]
+def innovation(
+    model: TrackerModel, bias: Floats, tip: Tip, pi: Floats, position: Floats, quaternion: Floats
+) -> tuple[Floats, Floats, Floats, Floats]:
+    """A reading (position (3,) m, quaternion (4,) wxyz) against what the ``tip`` and the tracker states ``bias`` (13,) predict.
 
+    Returns:
+        On the k measured axes: innovation (k,), position in the tracker's axes, rotation vector in the sensor's; H (k, r + 13), the derivative of
+        the expected reading by the columns' coefficients and the tracker states; its covariance S (k, k) under ``pi`` (r + 13, r + 13); and the
+        innovation whitened by the Cholesky root of S.
 
-def residual(
-    position: Floats,
-    quaternion: Floats,
-    expected_position: Floats,
-    expected_quaternion: Floats,
-    mask: NDArray[np.bool_] | None = None,
-) -> Floats:
-    """(6,) reading minus expectation: position in the tracker's axes, rotation vector in the sensor's axes.
-
-    Where ``mask`` (6,) leaves out one rotation axis, the sensor's turn about it is arbitrary and often large.
-    It is taken off first, or it would turn the other two components.
+    Where one rotation axis is not measured, the sensor's turn about it is arbitrary and often large. It is taken off first, or it would turn the
+    other two components.
     """
-    free = 1 + int(np.argmin(mask[3:])) if mask is not None and mask[3:].sum() == 2 else 0
-    return pose_difference(position, quaternion, expected_position, expected_quaternion, free)
-
-
-def sensitivity(model: TrackerModel, bias: Floats, tip: Tip) -> Floats:
-    """H (6, r + 13): derivative of the expected reading by the columns' coefficients and the tracker states."""
-    H = np.empty((6, tip.columns.shape[1] + STATES))
-    sensitivity_rows(tip.mean, tip.columns, model.rotation, model.lever, bias, H)
-    return H
+    axes = model.axes
+    nu, H, S = np.empty(len(axes)), np.empty((len(axes), len(pi))), np.empty((len(axes), len(axes)))
+    white = innovation_rows(
+        position, quaternion, tip.mean, tip.columns, model.rotation, model.translation, model.lever, bias, model.free, axes, model.variance,
+        pi, nu, H, S,
+    )  # fmt: skip
+    return nu, H, S, white
 
 
 def registered(model: TrackerModel, bias: Floats, tip: Tip) -> Floats:

@@ -15,10 +15,11 @@ from estimation_cases import (
     rms,
     truth_error,
 )
+from tracker_twin import expected
 
 from ctr_dynamics.estimation.rotations import conjugate, from_vector, matrix, multiply
 from ctr_dynamics.estimation.tip import Tip
-from ctr_dynamics.estimation.tracker import STATES, expected, tracker_model
+from ctr_dynamics.estimation.tracker import STATES, tracker_model
 from ctr_dynamics.model.model import Model
 from ctr_dynamics.robot import load_robot, robot_from_dict, robot_to_dict
 

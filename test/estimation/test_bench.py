@@ -30,7 +30,7 @@ def test_quick_bench_writes_figures_and_plots(tmp_path, capsys):
     assert {"numpy", "numba", "ctr_dynamics", "python"} <= set(result["machine"]["versions"])
 
     plain = {(r["tubes"], r["nodes"]): r["sweep_us"] for r in result["sweeps"] if r["lanes"] == 1}
-    assert set(plain) == {(2, 16), (2, 100)}
+    assert set(plain) == {(2, 12), (2, 100)}
     for row in result["sweeps"]:
         assert row["sweep_us"] > 0
         assert row["ratio_to_plain_sweep"] == pytest.approx(

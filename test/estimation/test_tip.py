@@ -1,22 +1,17 @@
 """Tip kinematics, the window of kept tips, and the tracker's sensitivities against finite differences."""
 
 import copy
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from tracker_twin import expected, residual
 
 from ctr_dynamics.estimation.kernels import registered_rows
 from ctr_dynamics.estimation.rotations import conjugate, from_vector, matrix, multiply, to_vector
 from ctr_dynamics.estimation.tip import Tip, TipWindow, tip_rows
-from ctr_dynamics.estimation.tracker import (
-    DELAY,
-    STATES,
-    TrackerModel,
-    expected,
-    residual,
-    sensitivity,
-)
+from ctr_dynamics.estimation.tracker import DELAY, STATES, TrackerModel, innovation
 
 RNG = np.random.default_rng(11)
 COLUMNS, STEP = 5, 1e-6
@@ -88,7 +83,7 @@ def test_tip_rows_are_the_kinematics_and_their_derivative():
 
 def test_sensitivity_equals_finite_differences():
     tip, tracker, bias = random_tip(), random_tracker(), bias_of(0.0)
-    H = sensitivity(tracker, bias, tip)
+    H = innovation(tracker, bias, tip, np.eye(COLUMNS + STATES), *expected(tracker, bias, tip))[1]
     assert H.shape == (6, COLUMNS + STATES)
     for column in range(COLUMNS + STATES):
         readings = []
@@ -104,14 +99,35 @@ def test_sensitivity_equals_finite_differences():
         assert np.allclose(H[:, column], difference, rtol=1e-6, atol=1e-7), column
 
 
+@pytest.mark.parametrize("measured", ["111111", "111110", "111011", "111000", "110101", "111001"])
+def test_innovation_equals_its_numpy_twin(measured):
+    mask = np.array([axis == "1" for axis in measured])
+    tip, tracker, bias = random_tip(), replace(random_tracker(), mask=mask), bias_of(0.02)
+    position, quaternion = expected(tracker, bias_of(0.02), tip)
+    root = RNG.normal(size=(COLUMNS + STATES, COLUMNS + STATES))
+    nu, H, S, white = innovation(tracker, bias, tip, root @ root.T, position, quaternion)
+    everything = innovation(
+        replace(tracker, mask=np.ones(6, dtype=bool)), bias, tip, root @ root.T, position, quaternion
+    )[1]
+    wanted = residual(position, quaternion, *expected(tracker, bias, tip), mask)[mask]
+    np.testing.assert_allclose(nu, wanted, rtol=1e-10, atol=1e-13)
+    np.testing.assert_array_equal(H, everything[mask])
+    np.testing.assert_allclose(
+        S, H @ root @ root.T @ H.T + np.diag(tracker.variance[mask]), rtol=1e-10, atol=1e-10
+    )
+    np.testing.assert_allclose(white @ white, nu @ np.linalg.solve(S, nu), rtol=1e-8)
+    np.testing.assert_allclose(np.linalg.cholesky(S) @ white, nu, rtol=1e-8, atol=1e-12)
+
+
 def test_residual_of_a_masked_rotation_leaves_the_arbitrary_turn_out():
     tip, tracker = random_tip(), random_tracker()
     position, quaternion = expected(tracker, np.zeros(STATES), tip)
     tilt = np.array([0.01, -0.02, 0.0])
+    five = replace(tracker, mask=np.array([1, 1, 1, 1, 1, 0], dtype=bool))
     for roll in (0.0, 1.0, -2.5, np.pi):
         read = multiply(multiply(quaternion, from_vector(tilt)), from_vector(np.array([0.0, 0.0, roll])))
-        five = np.array([1, 1, 1, 1, 1, 0], dtype=bool)
-        assert np.allclose(residual(position, read, position, quaternion, five)[3:5], tilt[:2], atol=1e-5)
+        nu = innovation(five, np.zeros(STATES), tip, np.eye(COLUMNS + STATES), position, read)[0]
+        assert np.allclose(nu[3:5], tilt[:2], atol=1e-5)
 
 
 def test_registered_pose_and_covariance_equal_finite_differences():

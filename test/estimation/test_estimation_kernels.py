@@ -1,0 +1,69 @@
+"""Small kernels of the filter against plain NumPy."""
+
+import numpy as np
+import pytest
+from scipy.sparse import random_array
+
+from ctr_dynamics.estimation import kernels
+
+RNG = np.random.default_rng(3)
+
+
+def covariance(size):
+    root = RNG.normal(size=(size, size))
+    return root @ root.T
+
+
+@pytest.mark.parametrize("r", [1, 5, 16])
+def test_variances_are_those_of_the_columns(r):
+    rows, pi = RNG.normal(size=(3, r)), covariance(r + 13)
+    np.testing.assert_allclose(kernels.spreads(rows, pi), np.diag(rows @ pi[:r, :r] @ rows.T), rtol=1e-12)
+    states = RNG.normal(size=(4, 22, r))
+    wanted = [np.sqrt(np.trace(node[:3] @ pi[:r, :r] @ node[:3].T) / 3) for node in states]
+    np.testing.assert_allclose(kernels.position_deviations(states.reshape(-1, r), 22, pi), wanted, rtol=1e-12)
+    assert np.isnan(kernels.quadratic(np.full(r, np.nan), pi))
+
+
+def test_columns_that_were_skipped_lie_between_their_neighbours():
+    columns = RNG.normal(size=(5, 12, 3))
+    filled = columns.copy()
+    kernels.interpolate_columns(filled[1:], 2)
+    for i, share in ((2, 1 / 3), (3, 2 / 3)):
+        np.testing.assert_allclose(
+            filled[i], (1 - share) * columns[1] + share * columns[4], rtol=1e-12, atol=1e-15
+        )
+    for i in (0, 1, 4):
+        np.testing.assert_array_equal(filled[i], columns[i])
+
+
+def test_a_product_with_compressed_rows():
+    matrix = random_array((7, 5), density=0.5, rng=RNG).tocsr()
+    columns = RNG.normal(size=(5, 3))
+    found = kernels.sparse_product(matrix.indptr, matrix.indices, matrix.data, columns)
+    np.testing.assert_allclose(found, matrix @ columns, rtol=1e-12, atol=1e-15)
+
+
+def test_parameters_outside_their_range_are_noticed():
+    theta, rows, a = np.zeros(4), RNG.normal(size=(4, 3)), RNG.normal(size=3)
+    moved = rows @ a
+    assert not kernels.outside(theta, rows, a, moved - 1e-9, moved + 1e-9)
+    for i in range(4):
+        for side in (-1.0, 1.0):
+            lowest, highest = moved - 1.0, moved + 1.0
+            lowest[i] += 2.0 * (side > 0)
+            highest[i] -= 2.0 * (side < 0)
+            assert kernels.outside(theta, rows, a, lowest, highest)
+    assert kernels.outside(theta, rows, a * np.nan, moved - 1.0, moved + 1.0)
+
+
+def test_unknowns_of_all_stages_and_steps_move_together():
+    dx, a, unknowns, earlier = (
+        RNG.normal(size=(7, 3)),
+        RNG.normal(size=3),
+        RNG.normal(size=(3, 7)),
+        RNG.normal(size=(4, 3, 7)),
+    )
+    now, before = unknowns.copy(), earlier.copy()
+    kernels.move_unknowns(dx, a, now, before)
+    np.testing.assert_allclose(now, unknowns + dx @ a, rtol=1e-12, atol=1e-14)
+    np.testing.assert_allclose(before, earlier + dx @ a, rtol=1e-12, atol=1e-14)
