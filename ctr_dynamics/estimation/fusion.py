@@ -22,7 +22,7 @@ from ctr_dynamics.model.model import Model
 from ctr_dynamics.model.simulator import Inputs, Simulator, State, StepResult
 
 from .columns import Columns
-from .kernels import move_unknowns, outside, registered_rows, spreads
+from .kernels import deviations, move_unknowns, outside, registered_rows
 from .tip import TipWindow
 from .tracker import DELAY, DRIFT, STATES, TrackerModel, innovation
 from .uncertainty import bias_sigma, model_uncertainty
@@ -320,9 +320,9 @@ class Fusion:
         """(3,) estimated tip force, N, ``ctr_base`` axes; the caller's own, as the filter goes on writing."""
         return self.theta[self._force].copy()
 
-    def force_variance(self) -> Floats:
-        """(3,) variance of the estimated tip force, N^2."""
-        return spreads(self.columns.theta[self._force], self.pi)
+    def force_deviation(self) -> Floats:
+        """(3,) standard deviation of the estimated tip force, N."""
+        return deviations(self.columns.theta[self._force], self.pi)
 
     def _inflate(self, nu: Floats, H: Floats, R: Floats, limit: float) -> None:
         """Two readings in a row outside the gate are no outliers: the model has lost the robot. Widen the fields' part of the covariance until

@@ -248,11 +248,11 @@ def quadratic(row, pi):
 
 
 @_compile
-def spreads(rows, pi):
-    """(rows,) variances rows pi rows^T of ``rows`` (rows, r) under ``pi`` (at least r, r), none below zero."""
+def deviations(rows, pi):
+    """(rows,) roots of the variances rows pi rows^T of ``rows`` (rows, r) under ``pi`` (at least r, r)."""
     result = np.empty(len(rows))
     for n in range(len(rows)):
-        result[n] = max(quadratic(rows[n], pi), 0.0)
+        result[n] = math.sqrt(max(quadratic(rows[n], pi), 0.0))
     return result
 
 

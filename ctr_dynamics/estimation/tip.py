@@ -66,7 +66,7 @@ class TipWindow:
         room = self.size + self.MORE
         self.stamps = np.zeros(room)
         self.means = np.zeros((room, 13))  # position, quaternion, velocity, rate
-        self.columns = np.zeros((room, 12, columns))
+        self.columns = np.empty((room, 12, columns))
 
     @property
     def begin(self) -> int:
@@ -121,8 +121,8 @@ class TipWindow:
         """Replace all columns V by V T; columns that have been appended since do not move the past."""
         old = self.columns[self.begin : self.end]
         _, rows, r = old.shape
-        self.columns = np.zeros((len(self.stamps), rows, T.shape[1]))
-        self.columns[self.begin : self.end] = (old.reshape(-1, r) @ T[:r]).reshape(len(old), rows, T.shape[1])
+        self.columns = np.empty((len(self.stamps), rows, T.shape[1]))
+        np.matmul(old.reshape(-1, r), T[:r], out=self.columns[self.begin : self.end].reshape(-1, T.shape[1]))
 
     def shift(self, a: Floats) -> None:
         """Move every kept tip by the columns times ``a`` (r,)."""

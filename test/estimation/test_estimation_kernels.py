@@ -17,7 +17,9 @@ def covariance(size):
 @pytest.mark.parametrize("r", [1, 5, 16])
 def test_variances_are_those_of_the_columns(r):
     rows, pi = RNG.normal(size=(3, r)), covariance(r + 13)
-    np.testing.assert_allclose(kernels.spreads(rows, pi), np.diag(rows @ pi[:r, :r] @ rows.T), rtol=1e-12)
+    np.testing.assert_allclose(
+        kernels.deviations(rows, pi) ** 2, np.diag(rows @ pi[:r, :r] @ rows.T), rtol=1e-12
+    )
     states = RNG.normal(size=(4, 22, r))
     wanted = [np.sqrt(np.trace(node[:3] @ pi[:r, :r] @ node[:3].T) / 3) for node in states]
     np.testing.assert_allclose(kernels.position_deviations(states.reshape(-1, r), 22, pi), wanted, rtol=1e-12)
