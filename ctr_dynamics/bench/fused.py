@@ -22,7 +22,12 @@ EDGES_MS = tuple(float(x) for x in np.round(np.geomspace(0.1, 30.0, 51), 4))
 
 
 def fused_replay(
-    bag: Path, robot_name: str, nodes: int | None, seconds: float | None, rank: int | None = None
+    bag: Path,
+    robot_name: str,
+    nodes: int | None,
+    seconds: float | None,
+    rank: int | None = None,
+    rounds: int = 1,
 ) -> dict[str, Any]:
     """Replay `bag` with fusion: ratio, percentiles and histogram of the steps' times in ms, and cost in plain sweeps.
 
@@ -30,6 +35,7 @@ def fused_replay(
         nodes: `model.nodes`; None for its default.
         seconds: how much of the bag; None for all of it.
         rank: `filter.rank`; None for its default.
+        rounds: how often; the figures are those of the fastest replay.
     """
     values: dict[str, Any] = {"output.policy": "wait"}
     if nodes is not None:
@@ -41,13 +47,16 @@ def fused_replay(
     start = min(block.start_ns for file in opened.files for block in file.blocks)
     rehearse(robot, settings)  # as the node does before its first message
     until = None if seconds is None else start + round(seconds * 1e9)
-    estimator = Estimator(robot, settings)
-    player = Player(estimator)
-    with seldom_collected():
-        begin = time.perf_counter()
-        steps = sum(1 for _ in player.play(opened, until_ns=until))
-        wall = time.perf_counter() - begin
-    ticks = 1e3 * np.array(player.times_s())
+    wall = np.inf
+    for _ in range(rounds):
+        estimator = Estimator(robot, settings)
+        player = Player(estimator)
+        with seldom_collected():
+            begin = time.perf_counter()
+            steps = sum(1 for _ in player.play(opened, until_ns=until))
+            spent = time.perf_counter() - begin
+        if spent < wall:
+            wall, ticks = spent, 1e3 * np.array(player.times_s())
     model = Model(robot, nodes=int(settings["model.nodes"]))
     plain = 1e3 * sweep_cost(model, (), max(3, 4000 // model.nodes))
     counts, _ = np.histogram(np.clip(ticks, EDGES_MS[0], EDGES_MS[-1]), EDGES_MS)

@@ -116,7 +116,7 @@ def page(result: Result) -> str:
         "Written by `ctr-dynamics bench --page FILE`; do not edit by hand. The machine and its load are part of the figures: compare ratios to a\n"
         "plain sweep (one pass from base to tip), which the same run has measured, rather than times. `ctr-dynamics bench --output DIR` writes the\n"
         "same figures as JSON and as plots: real-time ratio over step and spacing (Till et al. 2020, Fig. 13), error over spacing (Fig. 14),\n"
-        "the histogram of the steps' times.\n\n"
+        "the histogram of the steps' times. Where something else may have been running meanwhile, the fastest of some repetitions counts.\n\n"
         "The default time scheme, `sdirk3`, is the one with the smallest error at 3 ms below.\n\n"
         f"```text\n{text(result)}\n```\n"
     )

@@ -40,6 +40,7 @@ class Size:
     fine_nodes: int
     cases: int
     cases_s: float
+    rounds: int
 
 
 LONG = Size(
@@ -62,6 +63,7 @@ LONG = Size(
     fine_nodes=400,
     cases=64,
     cases_s=2.0,
+    rounds=5,
 )
 QUICK = Size(
     cut=0.06,
@@ -83,6 +85,7 @@ QUICK = Size(
     fine_nodes=100,
     cases=16,
     cases_s=0.15,
+    rounds=1,
 )
 
 
@@ -111,10 +114,13 @@ def measure(bag: Path, quick: bool, say: Callable[[str], None]) -> dict[str, Any
     ]
     say("replay with fusion")
     result["replay"] = [
-        fused_replay(bag, "till2020_tissue", nodes, size.replay_s) for nodes in size.replay_nodes
+        fused_replay(bag, "till2020_tissue", nodes, size.replay_s, rounds=size.rounds)
+        for nodes in size.replay_nodes
     ]
     say("replay with fusion over the rank")
-    result["rank"] = [fused_replay(bag, "till2020_tissue", None, size.rank_s, rank) for rank in size.ranks]
+    result["rank"] = [
+        fused_replay(bag, "till2020_tissue", None, size.rank_s, rank, size.rounds) for rank in size.ranks
+    ]
     say("release test: error of the time schemes")
     result["time_error"] = time_error(test, size.time_nodes, size.time_s, size.reference, size.since)
     say("real-time ratio over time step and node spacing")
