@@ -22,9 +22,10 @@ from ctr_dynamics.model.model import Model
 from ctr_dynamics.model.simulator import Inputs, Simulator, State, StepResult
 
 from .columns import Columns
-from .kernels import deviations, move_unknowns, outside, registered_rows
+from .kernels import deviations, move_unknowns, outside
 from .tip import TipWindow
 from .tracker import DELAY, DRIFT, STATES, TrackerModel, innovation
+from .tracker_kernels import registered_rows
 from .uncertainty import bias_sigma, model_uncertainty
 
 Floats = NDArray[np.float64]

@@ -1,4 +1,4 @@
-"""Numba kernels of the filter's outputs: tip with its columns, registered pose with covariance, backbone rows."""
+"""Numba kernels of the filter: inputs of the stages, tips with their columns, corrections, variances, and rows of the outputs."""
 
 import math
 
@@ -7,14 +7,14 @@ from numba import njit
 
 from . import rotations
 
-_compile = njit(cache=True, nogil=True, error_model="numpy")
+compiled = njit(cache=True, nogil=True, error_model="numpy")
 # sums in any order, so that the processor adds several at a time; what is not finite stays so
-_compile_sums = njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "contract"})
-matrix, multiply, conjugate = map(_compile, (rotations.matrix, rotations.multiply, rotations.conjugate))
-from_vector, to_vector = map(_compile, (rotations.from_vector, rotations.to_vector))
+compiled_sums = njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "contract"})
+matrix, multiply, conjugate = map(compiled, (rotations.matrix, rotations.multiply, rotations.conjugate))
+from_vector, to_vector = map(compiled, (rotations.from_vector, rotations.to_vector))
 
 
-@_compile
+@compiled
 def on_lines(samples, time_ns, value, rate):
     """``value`` (size,) and its ``rate``, 1/s, at a time on the lines through three ``samples``: values, then stamps in ns. At the middle one the
     rate is that of the first line."""
@@ -27,7 +27,7 @@ def on_lines(samples, time_ns, value, rate):
         value[i] = begin[i] + rate[i] * ((time_ns - begin_ns) * 1e-9)
 
 
-@_compile
+@compiled
 def stage_rows(times, t0_ns, joints, load, rows, beta_rate):
     """Fill ``rows`` (stages, inputs) and ``beta_rate`` (N,) as :meth:`ctr_dynamics.estimation.actuation.Signals.rows` gives them, from the samples
     around ``times`` (s after ``t0_ns``); see :func:`on_lines`."""
@@ -47,7 +47,7 @@ def stage_rows(times, t0_ns, joints, load, rows, beta_rate):
     beta_rate[:] = rate[n:]
 
 
-@_compile
+@compiled
 def tip_rows(node, dnode, insertion_rate, mean, columns):
     """Tip from the last node's state (S,) and its columns (S, r): ``mean`` (13,) position, quaternion, velocity, rate; ``columns`` (12, r)."""
     w, x, y, z = node[3], node[4], node[5], node[6]
@@ -85,90 +85,154 @@ def tip_rows(node, dnode, insertion_rate, mean, columns):
         columns[11, c] += tx * ay - ty * ax
 
 
-@_compile
-def applied(A, v):
-    """Product (3,) of a matrix (3, 3) and a vector (3,)."""
-    result = np.empty(3)
+@compiled
+def tip_between(a, b, a_columns, b_columns, x, dt, mean, columns):
+    """Tip at the fraction ``x`` of the step ``dt`` (s) from tip ``a`` (13,) to ``b``, or a little outside, into ``mean`` (13,); with its columns
+    where ``columns`` (12, r) has any.
+
+    Cubic Hermite in position, linear turn on top of the nearer end's rotation.
+    """
+    w0, w1 = (1 + 2 * x) * (1 - x) ** 2, x * (1 - x) ** 2 * dt
+    w2, w3 = x * x * (3 - 2 * x), x * x * (x - 1) * dt
+    d0, d1 = 6 * x * (x - 1) / dt, (1 - x) * (1 - 3 * x)
+    d2, d3 = 6 * x * (1 - x) / dt, x * (3 * x - 2)
     for i in range(3):
-        result[i] = A[i, 0] * v[0] + A[i, 1] * v[1] + A[i, 2] * v[2]
+        mean[i] = w0 * a[i] + w1 * a[7 + i] + w2 * b[i] + w3 * b[7 + i]
+        mean[7 + i] = d0 * a[i] + d1 * a[7 + i] + d2 * b[i] + d3 * b[7 + i]
+        mean[10 + i] = (1 - x) * a[10 + i] + x * b[10 + i]
+    turn = to_vector(multiply(b[3:7], conjugate(a[3:7])))
+    mean[3:7] = multiply(from_vector(x * turn), a[3:7])
+    for c in range(columns.shape[1]):
+        for i in range(3):
+            p, v, q, u = a_columns[i, c], a_columns[6 + i, c], b_columns[i, c], b_columns[6 + i, c]
+            columns[i, c] = w0 * p + w1 * v + w2 * q + w3 * u
+            columns[6 + i, c] = d0 * p + d1 * v + d2 * q + d3 * u
+            columns[3 + i, c] = (1 - x) * a_columns[3 + i, c] + x * b_columns[3 + i, c]
+            columns[9 + i, c] = (1 - x) * a_columns[9 + i, c] + x * b_columns[9 + i, c]
+
+
+@compiled
+def shift_tips(columns, a, means):
+    """Move tips ``means`` (tips, 13) by their columns (tips, 12, r) times ``a`` (r,)."""
+    d = np.empty(12)
+    for tip in range(len(means)):
+        for row in range(12):
+            d[row] = 0.0
+            for c in range(len(a)):
+                d[row] += columns[tip, row, c] * a[c]
+        mean = means[tip]
+        for i in range(3):
+            mean[i] += d[i]
+        for i in range(6):
+            mean[7 + i] += d[6 + i]
+        # the half turn, made a unit quaternion
+        x, y, z = 0.5 * d[3], 0.5 * d[4], 0.5 * d[5]
+        w = math.sqrt(max(0.0, 1.0 - x * x - y * y - z * z))
+        mean[3:7] = multiply(np.array([w, x, y, z]), mean[3:7])
+
+
+@compiled
+def interpolate_columns(columns, count):
+    """Columns (tips, 12, r) of the ``count`` tips before the last, between those of their neighbours."""
+    last = len(columns) - 1
+    first = last - 1 - count
+    for i in range(1, count + 1):
+        for row in range(columns.shape[1]):
+            for c in range(columns.shape[2]):
+                change = columns[last, row, c] - columns[first, row, c]
+                columns[first + i, row, c] = columns[first, row, c] + i * (change / (count + 1))
+
+
+@compiled
+def sparse_product(indptr, indices, data, columns):
+    """Product (rows, k) of a matrix in compressed rows with ``columns`` (columns, k)."""
+    result = np.zeros((len(indptr) - 1, columns.shape[1]))
+    for row in range(len(result)):
+        for place in range(indptr[row], indptr[row + 1]):
+            for k in range(columns.shape[1]):
+                result[row, k] += data[place] * columns[indices[place], k]
     return result
 
 
-@_compile
-def registered_pose(mean, rotation, lever, bias, pose):
-    """Fill ``pose`` (7,) with that of :func:`ctr_dynamics.estimation.tracker.registered`.
-
-    ``mean`` (13,): the tip; ``rotation`` (4,), ``lever`` (3,): nominal geometry; ``bias`` (13,): tracker states. Returns the rotation of the
-    tip, that of the registration's estimated error in base axes, and the registration's inverse, (3, 3) each.
-    """
-    R, N = matrix(mean[3:7]), matrix(conjugate(rotation))
-    turn = from_vector(applied(N, bias[0:3]))
-    C = matrix(turn)
-    pose[3:7] = multiply(turn, mean[3:7])
-    point = mean[0:3] + applied(R, lever + bias[6:9])
-    pose[0:3] = applied(C, point) + applied(N, bias[3:6]) - applied(matrix(pose[3:7]), lever)
-    return R, C, N
+@compiled
+def outside(theta, rows, a, lowest, highest):
+    """Whether ``theta`` (n,) moved by ``rows`` (n, r) times ``a`` (r,) leaves its range anywhere."""
+    for i in range(len(theta)):
+        moved = theta[i]
+        for k in range(len(a)):
+            moved += rows[i, k] * a[k]
+        if not lowest[i] <= moved <= highest[i]:
+            return True
+    return False
 
 
-@_compile_sums
-def covariance_of(rows, pi, covariance):
-    """``covariance`` (k, k) = rows pi rows^T of ``rows`` (k, s) under ``pi`` (at least s, s)."""
-    size = rows.shape[1]
-    half = np.empty(size)
-    for n in range(len(rows)):
-        for p in range(size):
-            product = 0.0
-            for q in range(size):
-                product += pi[p, q] * rows[n, q]
-            half[p] = product
-        for i in range(n + 1):
-            product = 0.0
-            for p in range(size):
-                product += rows[i, p] * half[p]
-            covariance[i, n] = covariance[n, i] = product
+@compiled
+def move_unknowns(dx, a, unknowns, earlier):
+    """Add ``dx`` (m, r) times ``a`` (r,) to the ``unknowns`` (stages, m) and the ``earlier`` (steps, stages, m)."""
+    for i in range(len(dx)):
+        shift = 0.0
+        for k in range(len(a)):
+            shift += dx[i, k] * a[k]
+        for stage in range(len(unknowns)):
+            unknowns[stage, i] += shift
+            for step in range(len(earlier)):
+                earlier[step, stage, i] += shift
 
 
-@_compile
-def registered_rows(mean, columns, rotation, lever, bias, pi, pose, covariance):
-    """Pose (7,) of :func:`registered_pose` and the covariance (12, 12) of pose and twist (base axes) under ``pi`` (r + 13, r + 13).
-
-    ``columns`` (12, r): of the tip. Returns False if anything is not finite.
-    """
-    r = columns.shape[1]
-    size = r + 13
-    R, C, N = registered_pose(mean, rotation, lever, bias, pose)
-    arm = applied(R, bias[6:9])  # extra arm beyond the nominal lever moves the pose when the tip turns
-    J = np.zeros((12, size - 4))  # delay and drift are left out
-    for c in range(r):
-        ax, ay, az = columns[3, c], columns[4, c], columns[5, c]
-        dx = columns[0, c] + ay * arm[2] - az * arm[1]
-        dy = columns[1, c] + az * arm[0] - ax * arm[2]
-        dz = columns[2, c] + ax * arm[1] - ay * arm[0]
-        for i in range(3):
-            J[i, c] = C[i, 0] * dx + C[i, 1] * dy + C[i, 2] * dz
-            J[3 + i, c] = C[i, 0] * ax + C[i, 1] * ay + C[i, 2] * az
-            J[6 + i, c] = columns[6 + i, c]
-            J[9 + i, c] = columns[9 + i, c]
-    for c in range(3):
-        nx, ny, nz = N[0, c], N[1, c], N[2, c]
-        J[0, r + c] = ny * pose[2] - nz * pose[1]
-        J[1, r + c] = nz * pose[0] - nx * pose[2]
-        J[2, r + c] = nx * pose[1] - ny * pose[0]
-        for i in range(3):
-            J[3 + i, r + c] = N[i, c]
-            J[i, r + 3 + c] = N[i, c]
-            J[i, r + 6 + c] = C[i, 0] * R[0, c] + C[i, 1] * R[1, c] + C[i, 2] * R[2, c]
-    covariance_of(J, pi, covariance)
+@compiled_sums
+def quadratic(row, pi):
+    """row pi row^T of ``row`` (r,) under ``pi`` (at least r, r)."""
     total = 0.0
-    for i in range(12):
-        for n in range(12):
-            total += covariance[i, n]
-    for i in range(7):
-        total += pose[i]
-    return np.isfinite(total)
+    for i in range(len(row)):
+        product = 0.0
+        for k in range(len(row)):
+            product += pi[i, k] * row[k]
+        total += row[i] * product
+    return total
 
 
-@_compile
+@compiled
+def deviations(rows, pi):
+    """(rows,) roots of the variances rows pi rows^T of ``rows`` (rows, r) under ``pi`` (at least r, r)."""
+    result = np.empty(len(rows))
+    for n in range(len(rows)):
+        result[n] = math.sqrt(max(quadratic(rows[n], pi), 0.0))
+    return result
+
+
+@compiled
+def position_deviations(dnodes, size, pi):
+    """(nodes,) deviation of the position per axis in m: root of a third of the trace of its covariance under ``pi`` (at least r, r).
+
+    ``dnodes`` (nodes * size, r): columns of the node states, position first.
+    """
+    result = np.empty(len(dnodes) // size)
+    for node in range(len(result)):
+        trace = 0.0
+        for axis in range(3):
+            trace += quadratic(dnodes[node * size + axis], pi)
+        result[node] = math.sqrt(max(trace, 0.0) / 3.0)
+    return result
+
+
+@compiled_sums
+def modal_coordinates(by_fields, fields, by_inputs, alpha, beta, force, torque, at_rest):
+    """(2m,) amplitudes and rates of modes: ``by_fields`` (2m, fields) times the ``fields``, less what the equilibrium at the inputs has."""
+    values = np.empty(len(at_rest))
+    for i in range(len(values)):
+        total = -at_rest[i]
+        for k in range(len(fields)):
+            total += by_fields[i, k] * fields[k]
+        column = 0
+        for part in (alpha, beta, force, torque):
+            for k in range(len(part)):
+                total -= by_inputs[i, column] * part[k]
+                column += 1
+        values[i] = total
+    return values
+
+
+@compiled
 def backbone_rows(s, nodes, fields, points, n, insertion_rate, turn, shift, deviation, rows):
     """Fill ``rows`` (P, 15) float32: s, x, y, z, qx, qy, qz, qw, vx, vy, vz, ux, uy, uz, sd.
 
@@ -205,279 +269,3 @@ def backbone_rows(s, nodes, fields, points, n, insertion_rate, turn, shift, devi
         for k in range(3):
             rows[i, 11 + k] = fields[base + 6 + k]
         rows[i, 14] = deviation[i]
-
-
-@_compile
-def sparse_product(indptr, indices, data, columns):
-    """Product (rows, k) of a matrix in compressed rows with ``columns`` (columns, k)."""
-    result = np.zeros((len(indptr) - 1, columns.shape[1]))
-    for row in range(len(result)):
-        for place in range(indptr[row], indptr[row + 1]):
-            for k in range(columns.shape[1]):
-                result[row, k] += data[place] * columns[indices[place], k]
-    return result
-
-
-@_compile_sums
-def modal_coordinates(by_fields, fields, by_inputs, alpha, beta, force, torque, at_rest):
-    """(2m,) amplitudes and rates of modes: ``by_fields`` (2m, fields) times the ``fields``, less what the equilibrium at the inputs has."""
-    values = np.empty(len(at_rest))
-    for i in range(len(values)):
-        total = -at_rest[i]
-        for k in range(len(fields)):
-            total += by_fields[i, k] * fields[k]
-        column = 0
-        for part in (alpha, beta, force, torque):
-            for k in range(len(part)):
-                total -= by_inputs[i, column] * part[k]
-                column += 1
-        values[i] = total
-    return values
-
-
-@_compile_sums
-def quadratic(row, pi):
-    """row pi row^T of ``row`` (r,) under ``pi`` (at least r, r)."""
-    total = 0.0
-    for i in range(len(row)):
-        product = 0.0
-        for k in range(len(row)):
-            product += pi[i, k] * row[k]
-        total += row[i] * product
-    return total
-
-
-@_compile
-def deviations(rows, pi):
-    """(rows,) roots of the variances rows pi rows^T of ``rows`` (rows, r) under ``pi`` (at least r, r)."""
-    result = np.empty(len(rows))
-    for n in range(len(rows)):
-        result[n] = math.sqrt(max(quadratic(rows[n], pi), 0.0))
-    return result
-
-
-@_compile
-def position_deviations(dnodes, size, pi):
-    """(nodes,) deviation of the position per axis in m: root of a third of the trace of its covariance under ``pi`` (at least r, r).
-
-    ``dnodes`` (nodes * size, r): columns of the node states, position first.
-    """
-    result = np.empty(len(dnodes) // size)
-    for node in range(len(result)):
-        trace = 0.0
-        for axis in range(3):
-            trace += quadratic(dnodes[node * size + axis], pi)
-        result[node] = math.sqrt(max(trace, 0.0) / 3.0)
-    return result
-
-
-@_compile
-def interpolate_columns(columns, count):
-    """Columns (tips, 12, r) of the ``count`` tips before the last, between those of their neighbours."""
-    last = len(columns) - 1
-    first = last - 1 - count
-    for i in range(1, count + 1):
-        for row in range(columns.shape[1]):
-            for c in range(columns.shape[2]):
-                change = columns[last, row, c] - columns[first, row, c]
-                columns[first + i, row, c] = columns[first, row, c] + i * (change / (count + 1))
-
-
-@_compile
-def tip_between(a, b, a_columns, b_columns, x, dt, mean, columns):
-    """Tip at the fraction ``x`` of the step ``dt`` (s) from tip ``a`` (13,) to ``b``, or a little outside, into ``mean`` (13,); with its columns
-    where ``columns`` (12, r) has any.
-
-    Cubic Hermite in position, linear turn on top of the nearer end's rotation.
-    """
-    w0, w1 = (1 + 2 * x) * (1 - x) ** 2, x * (1 - x) ** 2 * dt
-    w2, w3 = x * x * (3 - 2 * x), x * x * (x - 1) * dt
-    d0, d1 = 6 * x * (x - 1) / dt, (1 - x) * (1 - 3 * x)
-    d2, d3 = 6 * x * (1 - x) / dt, x * (3 * x - 2)
-    for i in range(3):
-        mean[i] = w0 * a[i] + w1 * a[7 + i] + w2 * b[i] + w3 * b[7 + i]
-        mean[7 + i] = d0 * a[i] + d1 * a[7 + i] + d2 * b[i] + d3 * b[7 + i]
-        mean[10 + i] = (1 - x) * a[10 + i] + x * b[10 + i]
-    turn = to_vector(multiply(b[3:7], conjugate(a[3:7])))
-    mean[3:7] = multiply(from_vector(x * turn), a[3:7])
-    for c in range(columns.shape[1]):
-        for i in range(3):
-            p, v, q, u = a_columns[i, c], a_columns[6 + i, c], b_columns[i, c], b_columns[6 + i, c]
-            columns[i, c] = w0 * p + w1 * v + w2 * q + w3 * u
-            columns[6 + i, c] = d0 * p + d1 * v + d2 * q + d3 * u
-            columns[3 + i, c] = (1 - x) * a_columns[3 + i, c] + x * b_columns[3 + i, c]
-            columns[9 + i, c] = (1 - x) * a_columns[9 + i, c] + x * b_columns[9 + i, c]
-
-
-@_compile
-def shift_tips(columns, a, means):
-    """Move tips ``means`` (tips, 13) by their columns (tips, 12, r) times ``a`` (r,)."""
-    d = np.empty(12)
-    for tip in range(len(means)):
-        for row in range(12):
-            d[row] = 0.0
-            for c in range(len(a)):
-                d[row] += columns[tip, row, c] * a[c]
-        mean = means[tip]
-        for i in range(3):
-            mean[i] += d[i]
-        for i in range(6):
-            mean[7 + i] += d[6 + i]
-        # the half turn, made a unit quaternion
-        x, y, z = 0.5 * d[3], 0.5 * d[4], 0.5 * d[5]
-        w = math.sqrt(max(0.0, 1.0 - x * x - y * y - z * z))
-        mean[3:7] = multiply(np.array([w, x, y, z]), mean[3:7])
-
-
-@_compile
-def expected_reading(mean, rotation, translation, lever, bias):
-    """(7,) position and quaternion that a tip and tracker states predict."""
-    registration = multiply(from_vector(bias[0:3]), rotation)
-    point = mean[0:3] + applied(matrix(mean[3:7]), lever + bias[6:9])
-    pose = np.empty(7)
-    pose[0:3] = applied(matrix(registration), point) + translation + bias[3:6] + bias[10:13]
-    pose[3:7] = multiply(registration, mean[3:7])
-    return pose
-
-
-@_compile
-def pose_difference(position, quaternion, expected_position, expected_quaternion, free):
-    """(6,) reading minus expectation: position, then rotation vector in the sensor's axes, without the turn about the axis ``free``, 1 to 3, if
-    not 0."""
-    turned = multiply(conjugate(expected_quaternion), quaternion)
-    if free:
-        size = turned[0] ** 2 + turned[free] ** 2
-        if size > 1e-12:
-            twist = np.zeros(4)
-            twist[0], twist[free] = turned[0] / math.sqrt(size), -turned[free] / math.sqrt(size)
-            turned = multiply(turned, twist)
-    difference = np.empty(6)
-    difference[0:3] = position - expected_position
-    difference[3:6] = to_vector(turned)
-    return difference
-
-
-@_compile
-def pose_in_base(position, quaternion, rotation, translation, lever):
-    """(7,) tip pose of :meth:`ctr_dynamics.estimation.tracker.TrackerModel.to_base`."""
-    back = conjugate(rotation)
-    pose = np.empty(7)
-    pose[3:7] = multiply(back, quaternion)
-    pose[0:3] = applied(matrix(back), position - translation) - applied(matrix(pose[3:7]), lever)
-    return pose
-
-
-@_compile
-def sensitivity_rows(mean, columns, rotation, lever, bias, H):
-    """Derivative H (6, r + 13) of the expected reading; see :func:`ctr_dynamics.estimation.tracker.innovation`."""
-    r = columns.shape[1]
-    R, Q = matrix(mean[3:7]), matrix(multiply(from_vector(bias[0:3]), rotation))
-    position, velocity, rate = mean[0:3], mean[7:10], mean[10:13]
-    arm = applied(R, lever + bias[6:9])
-    d = np.empty(3)
-    for c in range(r):
-        tx, ty, tz = columns[3, c], columns[4, c], columns[5, c]
-        d[0] = columns[0, c] + ty * arm[2] - tz * arm[1]
-        d[1] = columns[1, c] + tz * arm[0] - tx * arm[2]
-        d[2] = columns[2, c] + tx * arm[1] - ty * arm[0]
-        for i in range(3):
-            H[i, c] = Q[i, 0] * d[0] + Q[i, 1] * d[1] + Q[i, 2] * d[2]
-            H[3 + i, c] = R[0, i] * tx + R[1, i] * ty + R[2, i] * tz
-    H[:, r:] = 0.0
-    for i in range(3):
-        px = (
-            Q[0, 0] * (position[0] + arm[0])
-            + Q[0, 1] * (position[1] + arm[1])
-            + Q[0, 2] * (position[2] + arm[2])
-        )
-        py = (
-            Q[1, 0] * (position[0] + arm[0])
-            + Q[1, 1] * (position[1] + arm[1])
-            + Q[1, 2] * (position[2] + arm[2])
-        )
-        pz = (
-            Q[2, 0] * (position[0] + arm[0])
-            + Q[2, 1] * (position[1] + arm[1])
-            + Q[2, 2] * (position[2] + arm[2])
-        )
-        for k in range(3):
-            H[3 + i, r + k] = R[0, i] * Q[k, 0] + R[1, i] * Q[k, 1] + R[2, i] * Q[k, 2]
-            H[i, r + 6 + k] = Q[i, 0] * R[0, k] + Q[i, 1] * R[1, k] + Q[i, 2] * R[2, k]
-        H[i, r + 3 + i] = 1.0
-        H[i, r + 10 + i] = 1.0
-        d[i] = velocity[i] + rate[(i + 1) % 3] * arm[(i + 2) % 3] - rate[(i + 2) % 3] * arm[(i + 1) % 3]
-    H[0, r + 1], H[0, r + 2] = pz, -py
-    H[1, r], H[1, r + 2] = -pz, px
-    H[2, r], H[2, r + 1] = py, -px
-    for i in range(3):
-        H[i, r + 9] = -(Q[i, 0] * d[0] + Q[i, 1] * d[1] + Q[i, 2] * d[2])
-        H[3 + i, r + 9] = -(R[0, i] * rate[0] + R[1, i] * rate[1] + R[2, i] * rate[2])
-
-
-@_compile
-def innovation_rows(
-    position,
-    quaternion,
-    mean,
-    columns,
-    rotation,
-    translation,
-    lever,
-    bias,
-    free,
-    measured,
-    variance,
-    pi,
-    nu,
-    H,
-    S,
-):
-    """Fill ``nu``, ``H`` and ``S`` of :func:`ctr_dynamics.estimation.tracker.innovation` on the axes ``measured`` (k,); returns the whitened
-    innovation."""
-    pose = expected_reading(mean, rotation, translation, lever, bias)
-    difference = pose_difference(position, quaternion, pose[0:3], pose[3:7], free)
-    whole = np.empty((6, len(pi)))
-    sensitivity_rows(mean, columns, rotation, lever, bias, whole)
-    size = len(measured)
-    for i in range(size):
-        nu[i], H[i] = difference[measured[i]], whole[measured[i]]
-    covariance_of(H, pi, S)
-    for i in range(size):
-        S[i, i] += variance[measured[i]]
-    root, white = np.zeros((size, size)), np.empty(size)
-    for i in range(size):
-        for k in range(i + 1):
-            entry = S[i, k]
-            for q in range(k):
-                entry -= root[i, q] * root[k, q]
-            root[i, k] = entry / root[k, k] if k < i else math.sqrt(entry)
-        white[i] = nu[i]
-        for k in range(i):
-            white[i] -= root[i, k] * white[k]
-        white[i] /= root[i, i]
-    return white
-
-
-@_compile
-def outside(theta, rows, a, lowest, highest):
-    """Whether ``theta`` (n,) moved by ``rows`` (n, r) times ``a`` (r,) leaves its range anywhere."""
-    for i in range(len(theta)):
-        moved = theta[i]
-        for k in range(len(a)):
-            moved += rows[i, k] * a[k]
-        if not lowest[i] <= moved <= highest[i]:
-            return True
-    return False
-
-
-@_compile
-def move_unknowns(dx, a, unknowns, earlier):
-    """Add ``dx`` (m, r) times ``a`` (r,) to the ``unknowns`` (stages, m) and the ``earlier`` (steps, stages, m)."""
-    for i in range(len(dx)):
-        shift = 0.0
-        for k in range(len(a)):
-            shift += dx[i, k] * a[k]
-        for stage in range(len(unknowns)):
-            unknowns[stage, i] += shift
-            for step in range(len(earlier)):
-                earlier[step, stage, i] += shift

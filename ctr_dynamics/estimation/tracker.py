@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 
 from ctr_dynamics.effects import Setup
 
-from .kernels import from_vector, innovation_rows, matrix, multiply, pose_in_base, registered_pose
+from .kernels import from_vector, matrix, multiply
 from .tip import Tip
+from .tracker_kernels import innovation_rows, pose_in_base, registered_pose
 
 Floats = NDArray[np.float64]
 

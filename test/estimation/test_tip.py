@@ -8,10 +8,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 from tracker_twin import expected, residual
 
-from ctr_dynamics.estimation.kernels import registered_rows
 from ctr_dynamics.estimation.rotations import conjugate, from_vector, matrix, multiply, to_vector
 from ctr_dynamics.estimation.tip import Tip, TipWindow, tip_rows
 from ctr_dynamics.estimation.tracker import DELAY, STATES, TrackerModel, innovation
+from ctr_dynamics.estimation.tracker_kernels import registered_rows
 
 RNG = np.random.default_rng(11)
 COLUMNS, STEP = 5, 1e-6
