@@ -165,9 +165,8 @@ class Pair:
         if key != self._key:
             self._key, self._buffers = key, self._make(mesh)
         work, found_a, found_b, alive = self._buffers
-        column = (
-            scheme.stages * round(t / scheme.dt) % len(model.step)
-        )  # a step may be too short for all of them
+        # a step may be too short to probe all columns: the next one begins at another
+        column = scheme.stages * round(t / scheme.dt) % len(model.step)
         sweeps, jacobians = _step(
             model.tubes, model.jacobian_lanes, mesh, scheme.c0, scheme.weights, (self.first.parameters, self.second.parameters), (rows_a, rows_b),
             (a.bank, b.bank), (a.unknowns, b.unknowns), (a.earlier, b.earlier), (found_a, found_b), (a.inverse, b.inverse), (a.usable, b.usable),
