@@ -43,7 +43,7 @@ _MAX_STRETCHES = 100
 
 @dataclass
 class ReplayResult:
-    """Outcome of a replay: the content of summary.json, and what the reader of the bag had to leave out."""
+    """Outcome of a replay: the content of summary.json, and what was odd about the inputs, each kind in a line."""
 
     summary: dict[str, Any]
     notes: list[str] = field(default_factory=list)
@@ -256,7 +256,8 @@ def replay(
         log = _report_log(estimator, opened) if report_part is not None else None
         stack.enter_context(seldom_collected())
         numbers, times_s = _run(opened, estimator, robot, settings, writer, progress, log)
-        content = plain({**numbers, **provenance, "notes": opened.notes})
+        notes = [*opened.notes, *_input_notes(numbers)]
+        content = plain({**numbers, **provenance, "notes": notes})
         if summary_part is not None:
             text = json.dumps(content, indent=1, allow_nan=False, ensure_ascii=False)
             summary_part.write_text(text + "\n", encoding="utf-8")
@@ -264,7 +265,7 @@ def replay(
             from ctr_dynamics.report.replay import replay_page
 
             report_part.write_text(replay_page(log, content, times_s).text(), encoding="utf-8")
-    return ReplayResult(content, opened.notes)
+    return ReplayResult(content, notes)
 
 
 def _default_estimator() -> MakeEstimator:
@@ -318,7 +319,7 @@ def _run(
             progress(min(1.0, (last_ns - first_ns) / span_ns) if span_ns > 0 else 1.0, steps)
     wall_s = time.perf_counter() - begin
     if steps == 0:
-        raise _no_step(bag, robot, player.joint_names)
+        raise _no_step(bag, robot, player.joint_names, estimator.summary())
     duration_s = (last_ns - first_ns) * 1e-9
     p50, p99, worst = np.percentile(np.array(player.times_s()) * 1e3, (50, 99, 100))
     numbers = {
@@ -363,12 +364,22 @@ def _check_targets(bag: Bag, targets: dict[str, str | Path | None]) -> None:
         taken[target] = f"the same file as the {what}"
 
 
-def _no_step(bag: Bag, robot: Robot, names: set[str]) -> InputError:
+def _input_notes(numbers: dict[str, Any]) -> list[str]:
+    """A line for each kind of odd input that the estimator has noted."""
+    return [
+        f"{group}: {kind} ({found['count']}), the last: {found['last']}"
+        for group, kinds in numbers["input_problems"].items()
+        for kind, found in kinds.items()
+    ]
+
+
+def _no_step(bag: Bag, robot: Robot, names: set[str], numbers: dict[str, Any]) -> InputError:
     expected = ", ".join(f"tube{i}_rotation, tube{i}_translation" for i in range(1, robot.n_tubes + 1))
     found = ", ".join(sorted(names)[:12]) or "none"
+    odd = "".join(f"; {note}" for note in _input_notes(numbers) if note.startswith("joints"))
     return InputError(
         f"no step was possible: no usable joint state of robot '{robot.name}' on {JOINT_STATES} (joints "
-        f"found: {found}; needed: {expected}; readable messages: {_readable(bag)})",
+        f"found: {found}; needed: {expected}; readable messages: {_readable(bag)}{odd})",
         where=str(bag.path),
         do="check joint names, units and robot with `ctr-dynamics info`",
     )

@@ -435,6 +435,7 @@ class Estimator:
             "rejected": h.rejected,
             "late": h.late,
             "dropped": h.dropped,
+            "input_problems": h.input_problems(),
             "solver": {
                 "failures": h.failures,
                 "reasons": dict(h.reasons),

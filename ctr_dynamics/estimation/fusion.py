@@ -370,6 +370,8 @@ class Fusion:
         x = self._confined(x)
         a = x[:r]
         self.bias += x[r:]
+        # beyond these a reading on time would show a tip that is not kept, and no later one could mend the delay
+        self.bias[DELAY] = min(max(self.bias[DELAY], -self.simulator.scheme.dt), self.options.window)
         self.theta += c.theta @ a
         np.clip(self.theta, self.uncertainty.lowest, self.uncertainty.highest, out=self.theta)
         self._apply_theta()

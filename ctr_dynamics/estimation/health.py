@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -77,6 +78,13 @@ class Health:
     def note(self, group: str, kind: str, what: str) -> None:
         """Count an input problem of ``kind`` in ``group`` (joints, tracker or load)."""
         getattr(self, group).setdefault(kind, Counter()).add(what)
+
+    def input_problems(self) -> dict[str, dict[str, dict[str, Any]]]:
+        """What has been noted of inputs: by group and kind, how often (``count``) and what the ``last`` one was."""
+        return {
+            group: {kind: {"count": c.count, "last": c.last} for kind, c in getattr(self, group).items()}
+            for group in ("joints", "tracker", "load")
+        }
 
     def failed(self, reason: str) -> None:
         """Count a failed step."""

@@ -112,6 +112,7 @@ class StandIn:
             "rejected": 0,
             "late": 0,
             "dropped": 0,
+            "input_problems": {"joints": {}, "tracker": {}, "load": {}},
             "solver": {"failures": 0, "reasons": {}},
         }
 
@@ -364,6 +365,52 @@ def test_command_with_the_estimator(bags, tmp_path):
         assert set(content["solver"]) >= {"failures", "reasons"}
         assert {"duration_s", "wall_s", "realtime_ratio", "rejected", "late", "dropped"} <= set(content)
     assert outputs[0] == outputs[1]
+
+
+def start_of(bag, target, change):
+    """The first 0.3 s of ``bag``, every input but the load as ``change(message)`` encodes it."""
+    with write_bag(target, {}) as writer:
+        for item in open_bag(bag).inputs():
+            data = change(item.message) if item.log_ns <= T0 + 300_000_000 else None
+            if data is not None:
+                writer.write(item.topic, item.log_ns, data)
+
+
+def test_what_was_odd_about_the_inputs_is_said(bags, tmp_path):
+    def elsewhere(m):
+        if isinstance(m, cdr.JointStateIn):
+            return encode_joint_state(m.stamp_ns, m.names, m.positions)
+        if isinstance(m, cdr.PoseIn):
+            return encode_pose_stamped(m.stamp_ns, "polaris", m.position, m.quaternion_xyzw)
+        return None
+
+    start_of(bags / "clean_release.mcap", tmp_path / "in.mcap", elsewhere)
+    done = command(tmp_path / "in.mcap", "--summary", tmp_path / "out.json")
+    assert done.returncode == 0, done.stderr
+    assert (
+        "note: tracker: other frame (12), the last: pose in frame 'polaris', expected 'ctr_base'"
+        in done.stderr
+    )
+    content = json.loads((tmp_path / "out.json").read_text())
+    assert content["dropped"] == content["input_problems"]["tracker"]["other frame"]["count"] == 12
+    assert len(content["notes"]) == 1
+
+
+def test_joints_in_millimetres_are_refused_with_value_and_limit(bags, tmp_path):
+    def in_millimetres(m):
+        if not isinstance(m, cdr.JointStateIn):
+            return None
+        values = [
+            1e3 * x if "translation" in name else x for name, x in zip(m.names, m.positions, strict=True)
+        ]
+        return encode_joint_state(m.stamp_ns, m.names, values)
+
+    start_of(bags / "clean_release.mcap", tmp_path / "in.mcap", in_millimetres)
+    done = command(tmp_path / "in.mcap")
+    assert done.returncode == 2
+    assert len(done.stderr.splitlines()) == 1
+    assert "joints: out of range" in done.stderr
+    assert "give metres" in done.stderr
 
 
 # Clocks.
