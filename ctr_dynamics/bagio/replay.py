@@ -256,7 +256,7 @@ def replay(
         log = _report_log(estimator, opened) if report_part is not None else None
         stack.enter_context(seldom_collected())
         numbers, times_s = _run(opened, estimator, robot, settings, writer, progress, log)
-        notes = [*opened.notes, *_input_notes(numbers)]
+        notes = [*opened.notes, *_input_notes(numbers["input_problems"])]
         content = plain({**numbers, **provenance, "notes": notes})
         if summary_part is not None:
             text = json.dumps(content, indent=1, allow_nan=False, ensure_ascii=False)
@@ -319,7 +319,7 @@ def _run(
             progress(min(1.0, (last_ns - first_ns) / span_ns) if span_ns > 0 else 1.0, steps)
     wall_s = time.perf_counter() - begin
     if steps == 0:
-        raise _no_step(bag, robot, player.joint_names, estimator.summary())
+        raise _no_step(bag, robot, player.joint_names, estimator.summary()["input_problems"]["joints"])
     duration_s = (last_ns - first_ns) * 1e-9
     p50, p99, worst = np.percentile(np.array(player.times_s()) * 1e3, (50, 99, 100))
     numbers = {
@@ -364,19 +364,19 @@ def _check_targets(bag: Bag, targets: dict[str, str | Path | None]) -> None:
         taken[target] = f"the same file as the {what}"
 
 
-def _input_notes(numbers: dict[str, Any]) -> list[str]:
-    """A line for each kind of odd input that the estimator has noted."""
+def _input_notes(problems: dict[str, dict[str, Any]]) -> list[str]:
+    """A line for each kind of odd input that the estimator has noted, by group."""
     return [
         f"{group}: {kind} ({found['count']}), the last: {found['last']}"
-        for group, kinds in numbers["input_problems"].items()
+        for group, kinds in problems.items()
         for kind, found in kinds.items()
     ]
 
 
-def _no_step(bag: Bag, robot: Robot, names: set[str], numbers: dict[str, Any]) -> InputError:
+def _no_step(bag: Bag, robot: Robot, names: set[str], problems: dict[str, Any]) -> InputError:
     expected = ", ".join(f"tube{i}_rotation, tube{i}_translation" for i in range(1, robot.n_tubes + 1))
     found = ", ".join(sorted(names)[:12]) or "none"
-    odd = "".join(f"; {note}" for note in _input_notes(numbers) if note.startswith("joints"))
+    odd = "".join(f"; {note}" for note in _input_notes({"joints": problems}))
     return InputError(
         f"no step was possible: no usable joint state of robot '{robot.name}' on {JOINT_STATES} (joints "
         f"found: {found}; needed: {expected}; readable messages: {_readable(bag)}{odd})",

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import math
-import time
-from collections.abc import Callable
 from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ctr_dynamics.bench.machine import best_of
 from ctr_dynamics.bench.release import DT, Release, release_robot, sampled
 from ctr_dynamics.effects import apply_effects, make_setup
 from ctr_dynamics.model.batch import LANES, run_many
@@ -21,17 +19,6 @@ from ctr_dynamics.model.trajectory import run
 Floats = NDArray[np.float64]
 COLUMNS = 40
 SPREAD = 0.01  # deviation of the stiffness and of the angles (rad) from case to case
-
-
-def least_times(*works: Callable[[], None], rounds: int = 5) -> list[float]:
-    """Least time (s) that each of the ``works`` took in several rounds, one after the other: what else the machine does meets both."""
-    least = [math.inf] * len(works)
-    for _ in range(rounds):
-        for i, work in enumerate(works):
-            begin = time.perf_counter()
-            work()
-            least[i] = min(least[i], time.perf_counter() - begin)
-    return least
 
 
 def ensemble(test: Release, nodes: int, cases: int, duration: float, tolerance: float) -> dict[str, Any]:
@@ -54,7 +41,7 @@ def ensemble(test: Release, nodes: int, cases: int, duration: float, tolerance: 
         for block, rows in zip(parameters, inputs, strict=True):
             run(model, scheme, block, rows, duration, tolerance=tolerance)
 
-    together, apart = least_times(at_once, one_by_one)
+    together, apart = best_of(at_once, 1), best_of(one_by_one, 1)
     return {
         "nodes": nodes,
         "cases": cases,
@@ -74,9 +61,8 @@ def sensitivity_cost(test: Release, nodes: int, duration: float, tolerance: floa
         row = k % (11 * model.n)
         effect[row, k] = 1e-3 * abs(model.parameters[row])
 
-    def simulate(columns: Floats | None, seconds: float) -> None:
-        run(model, scheme, model.parameters, rows, seconds, effect=columns, tolerance=tolerance)
+    def simulate(columns: Floats | None) -> None:
+        run(model, scheme, model.parameters, rows, duration, effect=columns, tolerance=tolerance)
 
-    simulate(effect, 4 * DT)
-    plain, derived = least_times(partial(simulate, None, duration), partial(simulate, effect, duration))
+    plain, derived = best_of(partial(simulate, None), 1), best_of(partial(simulate, effect), 1)
     return {"nodes": nodes, "columns": COLUMNS, "simulations": derived / plain}

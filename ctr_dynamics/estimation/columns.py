@@ -28,9 +28,8 @@ EPSILON = 5e-9  # of one standard deviation: small against the curvature of the 
 
 def carried(matrix: csr_array, values: Floats) -> Floats:
     """Product (rows, k) of one of a transfer's matrices with ``values`` (columns, k), or (rows,) with (columns,)."""
-    columns = values if values.ndim == 2 else values[:, None]
-    product = sparse_product(matrix.indptr, matrix.indices, matrix.data, columns)
-    return product if values.ndim == 2 else product[:, 0]
+    product = sparse_product(matrix.indptr, matrix.indices, matrix.data, values.reshape(len(values), -1))
+    return product.reshape(-1, *values.shape[1:])
 
 
 def field_weights(model: Model, mesh: Mesh, beta: Floats) -> Floats:

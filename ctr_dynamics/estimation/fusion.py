@@ -294,10 +294,8 @@ class Fusion:
 
     def compare(self, stamp: float, position: Floats, quaternion: Floats) -> Update:
         """The innovation of a reading that is not fused."""
-        innovation = self._innovation(stamp, position, quaternion)
-        return (
-            innovation if isinstance(innovation, Update) else innovation[3]._replace(reason="fusion is off")
-        )
+        found = self._innovation(stamp, position, quaternion)
+        return found if isinstance(found, Update) else found[3]._replace(reason="fusion is off")
 
     def _innovation(
         self, stamp: float, position: Floats, quaternion: Floats

@@ -145,22 +145,8 @@ def sensitivity_rows(mean, columns, rotation, lever, bias, H):
             H[i, c] = Q[i, 0] * d[0] + Q[i, 1] * d[1] + Q[i, 2] * d[2]
             H[3 + i, c] = R[0, i] * tx + R[1, i] * ty + R[2, i] * tz
     H[:, r:] = 0.0
+    px, py, pz = applied(Q, position + arm)
     for i in range(3):
-        px = (
-            Q[0, 0] * (position[0] + arm[0])
-            + Q[0, 1] * (position[1] + arm[1])
-            + Q[0, 2] * (position[2] + arm[2])
-        )
-        py = (
-            Q[1, 0] * (position[0] + arm[0])
-            + Q[1, 1] * (position[1] + arm[1])
-            + Q[1, 2] * (position[2] + arm[2])
-        )
-        pz = (
-            Q[2, 0] * (position[0] + arm[0])
-            + Q[2, 1] * (position[1] + arm[1])
-            + Q[2, 2] * (position[2] + arm[2])
-        )
         for k in range(3):
             H[3 + i, r + k] = R[0, i] * Q[k, 0] + R[1, i] * Q[k, 1] + R[2, i] * Q[k, 2]
             H[i, r + 6 + k] = Q[i, 0] * R[0, k] + Q[i, 1] * R[1, k] + Q[i, 2] * R[2, k]
