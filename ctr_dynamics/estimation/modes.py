@@ -13,7 +13,7 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import eig
+from scipy.linalg.lapack import dgeev
 
 from ctr_dynamics.model.mesh import Key
 from ctr_dynamics.model.model import Model
@@ -33,6 +33,8 @@ SHIFT_STEP = 0.02  # s: the shift 50 / s lies among the slow bending modes
 BLOCK = 8
 ROUNDS = 4
 MODE_NODES = 16
+MOVED = 5e-4, 0.01  # m of any node, rad of any tube's base: modes of a robot that has moved less are kept
+MOST_KEPT = 4  # refreshes in a row
 _END = object()
 MAX_DAMPING = 0.7  # more is no vibration
 
@@ -47,7 +49,7 @@ class ModalBasis:
             main direction is 2 Re z and its speed 2 Re(mu z).
         rest: (fields,) fields of the equilibrium; inputs (2N + 6,): alpha, beta, force and torque there.
         follow: (2m, 2N + 6) modal coordinates of the equilibrium that moves with alpha, beta, force and torque.
-        direction: (m, 3) unit, main direction of the tip's motion in ``ctr_base``.
+        direction: (m, 3) unit, main direction of the tip's motion in ``ctr_base``; zero where a mode does not move it.
     """
 
     frequency_hz: Floats
@@ -194,40 +196,45 @@ def modal_parts(
     reduced = Q.T @ (weights[:, None] * image)
     if not np.isfinite(reduced).all():
         return
-    values, left, right = eig(reduced, left=True, check_finite=False)
-    overlap = np.einsum("ji,ji->i", left.conj(), right)
+    real, imaginary, left, right, failed = dgeev(reduced)
+    if failed:
+        return
+    values = real + 1j * imaginary
     with np.errstate(divide="ignore", invalid="ignore"):
         mu = (1.0 - 1.0 / values) / SHIFT_STEP
     wanted = (
-        np.isfinite(mu)
+        (
+            imaginary > 0.0
+        )  # of each pair the first, whose vectors LAPACK keeps in two columns: real part, imaginary part
+        & np.isfinite(mu)
         & (mu.imag > 1.0)
         & (-mu.real < MAX_DAMPING * np.abs(mu))
         & (mu.real < 0.05 * np.abs(mu))
-        & (np.abs(overlap) > 1e-8)  # else defective
     )
-    order = [int(i) for i in np.flatnonzero(wanted)[np.argsort(np.abs(mu[wanted]))]][:count]
-    if not order:
+    order = np.flatnonzero(wanted)[np.argsort(np.abs(mu[wanted]))]
+    left, right = left[:, order] - 1j * left[:, order + 1], right[:, order] + 1j * right[:, order + 1]
+    overlap = np.einsum("ji,ji->i", left, right)
+    slowest = np.flatnonzero(np.abs(overlap) > 1e-8)[:count]  # else defective
+    if not len(slowest):
         return
-    chosen = mu[order].astype(complex)
-    left, right = left[:, order].conj().T / overlap[order, None], right[:, order]
+    left, right = (left[:, slowest] / overlap[slowest]).T, right[:, slowest]
+    chosen, factor = mu[order[slowest]], values[order[slowest]]
     coordinates = ((left.real @ Q.T) + 1j * (left.imag @ Q.T)) * weights  # of the modes, in any fields
     tip = matrix(equilibrium.tip_quaternion) @ image[main - (7 + 2 * n) :][:3]  # velocity of the images
-    displacement = (tip @ (right / (values[order] * chosen))).T
-    readout, direction = [], []
-    for i, moved in enumerate(displacement):
-        # main direction: of the largest real part over the phase
-        axis = np.linalg.svd(np.stack([moved.real, moved.imag], axis=1), full_matrices=False)[0][:, 0]
-        axis = axis * (1.0 if axis[np.argmax(np.abs(axis))] > 0 else -1.0)
-        readout.append(coordinates[i] * (axis @ moved))
-        direction.append(axis)
-    rows = np.concatenate([np.real(readout), np.imag(readout)])
+    moved = (tip @ (right / (factor * chosen))).T  # displacement: an ellipse
+    # its main axis: the real part at the phase that makes real and imaginary part perpendicular
+    axis = (moved * np.exp(-0.5j * np.angle((moved**2).sum(1)))[:, None]).real
+    axis /= np.maximum(np.linalg.norm(axis, axis=1), 1e-300)[:, None]
+    axis *= np.where(axis[range(len(axis)), np.abs(axis).argmax(1)] < 0.0, -1.0, 1.0)[:, None]
+    readout = coordinates * (axis * moved).sum(1)[:, None]
+    rows = np.concatenate([readout.real, readout.imag])
     yield ModalBasis(
         np.abs(chosen.imag) / (2 * np.pi),
         -chosen.real / np.abs(chosen),
         chosen,
         rows,
         equilibrium.fields,
-        np.array(direction),
+        axis,
         np.concatenate([par[layout["alpha"]], beta, par[layout["force"]], par[layout["torque"]]]),
         rows @ follow,
     )
@@ -236,7 +243,8 @@ def modal_parts(
 class ModeTracker:
     """The modes of a moving robot: refreshed now and then, part by part between the steps, and read in every step.
 
-    They are found on at most ``MODE_NODES`` nodes; the equilibrium that amplitudes count from is the model's own.
+    They are found on at most ``MODE_NODES`` nodes; the equilibrium that amplitudes count from is the model's own. Where the robot has hardly
+    moved, that is all that is refreshed.
     """
 
     def __init__(self, model: Model, every: int) -> None:
@@ -253,6 +261,8 @@ class ModeTracker:
         self._pending: Iterator[ModalBasis | None] | None = None
         self._own: Equilibrium | None = None
         self._transfer: Transfer | None = None
+        self._alpha = np.zeros(self.model.n)  # where the modes were found
+        self._kept = 0  # refreshes since then
 
     def measure(self, state: State) -> Modes:
         """Modes in ``state``; to be called once a step."""
@@ -284,6 +294,12 @@ class ModeTracker:
         )
         if not equilibrium.converged or equilibrium.key != state.key:
             return
+        if self._kept < MOST_KEPT and not self._moved(equilibrium, now):
+            assert self._basis is not None
+            inputs = np.concatenate([now.alpha, now.beta, now.force, now.torque])
+            self._basis = replace(self._basis, rest=equilibrium.fields, inputs=inputs)
+            self._kept += 1
+            return
         par = parameters.copy()
         par[layout["alpha"]], par[layout["beta"]], par[layout["alpha_rate"]] = now.alpha, now.beta, 0.0
         par[layout["force"]], par[layout["torque"]] = now.force, now.torque
@@ -298,7 +314,15 @@ class ModeTracker:
             if pair not in self._transfers:
                 self._transfers[pair] = transfer(self.model.n, equilibrium.mesh, on.mesh)
             self._transfer = self._transfers[pair]
-        self._own = equilibrium
+        self._own, self._alpha, self._kept = equilibrium, now.alpha, 0
         if on.key not in self._buffers:
             self._buffers[on.key] = self.coarse.buffers(on.mesh, 8 * len(lanes_of(self.coarse)))
         self._pending = modal_parts(self.coarse, on, par, now.beta.copy(), self._buffers[on.key])
+
+    def _moved(self, equilibrium: Equilibrium, now: Inputs) -> bool:
+        """Whether the modes have to be found anew about ``equilibrium`` with the inputs ``now``."""
+        if self._basis is None or self._own is None:
+            return True
+        path = np.abs(equilibrium.nodes[:, :3] - self._own.nodes[:, :3]).max()
+        turn = np.abs(now.alpha - self._alpha).max()
+        return bool(path > MOVED[0] or turn > MOVED[1])

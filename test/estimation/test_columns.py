@@ -5,7 +5,7 @@ import pytest
 from scipy.optimize import curve_fit
 
 from ctr_dynamics.estimation.columns import Columns
-from ctr_dynamics.estimation.modes import modal_basis
+from ctr_dynamics.estimation.modes import MOST_KEPT, ModeTracker, modal_basis
 from ctr_dynamics.estimation.uncertainty import bias_sigma, model_uncertainty
 from ctr_dynamics.model.mesh import build_mesh
 from ctr_dynamics.model.model import Model
@@ -244,3 +244,37 @@ def test_modes_at_rest_are_zero_also_where_actuators_have_moved(model):
     moved = basis.measure(near.fields, Inputs(alpha, ZERO, BETA, ZERO))
     still = basis.measure(near.fields, there)
     assert np.abs(moved.amplitude).max() < 0.1 * np.abs(still.amplitude).max()
+
+
+def test_modes_are_found_anew_only_where_the_robot_has_moved(model):
+    tracker = ModeTracker(model, every=0)
+    simulator = Simulator(model)
+
+    def refreshed(alpha):
+        """Frequencies and amplitudes after a refresh at rest at ``alpha``, and whether the modes were found for it."""
+        state = simulator.rest(Inputs(alpha, ZERO, BETA, ZERO))
+        tracker.measure(state)
+        parts = 0
+        while not parts or tracker._pending is not None:
+            tracker.refresh(state, simulator.parameters)
+            parts += 1
+        found = tracker.measure(state)
+        return found.frequency_hz, found.amplitude, parts > 1
+
+    frequency, amplitude, found = refreshed(ALPHA)
+    assert found
+    assert np.abs(amplitude).max() < 1e-8
+    for k in range(1, MOST_KEPT + 1):
+        same, amplitude, found = refreshed(ALPHA + k * 1e-4)
+        assert not found
+        assert np.array_equal(same, frequency)
+        assert np.abs(amplitude).max() < 1e-8
+    assert refreshed(ALPHA)[2]  # kept often enough
+    assert not refreshed(ALPHA)[2]
+    moved, amplitude, found = refreshed(ALPHA + np.array([0.3, 0.0]))
+    assert found
+    assert np.abs(moved / frequency - 1).max() > 1e-4
+    assert np.abs(amplitude).max() < 1e-8
+    assert refreshed(ALPHA + 0.02)[2]
+    turned = ALPHA + 0.02 + 0.015
+    assert refreshed(turned)[2]
