@@ -9,7 +9,7 @@ from ctr_dynamics.model.model import Model
 from ctr_dynamics.model.simulator import Inputs
 
 from .inputs import InputBuffer
-from .kernels import stage_rows
+from .kernels import corrected_rows, stage_rows
 from .signals import Samples
 
 Floats = NDArray[np.float64]
@@ -56,10 +56,11 @@ class Signals:
 
 
 class Actuation:
-    """The ``signals`` with the corrections ``shift`` (inputs,) of one run, for the simulator."""
+    """The ``signals`` with the ``load`` (inputs,) of the robot file and what a run's parameters ``theta`` (p,) add by their ``effect``
+    (inputs, p), for the simulator."""
 
-    def __init__(self, signals: Signals, shift: Floats) -> None:
-        self.signals, self.shift = signals, shift
+    def __init__(self, signals: Signals, load: Floats, effect: Floats, theta: Floats) -> None:
+        self.signals, self.load, self.effect, self.theta = signals, load, effect, theta
 
     def __call__(self, t: float) -> Inputs:
         return self.stages(np.array([t]))[1]
@@ -67,7 +68,7 @@ class Actuation:
     def stages(self, times: Floats) -> tuple[Floats, Inputs]:
         """Inputs at all stages of a step; see :func:`ctr_dynamics.model.simulator.stage_inputs`."""
         bare, beta_rate = self.signals.rows(times)
-        rows = bare + self.shift
+        rows = corrected_rows(bare, self.load, self.effect, self.theta)
         n, last = self.signals.n, rows[-1]
         return rows, Inputs(
             last[:n],

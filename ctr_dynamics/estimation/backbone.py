@@ -10,8 +10,7 @@ from ctr_dynamics.model.model import Model
 from ctr_dynamics.model.simulator import State
 
 from .fusion import Fusion
-from .kernels import backbone_rows, conjugate, from_vector, matrix
-from .tracker import ROTATION, TRANSLATION
+from .kernels import backbone_rows, matrix
 
 Floats = NDArray[np.float64]
 SHAPES = 8  # sections at a beta whose nodes are remembered
@@ -23,11 +22,9 @@ class Backbone:
     def __init__(self, model: Model, fusion: Fusion) -> None:
         self.model, self.fusion = model, fusion
         self._nodes: dict[tuple, tuple[Floats, NDArray[np.int64]]] = {}
-        self._turn: tuple[bytes, tuple[Floats, Floats]] | None = None
 
     def rows(self, state: State) -> NDArray[np.float32]:
         """(P, 15) float32, see :class:`ctr_dynamics.estimation.outputs.StepOutput`."""
-        turn, shift = self._registration()
         key = (state.key, state.inputs.beta.tobytes())
         if key not in self._nodes:
             if len(self._nodes) > SHAPES:
@@ -38,10 +35,11 @@ class Backbone:
             )
         s, points = self._nodes[key]
         rows = np.empty((len(state.nodes), 15), np.float32)
-        inserted = self.fusion.inserted
+        fusion = self.fusion
+        inserted = fusion.inserted
         backbone_rows(
-            s, state.nodes, state.fields, points, self.model.n, float(state.inputs.beta_rate[0]) * (1.0 - inserted), turn, shift,
-            self.fusion.columns.position_deviation(self.fusion.pi), rows,
+            s, state.nodes, state.fields, points, self.model.n, float(state.inputs.beta_rate[0]) * (1.0 - inserted),
+            fusion.tracker.rotation, fusion.bias, fusion.columns.position_deviation(fusion.pi), rows,
         )  # fmt: skip
         rates = state.inputs.beta_rate
         if inserted and np.any(rates):
@@ -51,13 +49,3 @@ class Backbone:
             tangents = np.array([matrix(h)[:, 2] for h in state.nodes[:, 3:7]])
             rows[:, 8:11] += inserted * (rates[0] - grid)[:, None] * tangents
         return rows
-
-    def _registration(self) -> tuple[Floats, Floats]:
-        """Estimated error of the registration in base axes: rotation (3, 3) and translation (3,) m."""
-        bias = self.fusion.bias[:6]
-        key = bias.tobytes()
-        if self._turn is None or self._turn[0] != key:
-            back = matrix(conjugate(self.fusion.tracker.rotation))
-            turn = matrix(from_vector(back @ bias[ROTATION]))
-            self._turn = key, (turn, back @ bias[TRANSLATION])
-        return self._turn[1]

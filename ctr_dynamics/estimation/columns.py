@@ -27,7 +27,7 @@ EPSILON = 5e-9  # of one standard deviation: small against the curvature of the 
 
 
 def carried(matrix: csr_array, values: Floats) -> Floats:
-    """Product (rows, k) of one of a transfer's matrices with ``values`` (columns, k), or (rows,) with (columns,)."""
+    """Product (rows, k) of a sparse matrix with ``values`` (columns, k), or (rows,) with (columns,)."""
     product = sparse_product(matrix.indptr, matrix.indices, matrix.data, values.reshape(len(values), -1))
     return product.reshape(-1, *values.shape[1:])
 
@@ -82,6 +82,7 @@ class Columns:
 
     def __init__(self, model: Model, uncertainty: ModelUncertainty, rank: int) -> None:
         self.model, self.uncertainty, self.rank = model, uncertainty, rank
+        self._effect = csr_array(uncertainty.effect)
         self._work: dict[tuple, tuple] = {}
         self._coarse: dict[Key, tuple[Key, Mesh, Transfer | None]] = {}
         self.transfer: Transfer | None = None
@@ -155,7 +156,7 @@ class Columns:
         where a stage cannot be linearised (columns then stay)."""
         model = self.model
         m = 5 + model.n
-        dpar = self.uncertainty.effect @ self.theta
+        dpar = carried(self._effect, self.theta)
         for record in records:
             beta = record.inputs[-1, 2 * model.n : 3 * model.n]
             key, mesh, moved = self._own(record.key, record.mesh, beta)

@@ -383,10 +383,9 @@ class Estimator:
         stamp = self.inputs.stamp(k)
         assert stamp is not None
         tip = self.fusion.tip_estimate()
-        sigma = self.fusion.force_deviation()
         alone = self.runs.alone_tips.last
         predicted = alone.mean[:7].copy()
-        if not (tip.finite and math.isfinite(sum(predicted.tolist()) + sum(sigma.tolist()))):
+        if not (tip.finite and math.isfinite(sum(predicted.tolist()))):
             self.runs.fused = None
             self.health.failed("not finite")
             self.health.restarts += 1
@@ -399,7 +398,7 @@ class Estimator:
         return StepOutput(
             stamp, k, not problem, problem, tip.position, tip.quaternion, tip.covariance[:6, :6], tip.twist, tip.covariance[6:, 6:],
             predicted[:3], predicted[3:], self._backbone.rows(self.runs.fused), self._modes.measure(self.runs.fused), self.fusion.force,
-            sigma, self._take_innovations(), SolverStats(result.iterations, result.sweeps, result.reason),
+            tip.force_sigma, self._take_innovations(), SolverStats(result.iterations, result.sweeps, result.reason),
         )  # fmt: skip
 
     def _watch_stability(self, k: int) -> None:

@@ -22,10 +22,10 @@ from ctr_dynamics.model.model import Model
 from ctr_dynamics.model.simulator import Inputs, Simulator, State, StepResult
 
 from .columns import Columns
-from .kernels import deviations, move_unknowns, outside
+from .kernels import fade, move_unknowns, outside
 from .tip import TipWindow
 from .tracker import DELAY, DRIFT, STATES, TrackerModel, innovation
-from .tracker_kernels import registered_rows
+from .tracker_kernels import fused_tip
 from .uncertainty import bias_sigma, model_uncertainty
 
 Floats = NDArray[np.float64]
@@ -64,12 +64,14 @@ class Update(NamedTuple):
 
 
 class TipEstimate(NamedTuple):
-    """Fused tip: position (3,) m, quaternion (4,) wxyz, twist (6,), covariance (12, 12) of pose and twist (base axes), and whether all is finite."""
+    """Fused tip: position (3,) m, quaternion (4,) wxyz, twist (6,), covariance (12, 12) of pose and twist (base axes); deviation (3,) of the
+    estimated tip force, N; and whether all is finite."""
 
     position: Floats
     quaternion: Floats
     twist: Floats
     covariance: Floats
+    force_sigma: Floats
     finite: bool
 
 
@@ -162,8 +164,7 @@ class Fusion:
         """
         dt = self.simulator.scheme.dt
         self.unreduced += 1
-        self.theta[self._force] *= self._force_decay
-        self.columns.theta[self._force] *= self._force_decay
+        fade(self._force_decay, self.theta[self._force], self.columns.theta[self._force])
         fewest, most = self.options.reduce_between
         driven = self.force_sigma > DRIVEN * self.options.force_sigma
         if driven:
@@ -200,11 +201,11 @@ class Fusion:
         noise = self.model.robot.tracker.noise
         decay = math.exp(-steps * self.simulator.scheme.dt / noise.drift_time.value)
         r = self.columns.theta.shape[1]
-        rows = np.arange(r, r + STATES)[DRIFT]
+        rows = slice(r + DRIFT.start, r + DRIFT.stop)
         self.bias[DRIFT] *= decay
         self.pi[rows, :] *= decay
         self.pi[:, rows] *= decay
-        self.pi[rows, rows] += (1 - decay**2) * noise.drift.value**2
+        self.pi[rows, rows] += np.eye(3) * ((1 - decay**2) * noise.drift.value**2)
 
     def _drive_force(self, steps: int) -> None:
         """Append three columns that hold the tip force's new randomness of ``steps`` steps: so far they move nothing but that force."""
@@ -311,17 +312,17 @@ class Fusion:
         axes = self.tracker.axes
         full, variance, white = np.full((3, 6), np.nan)
         full[axes], variance[axes], white[axes] = nu, S.diagonal(), whitened
-        R = np.diag(self.tracker.variance[axes])
-        return nu, H, R, Update(full, variance, float(whitened @ whitened), len(nu), False, "", white)
+        return (
+            nu,
+            H,
+            self.tracker.noise,
+            Update(full, variance, float(whitened @ whitened), len(nu), False, "", white),
+        )
 
     @property
     def force(self) -> Floats:
         """(3,) estimated tip force, N, ``ctr_base`` axes; the caller's own, as the filter goes on writing."""
         return self.theta[self._force].copy()
-
-    def force_deviation(self) -> Floats:
-        """(3,) standard deviation of the estimated tip force, N."""
-        return deviations(self.columns.theta[self._force], self.pi)
 
     def _inflate(self, nu: Floats, H: Floats, R: Floats, limit: float) -> None:
         """Two readings in a row outside the gate are no outliers: the model has lost the robot. Widen the fields' part of the covariance until
@@ -384,17 +385,11 @@ class Fusion:
         """Fused tip now."""
         tip = self.tips.last
         pose, covariance = np.empty(7), np.empty((12, 12))
-        finite = registered_rows(
-            tip.mean,
-            tip.columns,
-            self.tracker.rotation,
-            self.tracker.lever,
-            self.bias,
-            self.pi,
-            pose,
-            covariance,
-        )
-        return TipEstimate(pose[:3], pose[3:], tip.mean[7:13].copy(), covariance, finite)
+        sigma, finite = fused_tip(
+            tip.mean, tip.columns, self.tracker.rotation, self.tracker.lever, self.bias, self.pi, self.columns.theta[self._force],
+            pose, covariance,
+        )  # fmt: skip
+        return TipEstimate(pose[:3], pose[3:], tip.mean[7:13].copy(), covariance, sigma, finite)
 
     # -- roll-back --
 

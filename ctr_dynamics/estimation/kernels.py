@@ -15,6 +15,15 @@ from_vector, to_vector = map(compiled, (rotations.from_vector, rotations.to_vect
 
 
 @compiled
+def applied(A, v):
+    """Product (3,) of a matrix (3, 3) and a vector (3,)."""
+    result = np.empty(3)
+    for i in range(3):
+        result[i] = A[i, 0] * v[0] + A[i, 1] * v[1] + A[i, 2] * v[2]
+    return result
+
+
+@compiled
 def on_lines(samples, time_ns, value, rate):
     """``value`` (size,) and its ``rate``, 1/s, at a time on the lines through three ``samples``: values, then stamps in ns. At the middle one the
     rate is that of the first line."""
@@ -45,6 +54,28 @@ def stage_rows(times, t0_ns, joints, load, rows, beta_rate):
         for i in range(rows.shape[1] - 3 * n - 6):
             rows[k, 3 * n + 6 + i] = rate[n + i]
     beta_rate[:] = rate[n:]
+
+
+@compiled
+def corrected_rows(bare, load, effect, theta):
+    """(stages, inputs) rows ``bare`` with the ``load`` (inputs,) and what the parameters ``theta`` (p,) add by their ``effect`` (inputs, p)."""
+    rows = np.empty_like(bare)
+    for i in range(bare.shape[1]):
+        shift = load[i]
+        for k in range(len(theta)):
+            shift += effect[i, k] * theta[k]
+        for stage in range(len(bare)):
+            rows[stage, i] = bare[stage, i] + shift
+    return rows
+
+
+@compiled
+def fade(decay, theta, rows):
+    """Multiply ``theta`` (p,) and its columns ``rows`` (p, r) by ``decay``, in place."""
+    for i in range(len(theta)):
+        theta[i] *= decay
+        for k in range(rows.shape[1]):
+            rows[i, k] *= decay
 
 
 @compiled
@@ -233,13 +264,16 @@ def modal_coordinates(by_fields, fields, by_inputs, alpha, beta, force, torque, 
 
 
 @compiled
-def backbone_rows(s, nodes, fields, points, n, insertion_rate, turn, shift, deviation, rows):
+def backbone_rows(s, nodes, fields, points, n, insertion_rate, rotation, bias, deviation, rows):
     """Fill ``rows`` (P, 15) float32: s, x, y, z, qx, qy, qz, qw, vx, vy, vz, ux, uy, uz, sd.
 
-    ``nodes`` (P, S) states; ``fields`` (fields,) with ``points`` (P,) the point of each node; ``turn`` (3, 3) and ``shift`` (3,) the estimated
-    registration; ``deviation`` (P,) m, the position's per axis (root of the third of its covariance's trace).
+    ``nodes`` (P, S) states; ``fields`` (fields,) with ``points`` (P,) the point of each node; ``rotation`` (4,) nominal registration, ``bias``
+    (13,) tracker states; ``deviation`` (P,) m, the position's per axis (root of the third of its covariance's trace).
     """
     F = 7 + 2 * n
+    # the registration's estimated error, in base axes
+    back = matrix(conjugate(rotation))
+    turn, shift = matrix(from_vector(applied(back, bias[0:3]))), applied(back, bias[3:6])
     for i in range(len(nodes)):
         a, b, c, d = nodes[i, 3], nodes[i, 4], nodes[i, 5], nodes[i, 6]
         norm = math.sqrt(a * a + b * b + c * c + d * d)

@@ -85,7 +85,9 @@ class Runs:
         self._signals = Signals(model, inputs)
         self._load = np.zeros(model.input_count)  # of the robot file
         self._load[3 * model.n : 3 * model.n + 3] = model.setup.tip_force
-        self._bare = Actuation(self._signals, self._load)  # of the model alone
+        self._bare = Actuation(
+            self._signals, self._load, np.zeros((model.input_count, 0)), np.zeros(0)
+        )  # of the model alone
         if model.extended:
             self.fusion.inserted = float(model.setup.block[model.layout["insertion"]][0])
         self.clear()
@@ -117,6 +119,7 @@ class Runs:
         self.alone = self.fused.copy()
         self.fusion.start(self.fused, t)
         self.alone_tips.clear(1)
+        self._no_columns = np.zeros((self.alone.nodes.shape[1], 1))
         self._keep_alone_tip(t)
         for sample in self.inputs.samples:
             sample.fused_k = None
@@ -168,7 +171,7 @@ class Runs:
 
     def _corrected(self) -> Actuation:
         """Actuators and load with the estimated offsets and force."""
-        return Actuation(self._signals, self._load + self._by_theta @ self.fusion.theta)
+        return Actuation(self._signals, self._load, self._by_theta, self.fusion.theta)
 
     def _start_filter(self, k: int) -> None:
         """Start the filter anew from the model alone at step ``k``: a correction has led the fused run astray."""
@@ -180,9 +183,8 @@ class Runs:
 
     def _keep_alone_tip(self, t: float) -> None:
         assert self.alone is not None
-        S = self.alone.nodes.shape[1]
         rate = float(self.alone.inputs.beta_rate[0]) * (1.0 - self.fusion.inserted)
-        self.alone_tips.append(t, self.alone.nodes[-1], np.zeros((S, 1)), rate)
+        self.alone_tips.append(t, self.alone.nodes[-1], self._no_columns, rate)
 
     def _fuse(self, k: int, due: list[tuple[Sample, float, Floats]]) -> None:
         """Compare and fuse the samples ``due`` after step ``k``."""

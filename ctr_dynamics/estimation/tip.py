@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,8 +12,7 @@ from .kernels import interpolate_columns, shift_tips, tip_between, tip_rows
 Floats = NDArray[np.float64]
 
 
-@dataclass
-class Tip:
+class Tip(NamedTuple):
     """Pose and twist in ``ctr_base`` at one time, with columns of their first variation.
 
     Attributes:

@@ -51,6 +51,11 @@ class TrackerModel:
         return np.flatnonzero(self.mask)
 
     @cached_property
+    def noise(self) -> Floats:
+        """(k, k) covariance of the white noise on the measured axes."""
+        return np.diag(self.variance[self.axes])
+
+    @cached_property
     def free(self) -> int:
         """1 to 3: the one rotation axis of the sensor that is not measured; 0 where none or several are not."""
         return 1 + int(np.argmin(self.mask[3:])) if self.mask[3:].sum() == 2 else 0

@@ -4,16 +4,17 @@ import math
 
 import numpy as np
 
-from .kernels import compiled, compiled_sums, conjugate, from_vector, matrix, multiply, to_vector
-
-
-@compiled
-def applied(A, v):
-    """Product (3,) of a matrix (3, 3) and a vector (3,)."""
-    result = np.empty(3)
-    for i in range(3):
-        result[i] = A[i, 0] * v[0] + A[i, 1] * v[1] + A[i, 2] * v[2]
-    return result
+from .kernels import (
+    applied,
+    compiled,
+    compiled_sums,
+    conjugate,
+    deviations,
+    from_vector,
+    matrix,
+    multiply,
+    to_vector,
+)
 
 
 @compiled
@@ -88,6 +89,15 @@ def registered_rows(mean, columns, rotation, lever, bias, pi, pose, covariance):
     for i in range(7):
         total += pose[i]
     return np.isfinite(total)
+
+
+@compiled
+def fused_tip(mean, columns, rotation, lever, bias, pi, force_rows, pose, covariance):
+    """As :func:`registered_rows`; returns the deviations (3,) of the tip force, whose columns are ``force_rows`` (3, r), and whether all is
+    finite."""
+    finite = registered_rows(mean, columns, rotation, lever, bias, pi, pose, covariance)
+    sigma = deviations(force_rows, pi)
+    return sigma, finite and np.isfinite(sigma.sum())
 
 
 @compiled
