@@ -257,7 +257,7 @@ _base_stretch = dispatch(_no_stretch, extended.base_stretch)
 _tilt = dispatch(_no_tilt, extended.tilt)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, forceinline=True, error_model="numpy")
 def _tube_friction(tubes, W, present):
     """Friction between neighbouring tubes at a transition, (22), (23): proportional to the jump of the inner tube's moment."""
     n = len(tubes)
@@ -453,12 +453,27 @@ def _load_history(tubes, W, hist, shared, own, point):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _cells(tubes, W, present, cells, point, node, ust, c0, hist, shared, own, out, nodes, kept):
-    """Runge-Kutta steps through the ``cells`` of a section, from and to the state in ``Y``; the length of a cell stands in ``MA``."""
+def _section(
+    tubes, W, before, present, cells, length, point, node, ust, c0, hist, shared, own, out, nodes, kept, res
+):
+    """From the state in ``Y`` at the near side of a section's start, where ``before`` tubes lie, to its end: friction from the jump of the inner
+    tubes' moments, Runge-Kutta steps through its ``cells``, and at the end fields, moments on the near side (``MA``) and R_1^T g."""
     S, F, n = state_rows(len(tubes)), field_rows(len(tubes)), len(tubes)
     Y, YS, K, ACC, HI, OU, TMP, PAR, MA, MB = offsets(tubes)
     V = local_copy(tubes, W)  # nothing else points to it
-    h = W[MA]
+    _load_history(tubes, V, hist, shared, own, point)
+    for r in range(S):
+        V[YS + r] = V[Y + r]
+    _curvature(tubes, V, present, ust, point * 3 * n, c0)
+    _bending_moments(tubes, V, present, MB)
+    _tube_friction(tubes, V, before)
+    for i in range(1, n):
+        if (
+            i >= present and i < before
+        ):  # ended here: its own balance about its axis; its m_z holds the body's part already
+            res[5 + i] = -V[Y + (Z0 + i)]
+            V[Y + (Z0 + i)] = 0.0
+    h = length / cells
     for cell in range(cells):
         for r in range(S):
             if kept:
@@ -473,28 +488,39 @@ def _cells(tubes, W, present, cells, point, node, ust, c0, hist, shared, own, ou
                 for r in range(F):
                     out[point * F + r] = V[OU + r]
             point += 1
-            if stage == 3:
-                for r in range(S):
-                    V[Y + r] = fma(1.0 / 3.0, fma(0.5 * h, V[K + r], V[ACC + r]), V[Y + r])
-            else:
-                ahead = (0.5 if stage < 2 else 1.0) * h
-                for r in range(S):
-                    V[K + r] *= ahead
-                    V[YS + r] = V[Y + r] + V[K + r]
-                    V[ACC + r] += V[K + r]
-                if stage == 1:
-                    for r in range(S):
-                        V[ACC + r] += V[K + r]
+            weight = 1.0 if stage == 0 or stage == 3 else 2.0
+            ahead = (0.5 if stage < 2 else 1.0) * h
+            for r in range(S):
+                V[ACC + r] = fma(V[K + r], weight, V[ACC + r])
+                if stage < 3:
+                    V[YS + r] = fma(V[K + r], ahead, V[Y + r])
+        for r in range(S):
+            V[Y + r] = fma(V[ACC + r], h * (1.0 / 6.0), V[Y + r])
+    _load_history(tubes, V, hist, shared, own, point)
+    for r in range(S):
+        if kept:
+            nodes[(node + cells) * S + r] = V[Y + r]
+        V[YS + r] = V[Y + r]
+    _move_grid(tubes, V, 1.0)
+    _derivative(tubes, V, present, ust, point * 3 * n, c0)
+    if kept:
+        for r in range(F):
+            out[point * F + r] = V[OU + r]
+    _bending_moments(tubes, V, present, MA)
     for r in range(S):
         W[Y + r] = V[Y + r]
+    for r in range(F):
+        W[HI + r] = V[HI + r]
+    for r in range(2 * n):
+        W[MA + r] = V[MA + r]
+    for r in range(10, 13):
+        W[TMP + r] = V[TMP + r]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _sweep(tubes, W, c0, mesh, par, seclen, x, hist, shared, own, histb, out, outb, nodes, kept, res):
     """:func:`sweep` for the lanes of one block, from views of the arrays."""
     n = len(tubes)
-    S = state_rows(n)
-    F = field_rows(n)
     Y, YS, K, ACC, HI, OU, TMP, PAR, MA, MB = offsets(tubes)
     for r in range(parameter_rows(n)):
         W[PAR + r] = par[r]
@@ -508,39 +534,29 @@ def _sweep(tubes, W, c0, mesh, par, seclen, x, hist, shared, own, histb, out, ou
     before = n
     for k in range(len(sec_cells)):
         present = sec_tubes[k]
-        # transition into this section: friction from the jump of the inner tubes' moments
         _start_section(tubes, W, mesh.bp_tube, seclen, k)
-        _load_history(tubes, W, hist, shared, own, point)
-        for r in range(S):
-            W[YS + r] = W[Y + r]
-        _curvature(tubes, W, present, ust, point * 3 * n, c0)
-        _bending_moments(tubes, W, present, MB)
-        _tube_friction(tubes, W, before)
-        if (
-            before > present
-        ):  # tube `present` ended here: its own balance about its axis; its m_z holds the body's part already
-            res[(5 + present)] = -W[Y + (Z0 + present)]
-            W[Y + (Z0 + present)] = 0.0
         cells = sec_cells[k]
-        W[MA] = seclen[k] / cells  # MA is free until the section's end
-        _cells(tubes, W, present, cells, point, node, ust, c0, hist, shared, own, out, nodes, kept)
-        point += 4 * cells
-        node += cells
-        # end of the section: fields, moments on the near side, body of the tube that ends
-        _load_history(tubes, W, hist, shared, own, point)
-        if kept:
-            for r in range(S):
-                nodes[node * S + r] = W[Y + r]
-        for r in range(S):
-            W[YS + r] = W[Y + r]
-        node += 1
-        _move_grid(tubes, W, 1.0)
-        _derivative(tubes, W, present, ust, point * 3 * n, c0)
-        if kept:
-            for r in range(F):
-                out[point * F + r] = W[OU + r]
-        point += 1
-        _bending_moments(tubes, W, present, MA)
+        _section(
+            tubes,
+            W,
+            before,
+            present,
+            cells,
+            seclen[k],
+            point,
+            node,
+            ust,
+            c0,
+            hist,
+            shared,
+            own,
+            out,
+            nodes,
+            kept,
+            res,
+        )
+        point += 4 * cells + 1
+        node += cells + 1
         before = present
         after = sec_tubes[k + 1] if k + 1 < len(sec_cells) else 0
         if after < present:

@@ -13,7 +13,6 @@ from numba import njit
 from ctr_dynamics.errors import InputError
 from ctr_dynamics.model.lockstep import solve_lanes
 from ctr_dynamics.model.mesh import Key, Mesh, section_lengths
-from ctr_dynamics.model.newton import aligned_zeros
 from ctr_dynamics.model.scheme import RATE_NOW, RATES, Y_BEFORE, Y_NOW
 from ctr_dynamics.model.simulator import InputsAt, Record, Simulator, State, StepResult, stage_inputs
 from ctr_dynamics.model.step import extrapolate, history, remember
@@ -38,11 +37,10 @@ def _gather(values, first, second):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _rates(c0, out, hist, target):
-    """Rates of the fields after a stage, c0 ``out`` + ``hist``; the probes, whose fields are perturbed, go on with those of their cases."""
-    for i in range(0, len(out), 4):
-        target[i] = target[i + 2] = c0 * out[i] + hist[i]
-        target[i + 1] = target[i + 3] = c0 * out[i + 1] + hist[i + 1]
+def _rates(c0, out, j, hist, rate):
+    """``rate`` (rows,) of the fields of case ``j`` after a stage, c0 out + hist, from its lane of ``out`` (rows, 4), flat."""
+    for i in range(len(rate)):
+        rate[i] = c0 * out[4 * i + j] + hist[i]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -63,38 +61,40 @@ def _step(tubes, few, mesh, c0, weights, pars, inputs, banks, unknowns, earlier,
           column, nodes, alive):  # fmt: skip
     """A step of both cases, as :func:`ctr_dynamics.model.step.step` for one; returns sweeps, 0 where they cannot go together, and new Jacobians.
 
-    ``work``: buffers of the four lanes, of one for a Jacobian, of the Jacobian's lanes, and (slots, fields * 4) for stored fields. ``column``: the
-    unknown to probe first. ``nodes``: states at the nodes (nodes, S) of both. ``alive`` (2,): set; False where a case does not converge, and then
+    ``work``: buffers of the four lanes, of one for a Jacobian, of the Jacobian's lanes, and (2, fields) for histories. ``column``: the unknown to
+    probe first. ``nodes``: states at the nodes (nodes, S) of both. ``alive`` (2,): set; False where a case does not converge, and then
     nothing else has changed."""
     alive[:] = True
-    if not _together(inputs[0], inputs[1], len(tubes)):
+    first, second = inputs
+    if not _together(first, second, len(tubes)):
         return 0, 0
-    big, one, eight, stored = work
+    big, one, eight, h = work
     par, seclen, hist, histb, out, outb = big[1], big[2], big[4], big[5], big[6], big[7]
-    n, stages, m, main = len(tubes), len(c0), len(scale), len(big[4])
+    n, stages, m, main = len(tubes), len(c0), len(scale), len(big[4]) // 4
     x, sweeps, jacobians, spent = np.empty(2 * m), 0, 0, np.zeros(2, np.int64)
     guess, inverse = np.empty((2, stages, m)), np.empty((2, m, m))
     lengths = np.empty(len(mesh.sec_cells))
     fresh = np.empty(2, np.bool_)
     _spread(pars[0], pars[1], par)
-    for slot in range(RATES):
-        if np.any(weights[:, slot]):
-            _spread(banks[0][slot], banks[1][slot], stored[slot])
     for j in range(2):
         inverse[j], fresh[j] = inverses[j], not usable[j]
         extrapolate(unknowns[j], earlier[j], perturb, guess[j])
     for stage in range(stages):
-        history(weights[stage], stored, hist, histb)
-        for i in range(inputs[0].shape[1]):
+        for j in range(2):
+            history(weights[stage], banks[j], h[j, :main], h[j, main:])
+        _spread(h[0, :main], h[1, :main], hist)
+        _spread(h[0, main:], h[1, main:], histb)
+        for i in range(first.shape[1]):
             row = 4 * input_row(tubes, i)
-            _spread(inputs[0][stage, i : i + 1], inputs[1][stage, i : i + 1], par[row : row + 4])
-        section_lengths(mesh.bp_tube, mesh.bp_offset, inputs[0][stage, 2 * n : 3 * n], lengths)
+            par[row] = par[row + 2] = first[stage, i]
+            par[row + 1] = par[row + 3] = second[stage, i]
+        section_lengths(mesh.bp_tube, mesh.bp_offset, first[stage, 2 * n : 3 * n], lengths)
         _spread(lengths, lengths, seclen)
         for j in range(2):
             for i in range(m):
                 # what the guess missed at the stage before, it misses here too
                 x[2 * i + j] = guess[j, stage, i] + (
-                    founds[j][stage - 1, i] - guess[j, stage - 1, i] if stage else 0.0
+                    founds[j, stage - 1, i] - guess[j, stage - 1, i] if stage else 0.0
                 )
         plain, renewed, column = solve_lanes(tubes, LANES, few, mesh, c0[stage], big, one, eight, x, inverse, fresh, alive, scale, perturb,
                                              tolerance, limit, spent, column)  # fmt: skip
@@ -102,26 +102,22 @@ def _step(tubes, few, mesh, c0, weights, pars, inputs, banks, unknowns, earlier,
         jacobians += renewed
         if not (alive[0] and alive[1]):
             return sweeps, jacobians
-        _rates(c0[stage], out, hist, stored[RATES + stage, :main])
-        _rates(c0[stage], outb, histb, stored[RATES + stage, main:])
         for j in range(2):
+            _rates(c0[stage], out, j, h[j, :main], banks[j][RATES + stage, :main])
+            _rates(c0[stage], outb, j, h[j, main:], banks[j][RATES + stage, main:])
             for i in range(m):
-                founds[j][stage, i] = x[2 * i + j]
+                founds[j, stage, i] = x[2 * i + j]
     for j in range(2):
         inverses[j][:] = inverse[j]
         for i in range(inputs[j].shape[1]):
             pars[j][input_row(tubes, i)] = inputs[j][stages - 1, i]
         banks[j][Y_BEFORE] = banks[j][Y_NOW]
         remember(unknowns[j], earlier[j], founds[j])
-    last = RATES + stages - 1
-    _gather(out, banks[0][Y_NOW, : main // 4], banks[1][Y_NOW, : main // 4])
-    _gather(outb, banks[0][Y_NOW, main // 4 :], banks[1][Y_NOW, main // 4 :])
-    _gather(stored[last], banks[0][last], banks[1][last])  # no later step reads the others
+    _gather(out, banks[0][Y_NOW, :main], banks[1][Y_NOW, :main])
+    _gather(outb, banks[0][Y_NOW, main:], banks[1][Y_NOW, main:])
     for j in range(2):
-        banks[j][RATE_NOW] = banks[j][last]
-    S = nodes[0].shape[1]
-    for p in range(len(nodes[0])):
-        _gather(big[8][4 * S * p : 4 * S * (p + 1)], nodes[0][p], nodes[1][p])
+        banks[j][RATE_NOW] = banks[j][RATES + stages - 1]
+    _gather(big[8], nodes[0].reshape(-1), nodes[1].reshape(-1))
     return sweeps, jacobians
 
 
@@ -164,12 +160,12 @@ class Pair:
                 return None
         if key != self._key:
             self._key, self._buffers = key, self._make(mesh)
-        work, found_a, found_b, alive = self._buffers
+        work, found, alive = self._buffers
         # a step may be too short to probe all columns: the next one begins at another
         column = scheme.stages * round(t / scheme.dt) % len(model.step)
         sweeps, jacobians = _step(
             model.tubes, model.jacobian_lanes, mesh, scheme.c0, scheme.weights, (self.first.parameters, self.second.parameters), (rows_a, rows_b),
-            (a.bank, b.bank), (a.unknowns, b.unknowns), (a.earlier, b.earlier), (found_a, found_b), (a.inverse, b.inverse), (a.usable, b.usable),
+            (a.bank, b.bank), (a.unknowns, b.unknowns), (a.earlier, b.earlier), found, (a.inverse, b.inverse), (a.usable, b.usable),
             work, model.scale, model.step, self.first.tolerance, self.first.limit, column, (a.nodes, b.nodes), alive,
         )  # fmt: skip
         if not (sweeps and alive[0] and alive[1]):
@@ -181,7 +177,7 @@ class Pair:
         records: tuple[Record, ...] = ()
         if record:
             rates = a.bank[RATES + scheme.stages - 1 : RATES + scheme.stages]
-            records = (Record(scheme, key, mesh, a.bank[:0], a.bank[Y_NOW], rates, rows_a, found_a, times),)
+            records = (Record(scheme, key, mesh, a.bank[:0], a.bank[Y_NOW], rates, rows_a, found[0], times),)
         iterations = sweeps - scheme.stages
         return (
             StepResult(True, "ok", iterations, sweeps, jacobians, 1, records),
@@ -189,14 +185,13 @@ class Pair:
         )
 
     def _make(self, mesh: Mesh) -> tuple:
-        """Buffers of the kernel, the unknowns found at the stages of both, and whether they converged."""
+        """Buffers of the kernel, the unknowns found at the stages of both (2, stages, 5 + N), and whether they converged."""
         model, stages = self.first.model, self.first.scheme.stages
         big, alone = model.buffers(mesh, len(LANES)), model.buffers(mesh, 1)
-        stored = aligned_zeros((RATES + stages) * (len(big[4]) + len(big[5])))
         work = (
             big,
             tuple(alone[i] for i in (1, 2, 3, 4, 5)),
             model.buffers(mesh, 8 * len(model.jacobian_lanes)),
-            stored.reshape(RATES + stages, -1),
+            np.empty((2, len(alone[4]) + len(alone[5]))),
         )
-        return work, *np.empty((2, stages, 5 + model.n)), np.ones(2, np.bool_)
+        return work, np.empty((2, stages, 5 + model.n)), np.ones(2, np.bool_)
