@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.sparse import random_array
 
-from ctr_dynamics.estimation import kernels
+from ctr_dynamics.estimation import kernels, rotations
 
 RNG = np.random.default_rng(3)
 
@@ -69,3 +69,44 @@ def test_unknowns_of_all_stages_and_steps_move_together():
     kernels.move_unknowns(dx, a, now, before)
     np.testing.assert_allclose(now, unknowns + dx @ a, rtol=1e-12, atol=1e-14)
     np.testing.assert_allclose(before, earlier + dx @ a, rtol=1e-12, atol=1e-14)
+
+
+@pytest.mark.parametrize("parameters", [0, 4])
+def test_inputs_take_on_the_load_and_the_parameters(parameters):
+    bare, load = RNG.normal(size=(3, 12)), RNG.normal(size=12)
+    effect, theta = RNG.normal(size=(12, parameters)), RNG.normal(size=parameters)
+    np.testing.assert_allclose(
+        kernels.corrected_rows(bare, load, effect, theta),
+        bare + load + effect @ theta,
+        rtol=1e-12,
+        atol=1e-14,
+    )
+
+
+def test_a_force_fades_with_its_columns():
+    theta, rows = RNG.normal(size=5), RNG.normal(size=(5, 3))
+    faded, columns = theta.copy(), rows.copy()
+    kernels.fade(0.5, faded[1:4], columns[1:4])
+    share = np.array([1.0, 0.5, 0.5, 0.5, 1.0])
+    np.testing.assert_array_equal(faded, share * theta)
+    np.testing.assert_array_equal(columns, share[:, None] * rows)
+
+
+def test_backbone_rows_stand_in_the_registered_frame():
+    """The estimated error of the registration turns and shifts positions and frames; velocities stay in base axes."""
+    nodes, fields = RNG.normal(size=(4, 22)), RNG.normal(size=44)
+    rotation = rotations.from_vector(np.array([0.3, -1.0, 0.4]))
+    bias = np.r_[1e-3 * RNG.normal(size=3), 1e-3 * RNG.normal(size=3), np.zeros(7)]
+    s, points, deviation = np.arange(4.0), np.array([0, 1, 2, 3]), RNG.random(4)
+    rows = np.empty((4, 15), np.float32)
+    kernels.backbone_rows(s, nodes, fields, points, 2, 0.02, rotation, bias, deviation, rows)
+    back = rotations.matrix(rotation).T
+    turn, shift = rotations.matrix(rotations.from_vector(back @ bias[:3])), back @ bias[3:6]
+    for node, row, own, point in zip(nodes, rows, deviation, points, strict=True):
+        R = rotations.matrix(node[3:7] / np.linalg.norm(node[3:7]))
+        np.testing.assert_allclose(row[1:4], turn @ node[:3] + shift, rtol=1e-5, atol=1e-6)
+        turned = rotations.matrix(np.array([row[7], *row[4:7]], float))
+        np.testing.assert_allclose(turned, turn @ R, atol=1e-5)
+        np.testing.assert_allclose(row[8:11], R @ (node[7:10] + [0, 0, 0.02]), rtol=1e-5, atol=1e-6)
+        np.testing.assert_allclose(row[11:14], fields[11 * point + 6 : 11 * point + 9], rtol=1e-6)
+        assert row[14] == np.float32(own)

@@ -11,7 +11,7 @@ from tracker_twin import expected, residual
 from ctr_dynamics.estimation.rotations import conjugate, from_vector, matrix, multiply, to_vector
 from ctr_dynamics.estimation.tip import Tip, TipWindow, tip_rows
 from ctr_dynamics.estimation.tracker import DELAY, STATES, TrackerModel, innovation
-from ctr_dynamics.estimation.tracker_kernels import registered_rows
+from ctr_dynamics.estimation.tracker_kernels import fused_tip, registered_rows
 
 RNG = np.random.default_rng(11)
 COLUMNS, STEP = 5, 1e-6
@@ -182,6 +182,22 @@ def test_what_is_not_finite_is_noticed():
     assert not registered_rows(
         mean, tip.columns, tracker.rotation, tracker.lever, np.zeros(STATES), pi, pose, covariance
     )
+
+
+def test_the_published_tip_comes_with_the_deviation_of_the_force():
+    tip, tracker, bias = random_tip(), random_tracker(), bias_of(1e-4)
+    mean = np.concatenate([tip.position, tip.quaternion, tip.velocity, tip.rate])
+    rng = np.random.default_rng(5)
+    root = rng.normal(size=(COLUMNS + STATES, COLUMNS + STATES))
+    pi, force_rows = root @ root.T, rng.normal(size=(3, COLUMNS))
+    plain, whole = (np.empty(7), np.empty((12, 12))), (np.empty(7), np.empty((12, 12)))
+    given = (mean, tip.columns, tracker.rotation, tracker.lever, bias, pi)
+    assert registered_rows(*given, *plain)
+    sigma, finite = fused_tip(*given, force_rows, *whole)
+    assert finite
+    assert all(np.array_equal(a, b) for a, b in zip(plain, whole, strict=True))
+    assert np.allclose(sigma**2, np.diag(force_rows @ pi[:COLUMNS, :COLUMNS] @ force_rows.T))
+    assert not fused_tip(*given, force_rows * np.nan, *whole)[1]
 
 
 # -- the window --

@@ -199,7 +199,7 @@ def test_sensitivities_of_an_extended_run():
             ("insertion", 0, 0.1),
         ],
         [(1, 0.01), (7, 0.01)],
-        2e-3,
+        4e-3,  # rounding of the differences is half of that in the smallest columns
     )
 
 
