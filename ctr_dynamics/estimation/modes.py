@@ -262,7 +262,7 @@ class ModeTracker:
         self._own: Equilibrium | None = None
         self._transfer: Transfer | None = None
         self._alpha = np.zeros(self.model.n)  # where the modes were found
-        self._kept = 0  # refreshes since then
+        self._kept = MOST_KEPT  # refreshes since then
 
     def measure(self, state: State) -> Modes:
         """Modes in ``state``; to be called once a step."""
@@ -283,6 +283,7 @@ class ModeTracker:
                 assert self._own is not None
                 readout = part.readout if self._transfer is None else part.readout @ self._transfer.restrict
                 self._basis, self._pending = replace(part, readout=readout, rest=self._own.fields), None
+                self._kept = 0
         elif self._age > self.every:
             self._age = 0
             self._begin(state, parameters)
@@ -314,7 +315,7 @@ class ModeTracker:
             if pair not in self._transfers:
                 self._transfers[pair] = transfer(self.model.n, equilibrium.mesh, on.mesh)
             self._transfer = self._transfers[pair]
-        self._own, self._alpha, self._kept = equilibrium, now.alpha, 0
+        self._own, self._alpha, self._kept = equilibrium, now.alpha, MOST_KEPT
         if on.key not in self._buffers:
             self._buffers[on.key] = self.coarse.buffers(on.mesh, 8 * len(lanes_of(self.coarse)))
         self._pending = modal_parts(self.coarse, on, par, now.beta.copy(), self._buffers[on.key])
