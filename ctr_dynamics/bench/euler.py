@@ -6,6 +6,7 @@ All that is not the integration of a section is the model's own sweep.
 from __future__ import annotations
 
 from types import FunctionType
+from typing import Any
 
 import numpy as np
 from numba import njit
@@ -26,10 +27,10 @@ TOLERANCE, LIMIT = 1e-7, 40
 
 
 @njit(nogil=True, error_model="numpy")
-def _euler_cells(tubes, W, present, cells, point, node, ust, c0, hist, shared, own, out, nodes, kept):
+def _euler_cells(tubes, W, present, cells, h, point, node, ust, c0, hist, shared, own, out, nodes, kept):
     """As :func:`ctr_dynamics.model.kernels._cells`, with the slope at the beginning of every cell alone."""
     S, F = state_rows(len(tubes)), field_rows(len(tubes))
-    Y, YS, K, _, HI, OU, _, _, MA, _ = offsets(tubes)
+    Y, YS, K, _, HI, OU, _, _, _, _ = offsets(tubes)
     for cell in range(cells):
         for r in range(S):
             nodes[(node + cell) * S + r] = W[Y + r]
@@ -41,12 +42,16 @@ def _euler_cells(tubes, W, present, cells, point, node, ust, c0, hist, shared, o
         for r in range(F):
             out[at * F + r] = W[OU + r]
         for r in range(S):
-            W[Y + r] += W[MA] * W[K + r]
+            W[Y + r] += h * W[K + r]
 
 
-_sweep = njit(nogil=True, error_model="numpy")(
-    FunctionType(kernels._sweep.py_func.__code__, {**vars(kernels), "_cells": _euler_cells})
-)
+def _with(kernel: Any, **replaced: Any) -> Any:
+    """The ``kernel`` with other functions in place of those it calls by these names."""
+    function = FunctionType(kernel.py_func.__code__, {**vars(kernels), **replaced})
+    return njit(nogil=True, error_model="numpy")(function)
+
+
+_sweep = _with(kernels._sweep, _section=_with(kernels._section, _cells=_euler_cells))
 
 
 @njit(nogil=True, error_model="numpy")

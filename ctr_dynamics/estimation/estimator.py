@@ -39,6 +39,7 @@ MAX_FAILURES = 10  # steps in a row that may fail before the model starts anew a
 SAME_COURSE = 8  # steps: joints no later than that move the robot so little that the covariance stays
 MOST_BEFORE_REDONE = 32  # steps: a course that waits for its correction is not continued farther than this
 MARGIN = 2.0  # times the mean cost of a step: so much time must be left for taking one again
+LOST = 1.0  # m: a tip that is known no better than that is not estimated any more
 MAX_BEHIND = 1000  # steps to catch up at once; beyond, the model starts anew
 BACKWARDS = 3  # joint states in a row whose time ran backwards: the clock or the bag began anew
 
@@ -390,6 +391,15 @@ class Estimator:
             self.health.failed("not finite")
             self.health.restarts += 1
             return self._invalid(k, "the estimate is not finite; the model starts anew at rest")
+        deviation = math.sqrt(float(np.trace(tip.covariance[:3, :3])))
+        if deviation > LOST:
+            self.runs.start_filter(k)
+            self.health.failed("led astray")
+            return self._invalid(
+                k,
+                f"the tracker has led the estimate astray: deviation of the tip {deviation:.2g} m, limit {LOST:g} m; "
+                "the filter starts anew from the model alone",
+            )
         problem = self._problem(k)
         self.health.problem = problem
         self._watch_due |= k % STABILITY_EVERY == 0

@@ -139,7 +139,7 @@ class Runs:
             return alone
         self._keep_alone_tip(t)
         if not result.ok:
-            self._start_filter(k)
+            self.start_filter(k)
             return result
         if result.substeps > 1:
             self.health.substeps += 1
@@ -173,7 +173,7 @@ class Runs:
         """Actuators and load with the estimated offsets and force."""
         return Actuation(self._signals, self._load, self._by_theta, self.fusion.theta)
 
-    def _start_filter(self, k: int) -> None:
+    def start_filter(self, k: int) -> None:
         """Start the filter anew from the model alone at step ``k``: a correction has led the fused run astray."""
         assert self.alone is not None
         self.fused = self.alone.copy()
@@ -253,6 +253,8 @@ class Runs:
         if not (always or self.inputs.predicting) and k % KEEP_EVERY:
             return
         assert self.fused is not None and self.alone is not None
+        if self.kept and self.kept[-1].k == k:
+            self.kept.pop()  # the filter has started anew since
         self.kept.append(
             Kept(
                 k,

@@ -452,28 +452,11 @@ def _load_history(tubes, W, hist, shared, own, point):
             W[HI + r] = shared[point * F + r]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def _section(
-    tubes, W, before, present, cells, length, point, node, ust, c0, hist, shared, own, out, nodes, kept, res
-):
-    """From the state in ``Y`` at the near side of a section's start, where ``before`` tubes lie, to its end: friction from the jump of the inner
-    tubes' moments, Runge-Kutta steps through its ``cells``, and at the end fields, moments on the near side (``MA``) and R_1^T g."""
+@njit(cache=True, forceinline=True, error_model="numpy")
+def _cells(tubes, V, present, cells, h, point, node, ust, c0, hist, shared, own, out, nodes, kept):
+    """Runge-Kutta steps of length ``h`` through the ``cells`` of a section, from and to the state in ``Y``."""
     S, F, n = state_rows(len(tubes)), field_rows(len(tubes)), len(tubes)
     Y, YS, K, ACC, HI, OU, TMP, PAR, MA, MB = offsets(tubes)
-    V = local_copy(tubes, W)  # nothing else points to it
-    _load_history(tubes, V, hist, shared, own, point)
-    for r in range(S):
-        V[YS + r] = V[Y + r]
-    _curvature(tubes, V, present, ust, point * 3 * n, c0)
-    _bending_moments(tubes, V, present, MB)
-    _tube_friction(tubes, V, before)
-    for i in range(1, n):
-        if (
-            i >= present and i < before
-        ):  # ended here: its own balance about its axis; its m_z holds the body's part already
-            res[5 + i] = -V[Y + (Z0 + i)]
-            V[Y + (Z0 + i)] = 0.0
-    h = length / cells
     for cell in range(cells):
         for r in range(S):
             if kept:
@@ -496,6 +479,32 @@ def _section(
                     V[YS + r] = fma(V[K + r], ahead, V[Y + r])
         for r in range(S):
             V[Y + r] = fma(V[ACC + r], h * (1.0 / 6.0), V[Y + r])
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _section(
+    tubes, W, before, present, cells, length, point, node, ust, c0, hist, shared, own, out, nodes, kept, res
+):
+    """From the state in ``Y`` at the near side of a section's start, where ``before`` tubes lie, to its end: friction from the jump of the inner
+    tubes' moments, Runge-Kutta steps through its ``cells``, and at the end fields, moments on the near side (``MA``) and R_1^T g."""
+    S, F, n = state_rows(len(tubes)), field_rows(len(tubes)), len(tubes)
+    Y, YS, K, ACC, HI, OU, TMP, PAR, MA, MB = offsets(tubes)
+    V = local_copy(tubes, W)  # nothing else points to it
+    _load_history(tubes, V, hist, shared, own, point)
+    for r in range(S):
+        V[YS + r] = V[Y + r]
+    _curvature(tubes, V, present, ust, point * 3 * n, c0)
+    _bending_moments(tubes, V, present, MB)
+    _tube_friction(tubes, V, before)
+    for i in range(1, n):
+        # a tube that ended here has its own balance about its axis; its m_z holds the body's part already
+        if i >= present and i < before:
+            res[5 + i] = -V[Y + (Z0 + i)]
+            V[Y + (Z0 + i)] = 0.0
+    _cells(
+        tubes, V, present, cells, length / cells, point, node, ust, c0, hist, shared, own, out, nodes, kept
+    )
+    point += 4 * cells
     _load_history(tubes, V, hist, shared, own, point)
     for r in range(S):
         if kept:

@@ -17,6 +17,7 @@ from estimation_cases import (
 )
 from tracker_twin import expected
 
+from ctr_dynamics.estimation.estimator import LOST
 from ctr_dynamics.estimation.rotations import conjugate, from_vector, matrix, multiply
 from ctr_dynamics.estimation.tip import Tip
 from ctr_dynamics.estimation.tracker import STATES, tracker_model
@@ -93,6 +94,8 @@ def test_lasting_contradiction_is_said(release):
     rng = np.random.default_rng(0)
     run = play(reshaped(release, lambda p, q, m: (p + rng.uniform(-0.3, 0.3, 3), q)))
     check_outputs(run)
+    for out in run.outputs:
+        assert not out.valid or np.sqrt(np.trace(out.tip_covariance[:3, :3])) <= LOST
     invalid = [out for out in run.outputs if not out.valid]
     assert any("tracker contradicts the model" in out.reason for out in invalid)
     status = next(s for s in run.estimator.health.statuses() if s.name == "tracker")
