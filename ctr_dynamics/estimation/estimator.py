@@ -391,13 +391,13 @@ class Estimator:
             self.health.failed("not finite")
             self.health.restarts += 1
             return self._invalid(k, "the estimate is not finite; the model starts anew at rest")
-        deviation = math.sqrt(float(np.trace(tip.covariance[:3, :3])))
-        if deviation > LOST:
+        variance = tip.covariance[0, 0] + tip.covariance[1, 1] + tip.covariance[2, 2]
+        if variance > LOST**2:
             self.runs.start_filter(k)
             self.health.failed("led astray")
             return self._invalid(
                 k,
-                f"the tracker has led the estimate astray: deviation of the tip {deviation:.2g} m, limit {LOST:g} m; "
+                f"the tracker has led the estimate astray: deviation of the tip {math.sqrt(variance):.2g} m, limit {LOST:g} m; "
                 "the filter starts anew from the model alone",
             )
         problem = self._problem(k)

@@ -24,6 +24,14 @@ def applied(A, v):
 
 
 @compiled
+def registration_error(rotation, bias):
+    """Estimated error of the registration in base axes: quaternion (4,) and shift (3,) m, from the nominal ``rotation`` (4,) and the tracker states
+    ``bias`` (13,); and the registration's inverse (3, 3)."""
+    back = matrix(conjugate(rotation))
+    return from_vector(applied(back, bias[0:3])), applied(back, bias[3:6]), back
+
+
+@compiled
 def on_lines(samples, time_ns, value, rate):
     """``value`` (size,) and its ``rate``, 1/s, at a time on the lines through three ``samples``: values, then stamps in ns. At the middle one the
     rate is that of the first line."""
@@ -271,9 +279,8 @@ def backbone_rows(s, nodes, fields, points, n, insertion_rate, rotation, bias, d
     (13,) tracker states; ``deviation`` (P,) m, the position's per axis (root of the third of its covariance's trace).
     """
     F = 7 + 2 * n
-    # the registration's estimated error, in base axes
-    back = matrix(conjugate(rotation))
-    turn, shift = matrix(from_vector(applied(back, bias[0:3]))), applied(back, bias[3:6])
+    quaternion, shift, _ = registration_error(rotation, bias)
+    turn = matrix(quaternion)
     for i in range(len(nodes)):
         a, b, c, d = nodes[i, 3], nodes[i, 4], nodes[i, 5], nodes[i, 6]
         norm = math.sqrt(a * a + b * b + c * c + d * d)

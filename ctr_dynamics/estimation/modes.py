@@ -202,10 +202,9 @@ def modal_parts(
     values = real + 1j * imaginary
     with np.errstate(divide="ignore", invalid="ignore"):
         mu = (1.0 - 1.0 / values) / SHIFT_STEP
+    # of each pair the first, whose vectors LAPACK keeps in two columns: real part, imaginary part
     wanted = (
-        (
-            imaginary > 0.0
-        )  # of each pair the first, whose vectors LAPACK keeps in two columns: real part, imaginary part
+        (imaginary > 0.0)
         & np.isfinite(mu)
         & (mu.imag > 1.0)
         & (-mu.real < MAX_DAMPING * np.abs(mu))
@@ -262,7 +261,7 @@ class ModeTracker:
         self._own: Equilibrium | None = None
         self._transfer: Transfer | None = None
         self._alpha = np.zeros(self.model.n)  # where the modes were found
-        self._kept = MOST_KEPT  # refreshes since then
+        self._kept = MOST_KEPT  # refreshes since then; MOST_KEPT where there are none to keep
 
     def measure(self, state: State) -> Modes:
         """Modes in ``state``; to be called once a step."""
@@ -295,7 +294,7 @@ class ModeTracker:
         )
         if not equilibrium.converged or equilibrium.key != state.key:
             return
-        if self._kept < MOST_KEPT and not self._moved(equilibrium, now):
+        if self._kept < MOST_KEPT and not self._moved(equilibrium, now.alpha):
             assert self._basis is not None
             inputs = np.concatenate([now.alpha, now.beta, now.force, now.torque])
             self._basis = replace(self._basis, rest=equilibrium.fields, inputs=inputs)
@@ -320,10 +319,9 @@ class ModeTracker:
             self._buffers[on.key] = self.coarse.buffers(on.mesh, 8 * len(lanes_of(self.coarse)))
         self._pending = modal_parts(self.coarse, on, par, now.beta.copy(), self._buffers[on.key])
 
-    def _moved(self, equilibrium: Equilibrium, now: Inputs) -> bool:
-        """Whether the modes have to be found anew about ``equilibrium`` with the inputs ``now``."""
-        if self._basis is None or self._own is None:
-            return True
+    def _moved(self, equilibrium: Equilibrium, alpha: Floats) -> bool:
+        """Whether ``equilibrium`` at ``alpha`` (N,) is another than the one that the modes are about."""
+        assert self._own is not None
         path = np.abs(equilibrium.nodes[:, :3] - self._own.nodes[:, :3]).max()
-        turn = np.abs(now.alpha - self._alpha).max()
+        turn = np.abs(alpha - self._alpha).max()
         return bool(path > MOVED[0] or turn > MOVED[1])

@@ -85,9 +85,8 @@ class Runs:
         self._signals = Signals(model, inputs)
         self._load = np.zeros(model.input_count)  # of the robot file
         self._load[3 * model.n : 3 * model.n + 3] = model.setup.tip_force
-        self._bare = Actuation(
-            self._signals, self._load, np.zeros((model.input_count, 0)), np.zeros(0)
-        )  # of the model alone
+        # the model alone has no parameters
+        self._bare = Actuation(self._signals, self._load, self._by_theta[:, :0].copy(), np.zeros(0))
         if model.extended:
             self.fusion.inserted = float(model.setup.block[model.layout["insertion"]][0])
         self.clear()

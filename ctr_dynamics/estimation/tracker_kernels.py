@@ -13,6 +13,7 @@ from .kernels import (
     from_vector,
     matrix,
     multiply,
+    registration_error,
     to_vector,
 )
 
@@ -24,12 +25,11 @@ def registered_pose(mean, rotation, lever, bias, pose):
     ``mean`` (13,): the tip; ``rotation`` (4,), ``lever`` (3,): nominal geometry; ``bias`` (13,): tracker states. Returns the rotation of the
     tip, that of the registration's estimated error in base axes, and the registration's inverse, (3, 3) each.
     """
-    R, N = matrix(mean[3:7]), matrix(conjugate(rotation))
-    turn = from_vector(applied(N, bias[0:3]))
-    C = matrix(turn)
+    turn, shift, N = registration_error(rotation, bias)
+    R, C = matrix(mean[3:7]), matrix(turn)
     pose[3:7] = multiply(turn, mean[3:7])
     point = mean[0:3] + applied(R, lever + bias[6:9])
-    pose[0:3] = applied(C, point) + applied(N, bias[3:6]) - applied(matrix(pose[3:7]), lever)
+    pose[0:3] = applied(C, point) + shift - applied(matrix(pose[3:7]), lever)
     return R, C, N
 
 

@@ -184,22 +184,22 @@ def test_sensitivities_of_an_extended_run():
         0.03,
         [
             ("bending_stiffness", 0, 0.02 * model.parameters[0]),
-            ("drive_compliance", 0, 0.5),
+            ("drive_compliance", 0, 2.0),
             ("drive_inertia", 0, 1e-5),
-            ("play", 0, 1e-3),
+            ("play", 0, 4e-3),
             ("play_share", 0, 0.5),
             ("oval_cos", 0, 0.01),
-            ("softening", 0, 1e-4),
-            ("drag_linear", 0, 0.01),
+            ("softening", 0, 4e-4),
+            ("drag_linear", 0, 0.04),
             ("drag_quadratic", 0, 0.2),
             ("stribeck_excess", 0, 0.05),
-            ("overlap_friction", 0, 2e-4),
+            ("overlap_friction", 0, 8e-4),
             ("spring_stiffness", 0, 0.1),
             ("spring_damping", 0, 2e-3),
             ("insertion", 0, 0.1),
         ],
         [(1, 0.01), (7, 0.01)],
-        4e-3,  # rounding of the differences is half of that in the smallest columns
+        2e-3,
     )
 
 
