@@ -60,7 +60,7 @@ def euler_sweep(tubes, W, c0, mesh, par, seclen, x, hist, histb, out, outb, node
     given = rows((), hist, 0, 1)
     _sweep(
         tubes, rows((), W, 0, 1), c0, mesh, rows((), par, 0, 1), rows((), seclen, 0, 1), rows((), x, 0, 1), given, given, True,
-        rows((), histb, 0, 1), rows((), out, 0, 1), rows((), outb, 0, 1), rows((), nodes, 0, 1), True, rows((), res, 0, 1),
+        rows((), histb, 0, 1), rows((), out, 0, 1), rows((), outb, 0, 1), rows((), nodes, 0, 1), (True, True), rows((), res, 0, 1),
     )  # fmt: skip
 
 

@@ -31,6 +31,13 @@ def release_robot() -> Robot:
     return load_robot("till2020_tissue")
 
 
+@cache
+def _at_rest() -> tuple[Floats, Floats, Floats]:
+    """Angles (2,) rad and translations (2,) m of the tubes, and their rates."""
+    rest = release_robot().rest
+    return np.array(rest.alpha.value), np.array(rest.beta.value), np.zeros(2)
+
+
 @dataclass(frozen=True)
 class Release:
     """Robot and load of the test: the weight's wrench (6,), and how much earlier than at 1 s it is cut (s)."""
@@ -52,13 +59,9 @@ class Release:
 
     def at(self, t: float) -> Inputs:
         """Inputs at `t` s."""
-        rest = release_robot().rest
-        share = min(max((1.01 - self.early - t) / 0.01, 0.0), 1.0)
-        still = np.zeros(2)
-        wrench = share * self.wrench
-        return Inputs(
-            np.array(rest.alpha.value), still, np.array(rest.beta.value), still, wrench[:3], wrench[3:]
-        )
+        wrench = min(max((1.01 - self.early - t) / 0.01, 0.0), 1.0) * self.wrench
+        alpha, beta, still = _at_rest()
+        return Inputs(alpha, still, beta, still, wrench[:3], wrench[3:])
 
 
 @dataclass(frozen=True)
@@ -152,7 +155,7 @@ def run(test: Release, scheme: str, dt: float, nodes: int, duration: float, tole
             break
         sweeps += result.sweeps
         jacobians += result.jacobians
-        tips.append(state.nodes[-1, :3])
+        tips.append(state.nodes[-1, :3].copy())
     wall = time.perf_counter() - begin
     return Path(
         dt, np.array(tips), wall, simulator.scheme.stages * (len(tips) - 1), sweeps, jacobians, failure

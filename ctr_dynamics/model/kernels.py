@@ -454,12 +454,14 @@ def _load_history(tubes, W, hist, shared, own, point):
 
 @njit(cache=True, forceinline=True, error_model="numpy")
 def _cells(tubes, V, present, cells, h, point, node, ust, c0, hist, shared, own, out, nodes, kept):
-    """Runge-Kutta steps of length ``h`` through the ``cells`` of a section, from and to the state in ``Y``."""
+    """Runge-Kutta steps of length ``h`` through the ``cells`` of a section, from and to the state in ``Y``. ``kept``: whether the fields, and
+    whether the states at the nodes."""
     S, F, n = state_rows(len(tubes)), field_rows(len(tubes)), len(tubes)
     Y, YS, K, ACC, HI, OU, TMP, PAR, MA, MB = offsets(tubes)
+    fields_kept, nodes_kept = kept
     for cell in range(cells):
         for r in range(S):
-            if kept:
+            if nodes_kept:
                 nodes[(node + cell) * S + r] = V[Y + r]
             V[YS + r] = V[Y + r]
             V[ACC + r] = 0.0
@@ -467,7 +469,7 @@ def _cells(tubes, V, present, cells, h, point, node, ust, c0, hist, shared, own,
             _load_history(tubes, V, hist, shared, own, point)
             _move_grid(tubes, V, (cell + (0.0 if stage == 0 else 1.0 if stage == 3 else 0.5)) / cells)
             _derivative(tubes, V, present, ust, point * 3 * n, c0)
-            if kept:
+            if fields_kept:
                 for r in range(F):
                     out[point * F + r] = V[OU + r]
             point += 1
@@ -490,6 +492,7 @@ def _section(
     S, F, n = state_rows(len(tubes)), field_rows(len(tubes)), len(tubes)
     Y, YS, K, ACC, HI, OU, TMP, PAR, MA, MB = offsets(tubes)
     V = local_copy(tubes, W)  # nothing else points to it
+    fields_kept, nodes_kept = kept
     _load_history(tubes, V, hist, shared, own, point)
     for r in range(S):
         V[YS + r] = V[Y + r]
@@ -507,12 +510,12 @@ def _section(
     point += 4 * cells
     _load_history(tubes, V, hist, shared, own, point)
     for r in range(S):
-        if kept:
+        if nodes_kept:
             nodes[(node + cells) * S + r] = V[Y + r]
         V[YS + r] = V[Y + r]
     _move_grid(tubes, V, 1.0)
     _derivative(tubes, V, present, ust, point * 3 * n, c0)
-    if kept:
+    if fields_kept:
         for r in range(F):
             out[point * F + r] = V[OU + r]
     _bending_moments(tubes, V, present, MA)
@@ -612,7 +615,7 @@ def _block(tubes, lanes, first, stride, W, c0, mesh, par, seclen, x, hist, histb
     _sweep(
         tubes, rows(lanes, W, 0, lane_count(lanes)), c0, mesh, rows(lanes, par, first, stride), rows(lanes, seclen, first, stride),
         rows(lanes, x, first, stride), rows(lanes, hist, first, stride), rows((), hist, 0, 1), own, rows(lanes, histb, first, stride),
-        rows(lanes, out, first, stride), rows(lanes, outb, first, stride), rows(lanes, nodes, first, stride), len(out) > 0,
+        rows(lanes, out, first, stride), rows(lanes, outb, first, stride), rows(lanes, nodes, first, stride), (len(out) > 0, len(nodes) > 0),
         rows(lanes, res, first, stride),
     )  # fmt: skip
 
@@ -664,6 +667,6 @@ def sweep(
     tubes, n and m_xy at s = 0+; ``hist``, ``out`` (points, F, L): history parts and fields at every Runge-Kutta stage of every cell
     and at section ends; ``histb``, ``outb`` (N, base points, 2, L); ``nodes`` (cells + sections, S, L): the state at the nodes;
     ``res`` (5 + N, L): imbalance of force (3), moment m_xy (2) and m_z of every tube's end. c0 = 0 with zero history is the static model.
-    With several lanes ``hist`` may be (points, F), which all share, and ``out`` with ``nodes`` may be empty: then neither is written.
+    With several lanes ``hist`` may be (points, F), which all share, and ``out`` and ``nodes`` may be empty: then they are not written.
     """
     _in_blocks(tubes, lanes, W, c0, mesh, par, seclen, x, hist, histb, out, outb, nodes, res)

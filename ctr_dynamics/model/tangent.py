@@ -20,16 +20,19 @@ THETA = 0.55  # of the one-stage tangent: nearly the trapezoidal rule, with a li
 
 @njit(cache=True, nogil=True)
 def _halves(tubes, lanes, big):
-    """Buffers of the lanes of the base case and the unknowns, and of one pack for columns, both in those of all lanes ``big``."""
-    W, par, seclen, x, hist, histb, out, outb, nodes, res = big
+    """Buffers of the lanes of the base case and the unknowns, and of one pack for columns, both in those of all lanes ``big``.
+
+    Fields take the place of their own histories, which a sweep has read before it writes them: less to go through the cache.
+    """
+    W, par, seclen, x, _, histb, out, outb, nodes, res = big
     L, H = lane_count(lanes), lane_count(unknown_lanes(tubes))
     near = (
-        W, par[: len(par) // L * H], seclen[: len(seclen) // L * H], x[: len(x) // L * H], hist[: len(hist) // L * H],
+        W, par[: len(par) // L * H], seclen[: len(seclen) // L * H], x[: len(x) // L * H], out[: len(out) // L * H],
         histb[: len(histb) // L * H], out[: len(out) // L * H], outb[: len(outb) // L * H], nodes[: len(nodes) // L * H],
         res[: len(res) // L * H],
     )  # fmt: skip
     far = (
-        W, _behind(par, L, H), _behind(seclen, L, H), _behind(x, L, H), _behind(hist, L, H), _behind(histb, L, H), _behind(out, L, H),
+        W, _behind(par, L, H), _behind(seclen, L, H), _behind(x, L, H), _behind(out, L, H), _behind(histb, L, H), _behind(out, L, H),
         _behind(outb, L, H), _behind(nodes, L, H), _behind(res, L, H),
     )  # fmt: skip
     return near, far
@@ -39,6 +42,13 @@ def _halves(tubes, lanes, big):
 def _behind(values, L, H):
     rows = len(values) // L
     return values[rows * H : rows * (H + PACK)]
+
+
+@njit(cache=True, nogil=True)
+def _without_nodes(buffers):
+    """The buffers of a sweep that does not keep the states at the nodes."""
+    W, par, seclen, x, hist, histb, out, outb, nodes, res = buffers
+    return W, par, seclen, x, hist, histb, out, outb, nodes[:0], res
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -65,7 +75,8 @@ def _lay(tubes, lanes, mesh, buffers, par, dpar, x, hist, histb, dhist, column, 
     main = len(hist)
     broadcast(lanes, x, xL)
     _perturb(parL, par, dpar, column, lane, count, epsilon)
-    _perturb(histL, hist, dhist[:main], column, lane, count, epsilon)
+    if count:  # otherwise all lanes share that of the base case
+        _perturb(histL, hist, dhist[:main], column, lane, count, epsilon)
     _perturb(histbL, histb, dhist[main:], column, lane, count, epsilon)
     lane_lengths(tubes, lanes, mesh, parL, seclenL)
 
@@ -81,7 +92,7 @@ def _base(tubes, mesh, c0, par, dpar, x, hist, histb, dhist, count, epsilon, per
     for i in range(m):
         xL[i * H + 1 + i] += perturb[i]
     sweep(tubes, lanes, W, c0, mesh,
-          parL, seclenL, xL, histL, histbL, outL, outbL, nodesL, resL)  # fmt: skip
+          parL, seclenL, xL, histL if count else hist, histbL, outL, outbL, nodesL, resL)  # fmt: skip
     jacobian = np.empty((m, m))
     for i in range(m):
         for k in range(m):
@@ -131,6 +142,31 @@ def _boundary(base, res, lane, column, count, epsilon, inverse, dx):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
+def _columns_of(tubes, slopes, swept, follow, scale, target, size):
+    """A pack of columns with the boundary values following, into ``size`` rows of the view ``target``: ``scale`` times what the perturbed lanes
+    ``swept`` differ from the base case, and the ``slopes`` (rows, H) that :func:`_base` left times the unknowns' columns ``follow``.
+
+    Four rows at a time: loading those columns for every row would be most of the work.
+    """
+    H, slope = lane_count(unknown_lanes(tubes)), rows((), slopes, 0, 1)
+    whole = size - size % 4
+    for r in range(0, whole, 4):
+        a, b, c, d = r * H, (r + 1) * H, (r + 2) * H, (r + 3) * H
+        first, second = (swept[r] - slope[a]) * scale, (swept[r + 1] - slope[b]) * scale
+        third, fourth = (swept[r + 2] - slope[c]) * scale, (swept[r + 3] - slope[d]) * scale
+        for k in range(5 + len(tubes)):
+            unknown = follow[k]
+            first, second = fma(unknown, slope[a + 1 + k], first), fma(unknown, slope[b + 1 + k], second)
+            third, fourth = fma(unknown, slope[c + 1 + k], third), fma(unknown, slope[d + 1 + k], fourth)
+        target[r], target[r + 1], target[r + 2], target[r + 3] = first, second, third, fourth
+    for r in range(whole, size):
+        total = (swept[r] - slope[r * H]) * scale
+        for k in range(5 + len(tubes)):
+            total = fma(follow[k], slope[r * H + 1 + k], total)
+        target[r] = total
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def _combine(tubes, slopes, values, lane, count, epsilon, dx, column, target):
     """d(values)/d(column) with the boundary values following: ``count`` columns of ``target`` (rows, r) from ``column`` on, from perturbed lanes of
     ``values`` (rows, L) and the ``slopes`` (rows, H) that :func:`_base` left. More rows than the target's: its are the last."""
@@ -140,17 +176,10 @@ def _combine(tubes, slopes, values, lane, count, epsilon, dx, column, target):
     skipped = len(slopes) // H - size
     scale = 1.0 / epsilon
     if count == PACK and L == PACK and target.strides[1] == 8 and dx.strides[1] == 8:
-        found, wanted, follow = (
-            rows((0,), values, skipped * PACK, PACK),
-            columns(target, column),
-            columns(dx, column),
+        found = rows((0,), values[skipped * PACK :], 0, PACK)
+        _columns_of(
+            tubes, slopes[skipped * H :], found, columns(dx, column), scale, columns(target, column), size
         )
-        for r in range(size):
-            start = (skipped + r) * H
-            total = (found[r] - slopes[start]) * scale
-            for i in range(5 + len(tubes)):
-                total = fma(follow[i], slopes[start + 1 + i], total)
-            wanted[r] = total
     else:
         for r in range(size):
             start = (skipped + r) * H
@@ -317,29 +346,40 @@ def _mix(weights, stored, first, base, values, epsilon):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _keep(tubes, stored, stage, last, one_step, first, c0, base, values, slopes, found, epsilon, dx, column):
-    """After a stage, from its swept history ``values`` and fields ``found`` (rows, 8): the columns of its rates, or after the ``last`` those of the
-    fields, into ``stored`` (slots, fields, 8) from field ``first`` on. What a ``one_step`` scheme never reads is not written: the columns of many
-    nodes exceed the cache."""
-    H = lane_count(unknown_lanes(tubes))
-    scale = 1.0 / epsilon
-    plain, slope = rows((), base, 0, 1), rows((), slopes, 0, 1)
-    given, swept, follow = rows((0,), values, 0, PACK), rows((0,), found, 0, PACK), columns(dx, column)
-    now, before = columns(stored[Y_NOW], 0), columns(stored[Y_BEFORE], 0)
-    rate, newest = columns(stored[RATES + stage], 0), columns(stored[RATE_NOW], 0)
-    for i in range(len(plain)):
-        field = (swept[i] - slope[i * H]) * scale
-        for k in range(5 + len(tubes)):
-            field = fma(follow[k], slope[i * H + 1 + k], field)
-        value = fma(field, c0, (given[i] - plain[i]) * scale)
-        if not last:
-            rate[first + i] = value
-        elif one_step:
-            now[first + i] = field
-        else:
-            before[first + i] = now[first + i]
-            now[first + i] = field
-            newest[first + i] = value
+def _keep(tubes, stored, slot, first, c0, weights, slopes, found, epsilon, dx, column):
+    """After a stage, from its swept fields ``found`` (rows, 8): their columns into the ``slot`` of ``stored`` (slots, fields, 8) from field
+    ``first`` on. What a one-step scheme never reads is not written: the columns of many nodes exceed the cache."""
+    size = len(slopes) // lane_count(unknown_lanes(tubes))
+    now, before, rate = (
+        columns(stored[Y_NOW, first:], 0),
+        columns(stored[Y_BEFORE, first:], 0),
+        columns(stored[RATE_NOW, first:], 0),
+    )
+    multistep = weights[Y_BEFORE] != 0.0 or weights[RATE_NOW] != 0.0
+    if multistep:
+        for i in range(size):
+            past = now[i] * weights[Y_NOW] + before[i] * weights[Y_BEFORE]
+            rate[i] = past + rate[i] * weights[RATE_NOW]
+            before[i] = now[i]
+    swept, target = rows((0,), found, 0, PACK), columns(stored[slot, first:], 0)
+    _columns_of(tubes, slopes, swept, columns(dx, column), 1.0 / epsilon, target, size)
+    if multistep:
+        for i in range(size):
+            rate[i] = rate[i] + now[i] * c0
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def by_fields(c0, weights):
+    """``weights`` (stages, 3 + stages) of the stored fields in the histories, for the fields at earlier stages instead of their rates, which are
+    y_t = c0 y + h."""
+    result = weights.copy()
+    for stage in range(len(c0)):
+        for earlier in range(stage):
+            share = weights[stage, RATES + earlier]
+            result[stage, RATES + earlier] = share * c0[earlier]
+        for earlier in range(stage):
+            result[stage] += weights[stage, RATES + earlier] * result[earlier]
+    return result
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -350,14 +390,15 @@ def step_tangent(tubes, lanes, mesh, c0, weights, par, inputs, found, before, ra
     ``before`` (slots, fields): stored fields before the step; ``rates`` (stages, fields): the stages' rates; ``found`` (stages, m): their
     unknowns; ``inputs`` as in :func:`ctr_dynamics.model.step.step`, ``dinputs`` (stages, inputs, r) their columns, added to those of the
     parameters ``dpar`` (NP, r); r is a multiple of 8. ``dbank`` (r / 8, 3 + stages, fields, 8): columns of the stored fields, advanced in
-    place like the fields themselves; slots that the scheme does not read are left as they are. ``work`` = (hist, histb, bank
+    place like the fields themselves, but with the stages' fields in place of their rates. ``work`` = (hist, histb, bank
     (3 + stages, fields), dpar of a stage (NP, r)). ``lanes``, ``big``: as for :func:`linearise`. ``dnodes`` (rows, r): columns of the last
     ``rows`` numbers of the node states. Returns False where a stage cannot be linearised.
     """
     hist, histb, bank, dstage = work
     fields, stages, main = dbank.shape[2], len(c0), len(hist)
-    near, far = _halves(tubes, lanes, big)
-    one_step = not np.any(weights[:, Y_BEFORE : RATE_NOW + 1])
+    whole = _halves(tubes, lanes, big)
+    bare = _without_nodes(whole[0]), _without_nodes(whole[1])
+    shares = by_fields(c0, weights)
     for i in range(fields):
         for slot in range(RATES):
             bank[slot, i] = before[slot, i]
@@ -371,7 +412,8 @@ def step_tangent(tubes, lanes, mesh, c0, weights, par, inputs, found, before, ra
             par[row] = inputs[stage, i]
             for k in range(dpar.shape[1]):
                 dstage[row, k] = dpar[row, k] + dinputs[stage, i, k]
-        x, used, last = found[stage], weights[stage, : RATES + stage], stage == stages - 1
+        x, used, last = found[stage], shares[stage, : RATES + stage], stage == stages - 1
+        near, far = whole if last else bare
         if not _base(
             tubes,
             mesh,
@@ -399,12 +441,9 @@ def step_tangent(tubes, lanes, mesh, c0, weights, par, inputs, found, before, ra
             _sweep_pack(tubes, mesh, c0[stage], far)
             if not _boundary(near[9], far[9], 0, column, PACK, epsilon, inverse, dx):
                 return False
-            _keep(
-                tubes, stored, stage, last, one_step, 0, c0[stage], hist, far[4], near[6], far[6], epsilon, dx, column
-            )  # fmt: skip
-            _keep(
-                tubes, stored, stage, last, one_step, main, c0[stage], histb, far[5], near[7], far[7], epsilon, dx, column
-            )  # fmt: skip
+            slot = Y_NOW if last else RATES + stage
+            _keep(tubes, stored, slot, 0, c0[stage], used, near[6], far[6], epsilon, dx, column)
+            _keep(tubes, stored, slot, main, c0[stage], used, near[7], far[7], epsilon, dx, column)
             if last:
                 _combine(tubes, near[8], far[8], 0, PACK, epsilon, dx, column, dnodes)
     return True
