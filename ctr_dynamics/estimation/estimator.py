@@ -38,7 +38,7 @@ RETRY_EVERY = 33  # steps between starts while there is no equilibrium: looking 
 MAX_FAILURES = 10  # steps in a row that may fail before the model starts anew at rest
 SAME_COURSE = 8  # steps: joints no later than that move the robot so little that the covariance stays
 MOST_BEFORE_REDONE = 32  # steps: a course that waits for its correction is not continued farther than this
-MARGIN = 2.0  # times the mean cost of a step: so much time must be left for taking one again
+MARGIN = 1.0  # times the mean cost of a step: so much time must be left for taking one again
 LOST = 1.0  # m: a tip that is known no better than that is not estimated any more
 MAX_BEHIND = 1000  # steps to catch up at once; beyond, the model starts anew
 BACKWARDS = 3  # joint states in a row whose time ran backwards: the clock or the bag began anew
@@ -168,8 +168,13 @@ class Estimator:
         """Whether the next step may be taken before the correction that is due: not where the load has jumped, or it is too far behind."""
         assert self.t0_ns is not None and self._return_to is not None
         begun = bool(self.runs.kept) and self.runs.kept[-1].k == self.k
-        behind = self.k - (self._return_to - self.t0_ns) // DT_NS
-        return self.inputs.predicting and begun and behind < MOST_BEFORE_REDONE and not self._urgent
+        return self.inputs.predicting and begun and self._behind < MOST_BEFORE_REDONE and not self._urgent
+
+    @property
+    def _behind(self) -> int:
+        """Steps that have been taken with other inputs than are known now."""
+        assert self.t0_ns is not None
+        return 0 if self._return_to is None else self.k - (self._return_to - self.t0_ns) // DT_NS
 
     def use_pause(self) -> None:
         """A part of the work that no output waits for: the misfit monitor's, and a look at the stability or a part of the modes' refresh."""
@@ -246,7 +251,13 @@ class Estimator:
                 self.health.failed("no static equilibrium")
                 return self._invalid(k, reason)
             return self._output(k, StepResult(True, "at rest", 0, 0, 0))
-        result = self.runs.step(k)
+        # A course that is known to be wrong says nothing of the robot: samples wait for its correction, or, where that is not soon, are
+        # fused for the time being, and counted when they are fused again.
+        counters = None if self._return_to is None else self.health.of_samples()
+        before = len(self.runs.innovations)
+        result = self.runs.step(k, fuse=self._return_to is None or self._behind > SAME_COURSE)
+        if counters is not None:
+            self._recount(counters, before, [])
         self.health.sweeps += result.sweeps
         if not result.ok:
             self.health.failed(result.reason)
@@ -296,7 +307,6 @@ class Estimator:
         counters = self.health.of_samples()
         # the next joints will return to the last step that these cover; what comes later than it should, to one of every eighth
         covered = (self.inputs.joints.stamps[-1] - self.t0_ns) // DT_NS
-        done = True
         for again in range(k + 1, reached + 1):
             if (
                 spare_s is not None
@@ -305,7 +315,6 @@ class Estimator:
                 and spare_s() < MARGIN * self._redo_s
             ):
                 self._put_off(again - 1, course, joints_only and again <= changed)
-                done = False
                 break
             begin = time.perf_counter()
             self.health.rolled_back += 1
@@ -320,7 +329,11 @@ class Estimator:
                     self.runs.fused = None
                     break
             self._redo_s += 0.1 * (time.perf_counter() - begin - self._redo_s)
-        self._thaw(counters, before, done)
+        reported = {i.stamp_ns for i in (*self._reported, *self.runs.innovations[:before])}
+        # samples that were counted before are not counted again
+        self._recount(
+            counters, before, [i for i in self.runs.innovations[before:] if i.stamp_ns not in reported]
+        )
 
     def _put_off(self, corrected: int, course: dict[int, Kept], same: bool) -> None:
         """Leave the correction at the step ``corrected``, to be gone on with from there, and return to the end of the ``course`` as it was.
@@ -335,13 +348,10 @@ class Estimator:
         self._return_to = self.t0_ns + corrected * DT_NS
         self._joints_only = same
 
-    def _thaw(self, counters: tuple, innovations: int, done: bool) -> None:
-        """Samples that were counted when they were first fused are not counted again; none while the correction is not ``done``."""
+    def _recount(self, counters: tuple, before: int, fresh: list[Innovation]) -> None:
+        """Count of the innovations that came since there were ``before``, and the health's ``counters``, only those that are ``fresh``."""
         h = self.health
-        again = self.runs.innovations[innovations:] if done else []
-        del self.runs.innovations[innovations:]
-        repeated = {i.stamp_ns for i in self._reported} if again else set()
-        fresh = [i for i in again if i.stamp_ns not in repeated]
+        del self.runs.innovations[before:]
         h.return_to(counters)
         for innovation in fresh:
             if innovation.dof:

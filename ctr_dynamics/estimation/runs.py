@@ -127,9 +127,9 @@ class Runs:
         self.keep(k)
         return ""
 
-    def step(self, k: int, track: Kept | None = None, keep: bool = True) -> StepResult:
-        """Both runs from step k - 1 to k, and every sample that has become due; with ``track`` the covariance is taken from there. Without
-        ``keep`` the state is kept at every eighth step only."""
+    def step(self, k: int, track: Kept | None = None, *, keep: bool = True, fuse: bool = True) -> StepResult:
+        """Both runs from step k - 1 to k, and, unless not to ``fuse``, every sample that has become due; with ``track`` the covariance is taken
+        from there. Without ``keep`` the state is kept at every eighth step only."""
         assert self.fused is not None and self.alone is not None
         before, t = seconds(k - 1), seconds(k)
         self._signals.clear()
@@ -145,7 +145,7 @@ class Runs:
         if track is not None:
             self.fusion.follow(track.fusion, self.fused)
         else:
-            due = self.inputs.due_samples(self.tracker, t)
+            due = self.inputs.due_samples(self.tracker, t) if fuse else []
             if not self.fusion.predict(self.fused, result, t, sampled=bool(due)):
                 self.health.note(
                     "tracker", "tangent", "the step could not be linearised; the covariance was held"

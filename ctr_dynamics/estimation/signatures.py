@@ -230,15 +230,21 @@ class Regression:
         self.seconds = fade * self.seconds + float(fades @ steps)
         self._last = float(times[-1])
 
-    def _left(self, chosen: list[int]) -> float:
-        """Sum of squares that the signatures ``chosen`` leave, at least the noise."""
-        columns = np.concatenate([self._slices[i] for i in chosen])
-        size = np.sqrt(np.maximum(self._gram[columns, columns], 1e-300))
-        G = self._gram[np.ix_(columns, columns)] / np.outer(size, size)
-        b = self._moment[columns] / size
-        lam, E = np.linalg.eigh(G)
+    def _left(self, sets: list[list[int]]) -> list[float]:
+        """Sums of squares that each of ``sets`` of signatures leaves, at least the noise; all at once, for these are many small problems."""
+        chosen = [np.concatenate([self._slices[i] for i in one]) for one in sets]
+        # sets of fewer columns are filled up with one of zeros, which explains nothing
+        empty = len(self._gram)
+        columns = np.full((len(sets), max(map(len, chosen))), empty)
+        for row, one in zip(columns, chosen, strict=True):
+            row[: len(one)] = one
+        size = np.append(np.sqrt(np.maximum(self._gram.diagonal(), 1e-300)), 1.0)
+        gram, moment = np.pad(self._gram, (0, 1)) / np.outer(size, size), np.append(self._moment, 0.0) / size
+        lam, E = np.linalg.eigh(gram[columns[:, :, None], columns[:, None, :]])
         inverse = np.where(lam > 1e-8, 1.0 / np.maximum(lam, 1e-8), 0.0)
-        return max(self._square - float((E.T @ b) ** 2 @ inverse), self._floor)
+        along = np.einsum("kij,ki->kj", E, moment[columns])
+        explained = np.einsum("kj,kj->k", along**2, inverse)
+        return [max(self._square - part, self._floor) for part in explained.tolist()]
 
     @property
     def _floor(self) -> float:
@@ -261,7 +267,7 @@ class Regression:
             unknowns = sum(len(self._slices[i]) for i in chosen)
             return -count * math.log(left) - unknowns * math.log(count)
 
-        alone = [self._left([i]) for i in every]
+        alone = self._left([[i] for i in every])
         order = sorted(every, key=lambda i: -worth([i], alone[i]))
         best = order[0]
         nothing = -count * math.log(self._square)
@@ -277,7 +283,7 @@ class Regression:
         while len(found) < MOST:
             listed = {cause.effect for cause in found}
             rest = [i for i in every if SIGNATURES[i].effect not in listed]
-            after = {i: self._left([*chosen, i]) for i in rest}
+            after = dict(zip(rest, self._left([[*chosen, i] for i in rest]), strict=True))
             nxt = max(rest, key=lambda i: worth([*chosen, i], after[i]))
             if worth([*chosen, nxt], after[nxt]) <= worth(chosen, left):
                 break

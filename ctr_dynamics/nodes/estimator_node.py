@@ -40,6 +40,7 @@ from ctr_dynamics.parameters import Settings
 from ctr_dynamics.robot import load_robot
 
 DIAGNOSTICS_NS = 500_000_000
+DIAGNOSTICS_WAIT_NS = 100_000_000  # how long they wait for a pause between steps
 # A thread that wants the interpreter gets it after this long; the default of 5 ms is longer than a step.
 SWITCH_INTERVAL_S = 1e-4
 
@@ -210,13 +211,14 @@ class EstimatorNode(Node):
         count, _ = self._undecodable.get(topic, (0, ""))
         self._undecodable[topic] = (count + 1, str(error))
 
-    def _housekeeping(self, now_ns: int) -> None:
+    def _housekeeping(self, now_ns: int, pause: bool) -> None:
         """Diagnostics, at once when validity or the warning of a snap has changed and else at 2 Hz of the wall clock."""
         monotonic_ns = time.monotonic_ns()
         if self.rolling is not None:
             self.rolling.alarm(self._estimator.health.misfit.alarm, monotonic_ns)
         before, now = self._shown, (self.outputs.valid, self._estimator.health.snap_ahead)
-        if now == before and monotonic_ns < self._next_diagnostics_ns:
+        due_ns = self._next_diagnostics_ns + (0 if pause else DIAGNOSTICS_WAIT_NS)
+        if now == before and monotonic_ns < due_ns:
             return
         self._next_diagnostics_ns = monotonic_ns + DIAGNOSTICS_NS
         self._shown = now

@@ -34,7 +34,7 @@ COLLECT_SLACK_NS = 1_500_000
 GATHER_NS = 4_000_000
 """So long after the first joints the model starts: a load of the same time comes a moment later, and starting takes longer than that."""
 PAUSE_NS = 1_000_000
-"""What the estimator does in a pause takes about as long."""
+"""What is done in a pause takes about as long."""
 
 
 class Steps(Protocol):
@@ -110,7 +110,7 @@ class StepLoop(threading.Thread):
     Args:
         estimator: see `Steps`; touched by this thread alone once started.
         publish: called with every step in order of its stamp; returns False when the stamp was withheld.
-        housekeeping: called after each round with the current time; publishes diagnostics when they are due.
+        housekeeping: called after each round with the current time and whether there is a pause; publishes diagnostics when they are due.
         clock_ns: the node's current time, 0 while it has none.
         timing: the account of punctuality.
         log_error: takes one line for the log.
@@ -122,7 +122,7 @@ class StepLoop(threading.Thread):
         self,
         estimator: Steps,
         publish: Callable[[Any], bool],
-        housekeeping: Callable[[int], None],
+        housekeeping: Callable[[int, bool], None],
         clock_ns: Callable[[], int],
         timing: StepTiming,
         log_error: Callable[[str], Any],
@@ -144,6 +144,9 @@ class StepLoop(threading.Thread):
         self._wall = wall
         self._gather_ns = gather_ns
         self._took_steps = False
+        self._starved = (
+            False  # a step was due in this round and the estimator did not take it: it wants an input
+        )
         self._pause_due = False
         self._wake = threading.Event()
         self._stopping = False
@@ -219,7 +222,7 @@ class StepLoop(threading.Thread):
             gc.unfreeze()
 
     def _round(self) -> None:
-        self._took_steps = False
+        self._took_steps = self._starved = False
         try:
             while self.inbox:
                 self.inbox.popleft()()
@@ -235,13 +238,17 @@ class StepLoop(threading.Thread):
         if self._took_steps:
             self._pause_due = True
         if not self.estimator.correcting:
-            if self._pause_due and not self.inbox and self._spare_s() * 1e9 > PAUSE_NS:
+            if self._pause_due and not self.inbox and self._pause():
                 self._pause_due = False
                 self.estimator.use_pause()
         elif self._took_steps:
             self._wake.set()  # now there is time for it
-        self._housekeeping(self._clock_ns())
+        self._housekeeping(self._clock_ns(), self._pause())
         self._collect()
+
+    def _pause(self) -> bool:
+        """Whether there is time for what no output waits for."""
+        return self._spare_s() * 1e9 > PAUSE_NS
 
     def _spare_s(self) -> float:
         """Time until the next step falls due, s; infinite where nothing tells."""
@@ -256,9 +263,11 @@ class StepLoop(threading.Thread):
         for _ in range(SLICE_STEPS):
             until_ns, more = self._until(self._now_ns())
             corrects = self.estimator.correcting
+            due_ns = self._next_due_ns()
             begin = time.perf_counter_ns()
             steps = self.estimator.advance(until_ns, self._spare_s, None if predicting else 1)
             spent_ns = time.perf_counter_ns() - begin
+            self._starved = not steps and due_ns is not None and until_ns is not None and until_ns >= due_ns
             if steps:
                 self._took_steps = True
                 self.timing.stepped(len(steps), spent_ns)
@@ -315,8 +324,8 @@ class StepLoop(threading.Thread):
         due_ns = self._next_due_ns()
         if due_ns is not None and self._wall:
             wait_ns = min(due_ns - self._now_ns(), IDLE_NS)
-            if wait_ns <= 0 and not self._took_steps:
-                wait_ns = RETRY_NS  # due and not taken: the estimator wants an input; do not spin
+            if wait_ns <= 0 and self._starved:
+                wait_ns = RETRY_NS  # do not spin
         if wait_ns > 0:
             self._wake.wait(wait_ns * 1e-9)
 

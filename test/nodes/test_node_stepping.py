@@ -62,7 +62,7 @@ def make_loop(estimator, clock, policy="predict", publish=None, gather_ns=0):
     loop = StepLoop(
         estimator,
         publish or note,
-        lambda now: None,
+        lambda now, pause: None,
         lambda: clock.now,
         StepTiming(policy, 100 * MS),
         errors.append,
@@ -207,6 +207,59 @@ def test_corrections_are_told_how_much_time_there_is(clock):
     loop._round()
     assert estimator.spare_s == pytest.approx(-0.25 * STEP_NS * 1e-9)
     assert len(published) == 2
+
+
+def test_a_step_that_falls_due_during_a_correction_is_taken_at_once(clock):
+    estimator = Scripted(clock.now)
+    loop, published, _ = make_loop(estimator, clock)
+    loop._round()
+    take = estimator.advance
+
+    def correct(now_ns=None, spare_s=None, most=None):
+        steps = take(now_ns, spare_s, most)
+        clock.now += STEP_NS  # the correction took until after the next step was due
+        return steps
+
+    waits = []
+    loop._wake = SimpleNamespace(
+        is_set=lambda: False, wait=waits.append, clear=lambda: None, set=lambda: None
+    )
+    estimator.advance = correct
+    clock.now += STEP_NS // 2
+    loop._round()
+    loop._sleep()
+    assert len(published) == 1
+    assert waits == []
+    estimator.advance = take
+    loop._round()
+    assert len(published) == 2
+
+
+def test_a_step_that_is_due_and_not_taken_is_not_asked_for_all_the_time(clock):
+    estimator = Scripted(clock.now)
+    loop, _, _ = make_loop(estimator, clock)
+    loop._round()
+    waits = []
+    loop._wake = SimpleNamespace(
+        is_set=lambda: False, wait=waits.append, clear=lambda: None, set=lambda: None
+    )
+    estimator.advance = lambda now_ns=None, spare_s=None, most=None: []
+    clock.now += 2 * STEP_NS
+    loop._round()
+    loop._sleep()
+    assert waits == [pytest.approx(1e-3)]
+
+
+def test_housekeeping_is_told_whether_there_is_a_pause(clock):
+    loop, _, _ = make_loop(Scripted(clock.now), clock)
+    told = []
+    loop._housekeeping = lambda now, pause: told.append(pause)
+    loop._round()
+    clock.now += STEP_NS // 2
+    loop._round()
+    clock.now += STEP_NS // 2 - STEP_NS // 10
+    loop._round()
+    assert told == [True, True, False]
 
 
 def test_a_correction_that_waits_goes_before_the_pause(clock):
