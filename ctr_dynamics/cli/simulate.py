@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from ctr_dynamics.robot import load_robot
-from ctr_dynamics.simulation import load_scenario, write_recording
+from ctr_dynamics.simulation import load_scenario, scenario_names, write_recording
 from ctr_dynamics.simulation import simulate as run_scenario
 
 
@@ -26,7 +26,9 @@ def _progress(fraction: float) -> None:
 def simulate(
     scenario: Annotated[
         str,
-        typer.Argument(metavar="SCENARIO.yaml", help="A scenario file, or a shipped one: release, sweep."),
+        typer.Argument(
+            metavar="SCENARIO.yaml", help=f"A scenario file, or a shipped one: {', '.join(scenario_names())}."
+        ),
     ],
     robot: Annotated[
         str, typer.Option("--robot", metavar="NAME_OR_FILE", help="A shipped robot or a robot file.")
