@@ -3,7 +3,8 @@
 The estimator and a driver run as two processes of this machine; nobody but this script's own listener (with
 --listen) hears the outputs. Bags are played one after the other, each run with a fresh estimator, until the
 asked time has been played. Figures go to standard output as JSON. Beside them stands the machine's own
-punctuality: how often a thread of this script that does nothing but sleep until the next 3 ms is as late.
+punctuality: how often a thread of this script that does nothing but sleep until the next 3 ms is as late, and
+for how long a virtual machine's processors were given to others.
 
     python benchmarks/live_run.py BAG [BAG ...] --seconds 60 --policy predict
 """
@@ -73,14 +74,14 @@ def run(bag: Path, settings: dict[str, Any], seconds: float, listen: bool) -> di
             stack.enter_context(Listener(domain, names, depth=5000))
         while estimator.code is None and "waiting for" not in estimator.output():
             time.sleep(0.1)  # kernels are being compiled
-        before = processor_time(estimator.pid)
+        before, stolen_before = processor_time(estimator.pid), stolen_s()
         played = {"bag": str(bag), "duration_s": seconds, "wait_s": 900.0}
         driver = stack.enter_context(NodeProcess(DRIVER, played, domain, folder / "driver.log"))
         sleeper = Sleeper()
         sleeper.start()
         while driver.code is None and estimator.code is None:
             time.sleep(0.2)
-        machine = sleeper.stop()
+        machine = {**sleeper.stop(), "stolen_s": round(stolen_s() - stolen_before, 2)}
         used = processor_time(estimator.pid) - before
         if estimator.code is not None or driver.code != 0 or estimator.stop() != 0:
             raise SystemExit(f"{driver.output()}\n{estimator.output()}")
@@ -99,6 +100,15 @@ def processor_time(pid: int) -> float:
     except OSError:
         return 0.0
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
+def stolen_s() -> float:
+    """Time in s for which this virtual machine's processors had work and were not given to it (Linux), all together; 0 where nothing tells."""
+    try:
+        fields = Path("/proc/stat").read_text().split("\n", 1)[0].split()
+        return int(fields[8]) / os.sysconf("SC_CLK_TCK")
+    except (OSError, IndexError):
+        return 0.0
 
 
 def main() -> int:
@@ -133,6 +143,7 @@ def main() -> int:
         "skipped": sum(r["skipped"] for r in runs),
         "machine_late_fraction": sum(r["machine"]["late_over_3ms"] for r in runs)
         / max(sum(r["machine"]["steps"] for r in runs), 1),
+        "machine_stolen_s": round(sum(r["machine"]["stolen_s"] for r in runs), 2),
         "max_lateness_ms": max(r["lateness_ms"]["max"] for r in runs),
         "runs": runs,
     }
