@@ -144,9 +144,8 @@ class StepLoop(threading.Thread):
         self._wall = wall
         self._gather_ns = gather_ns
         self._took_steps = False
-        self._starved = (
-            False  # a step was due in this round and the estimator did not take it: it wants an input
-        )
+        # a step was due in this round and the estimator did not take it: it wants an input
+        self._starved = False
         self._pause_due = False
         self._wake = threading.Event()
         self._stopping = False

@@ -7,6 +7,7 @@ from model_cases import make_robot, make_tube, run, still
 from ctr_dynamics.errors import InputError
 from ctr_dynamics.model.model import Model
 from ctr_dynamics.model.scheme import RATE_NOW, RATES, Y_BEFORE, Y_NOW, make_scheme
+from ctr_dynamics.model.tangent import by_fields
 from ctr_dynamics.robot import load_robot
 
 ORDERS = {"backward_euler": 1, "bdf2": 2, "trapezoid": 2, "bdf_alpha": 2, "sdirk2": 2, "sdirk3": 3}
@@ -127,3 +128,18 @@ def test_default_scheme_meets_the_release_test():
     assert np.ptp(exact[:, 1]) > 0.03
     assert default <= 0.10e-3
     assert bdf2 > 1e-3
+
+
+@pytest.mark.parametrize("name", ["backward_euler", "bdf2", "trapezoid", "sdirk2", "sdirk3"])
+def test_histories_from_stage_fields_equal_those_from_rates(name):
+    scheme, rng = make_scheme(name, 0.003), np.random.default_rng(3)
+    stored = rng.standard_normal((RATES + scheme.stages, 5))  # rates behind RATES
+    fields = stored.copy()  # the stages' fields there
+    weights = by_fields(scheme.c0, scheme.weights)
+    for stage, c0 in enumerate(scheme.c0):
+        expected = scheme.weights[stage] @ stored
+        np.testing.assert_allclose(
+            weights[stage] @ fields, expected, rtol=1e-12, atol=1e-9 * abs(expected).max()
+        )
+        fields[RATES + stage] = rng.standard_normal(5)
+        stored[RATES + stage] = c0 * fields[RATES + stage] + expected
