@@ -172,7 +172,7 @@ class Estimator:
 
     @property
     def _behind(self) -> int:
-        """Steps that have been taken with other inputs than are known now."""
+        """Steps that have been taken with other inputs than are known now; 0 only where none have been."""
         assert self.t0_ns is not None
         return 0 if self._return_to is None else self.k - (self._return_to - self.t0_ns) // DT_NS
 
@@ -253,9 +253,9 @@ class Estimator:
             return self._output(k, StepResult(True, "at rest", 0, 0, 0))
         # A course that is known to be wrong says nothing of the robot: samples wait for its correction, or, where that is not soon, are
         # fused for the time being, and counted when they are fused again.
-        counters = None if self._return_to is None else self.health.of_samples()
-        before = len(self.runs.innovations)
-        result = self.runs.step(k, fuse=self._return_to is None or self._behind > SAME_COURSE)
+        behind, before = self._behind, len(self.runs.innovations)
+        counters = self.health.of_samples() if behind > SAME_COURSE else None
+        result = self.runs.step(k, fuse=behind == 0 or behind > SAME_COURSE)
         if counters is not None:
             self._recount(counters, before, [])
         self.health.sweeps += result.sweeps
@@ -329,11 +329,11 @@ class Estimator:
                     self.runs.fused = None
                     break
             self._redo_s += 0.1 * (time.perf_counter() - begin - self._redo_s)
-        reported = {i.stamp_ns for i in (*self._reported, *self.runs.innovations[:before])}
-        # samples that were counted before are not counted again
-        self._recount(
-            counters, before, [i for i in self.runs.innovations[before:] if i.stamp_ns not in reported]
-        )
+        fused = self.runs.innovations[before:]
+        if fused:
+            # samples that were counted before are not counted again
+            counted = {i.stamp_ns for i in (*self._reported, *self.runs.innovations[:before])}
+            self._recount(counters, before, [i for i in fused if i.stamp_ns not in counted])
 
     def _put_off(self, corrected: int, course: dict[int, Kept], same: bool) -> None:
         """Leave the correction at the step ``corrected``, to be gone on with from there, and return to the end of the ``course`` as it was.

@@ -71,6 +71,15 @@ def make_loop(estimator, clock, policy="predict", publish=None, gather_ns=0):
     return loop, published, errors
 
 
+def noted_waits(loop):
+    """The loop's waits (s) from here on, which end at once."""
+    waits = []
+    loop._wake = SimpleNamespace(
+        is_set=lambda: False, wait=waits.append, clear=lambda: None, set=lambda: None
+    )
+    return waits
+
+
 @pytest.fixture
 def clock():
     return SimpleNamespace(now=1_000_000 * MS)
@@ -220,10 +229,7 @@ def test_a_step_that_falls_due_during_a_correction_is_taken_at_once(clock):
         clock.now += STEP_NS  # the correction took until after the next step was due
         return steps
 
-    waits = []
-    loop._wake = SimpleNamespace(
-        is_set=lambda: False, wait=waits.append, clear=lambda: None, set=lambda: None
-    )
+    waits = noted_waits(loop)
     estimator.advance = correct
     clock.now += STEP_NS // 2
     loop._round()
@@ -239,10 +245,7 @@ def test_a_step_that_is_due_and_not_taken_is_not_asked_for_all_the_time(clock):
     estimator = Scripted(clock.now)
     loop, _, _ = make_loop(estimator, clock)
     loop._round()
-    waits = []
-    loop._wake = SimpleNamespace(
-        is_set=lambda: False, wait=waits.append, clear=lambda: None, set=lambda: None
-    )
+    waits = noted_waits(loop)
     estimator.advance = lambda now_ns=None, spare_s=None, most=None: []
     clock.now += 2 * STEP_NS
     loop._round()
