@@ -1,26 +1,39 @@
 """Memory of the estimator over a long run: a bag again and again, its stamps running on, every step encoded as the node does.
 
 Between two passes the joints move back to where the bag begins, and no tracker pose comes. One row a minute of robot time goes to standard
-output as a Markdown table: resident memory, steps, invalid steps, and how much faster than real time the minute was.
+output as a Markdown table: resident memory, steps, invalid steps, and how much faster than real time the minute was. With --live a driver
+plays the same to the estimator node over real DDS, which takes as long as it says; the table tells the node's resident memory, and behind it
+stands what the node reports of its deadlines.
 
-    python benchmarks/memory.py [BAG] --minutes 60
+    python benchmarks/memory.py [BAG] --minutes 60 [--live]
 """
 
 from __future__ import annotations
 
 import argparse
+import contextlib
+import json
 import resource
 import sys
+import tempfile
 import time
 from collections.abc import Iterator
 from pathlib import Path
 
 from ctr_dynamics.bagio.reader import InputMessage, open_bag
+from ctr_dynamics.bagio.writer import write_bag
 from ctr_dynamics.bench.fused import DT_NS
 from ctr_dynamics.cli.demo import shipped_file
 from ctr_dynamics.estimation.estimator import Estimator
+from ctr_dynamics.messages import topics
 from ctr_dynamics.messages.cdr import JointStateIn, PoseIn
-from ctr_dynamics.messages.encode import StepEncoder
+from ctr_dynamics.messages.encode import (
+    StepEncoder,
+    encode_joint_state,
+    encode_pose_stamped,
+    encode_wrench_stamped,
+)
+from ctr_dynamics.nodes.processes import DRIVER, ESTIMATOR, NodeProcess, free_domain
 from ctr_dynamics.parameters import Settings
 from ctr_dynamics.robot import load_robot
 
@@ -49,31 +62,38 @@ def endless(bag: Path) -> Iterator[InputMessage]:
             )
             stamp = last.stamp_ns + moved + since
             message = last._replace(stamp_ns=stamp, positions=positions)
-            yield InputMessage("", stamp, message)
+            yield InputMessage(topics.JOINT_STATES, stamp, message)
         moved += period
 
 
-def resident_mb() -> float:
-    """Resident memory of this process in MB (Linux)."""
-    pages = int(Path("/proc/self/statm").read_text(encoding="utf-8").split()[1])
+def serialised(item: InputMessage) -> bytes:
+    """The message of an input topic as it goes over the wire."""
+    message = item.message
+    if isinstance(message, JointStateIn):
+        return encode_joint_state(message.stamp_ns, message.names, message.positions)
+    if isinstance(message, PoseIn):
+        return encode_pose_stamped(
+            message.stamp_ns, message.frame_id, message.position, message.quaternion_xyzw
+        )
+    return encode_wrench_stamped(message.stamp_ns, message.frame_id, message.force, message.torque)
+
+
+def resident_mb(process: int | str = "self") -> float:
+    """Resident memory of a process in MB (Linux)."""
+    pages = int(Path(f"/proc/{process}/statm").read_text(encoding="utf-8").split()[1])
     return pages * resource.getpagesize() / 1e6
 
 
-def main() -> int:
-    """Run the benchmark; returns 1 when memory grows by more than the limit."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n", maxsplit=1)[0])
-    parser.add_argument("bag", nargs="?", type=Path, default=shipped_file("clean_release.mcap"))
-    parser.add_argument("--minutes", type=int, default=60)
-    parser.add_argument("--robot", default="till2020_tissue")
-    options = parser.parse_args()
-    robot, settings = load_robot(options.robot), Settings({"output.policy": "wait"})
+def replayed(bag: Path, robot_name: str, minutes: int) -> list[float]:
+    """Memory at the end of every minute of robot time, as fast as this process steps; prints the table."""
+    robot, settings = load_robot(robot_name), Settings({"output.policy": "wait"})
     estimator = Estimator(robot, settings)
     encoder = StepEncoder(settings["output.frame_id"], robot.name, settings["output.backbone_every"])
     print("| minute | resident (MB) | steps | invalid | times real time |\n|---|---|---|---|---|", flush=True)
     memory: list[float] = []
     steps = invalid = 0
     begin, end_ns = time.perf_counter(), None
-    for item in endless(options.bag):
+    for item in endless(bag):
         message = item.message
         end_ns = message.stamp_ns + MINUTE_NS if end_ns is None else end_ns
         if isinstance(message, JointStateIn):
@@ -97,8 +117,57 @@ def main() -> int:
                 flush=True,
             )
             begin, end_ns, steps, invalid = now, end_ns + MINUTE_NS, 0, 0
-            if len(memory) == options.minutes:
+            if len(memory) == minutes:
                 break
+    return memory
+
+
+def live(bag: Path, robot_name: str, minutes: int) -> list[float]:
+    """Memory of the estimator node at the end of every minute of a run over DDS; prints the table and the report of the deadlines."""
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        long, report = folder / "long.mcap", folder / "timing.json"
+        with write_bag(long, {}) as writer:
+            begin_ns = None
+            for item in endless(bag):
+                begin_ns = item.log_ns if begin_ns is None else begin_ns
+                if item.log_ns > begin_ns + minutes * MINUTE_NS:
+                    break
+                writer.write(item.topic, item.log_ns, serialised(item))
+        domain = free_domain()
+        node = {"robot": robot_name, "timing_report": str(report)}
+        played = {"bag": str(long), "wait_s": 900.0}
+        with contextlib.ExitStack() as stack:
+            estimator = stack.enter_context(NodeProcess(ESTIMATOR, node, domain, folder / "estimator.log"))
+            while estimator.code is None and "waiting for" not in estimator.output():
+                time.sleep(0.1)  # kernels are being compiled
+            driver = stack.enter_context(NodeProcess(DRIVER, played, domain, folder / "driver.log"))
+            print("| minute | resident (MB) |\n|---|---|", flush=True)
+            memory: list[float] = []
+            due = time.monotonic() + 60.0
+            while driver.code is None and estimator.code is None:
+                time.sleep(0.2)
+                if time.monotonic() > due:
+                    memory.append(resident_mb(estimator.pid))
+                    print(f"| {len(memory)} | {memory[-1]:.1f} |", flush=True)
+                    due += 60.0
+            if estimator.code is not None or driver.code != 0 or estimator.stop() != 0:
+                raise SystemExit(f"{driver.output()}\n{estimator.output()}")
+        print(f"\n{json.dumps(json.loads(report.read_text()))}")
+    return memory
+
+
+def main() -> int:
+    """Run the benchmark; returns 1 when memory grows by more than the limit."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n", maxsplit=1)[0])
+    parser.add_argument("bag", nargs="?", type=Path, default=shipped_file("clean_release.mcap"))
+    parser.add_argument("--minutes", type=int, default=60)
+    parser.add_argument("--robot", default="till2020_tissue")
+    parser.add_argument(
+        "--live", action="store_true", help="the node over DDS, in real time, instead of the library"
+    )
+    options = parser.parse_args()
+    memory = (live if options.live else replayed)(options.bag, options.robot, options.minutes)
     settled = memory[len(memory) // 6]
     growth = memory[-1] - settled
     print(f"\ngrowth after minute {len(memory) // 6 + 1}: {growth:+.1f} MB", flush=True)
