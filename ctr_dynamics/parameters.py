@@ -47,7 +47,14 @@ PARAMETERS: tuple[Parameter, ...] = (
     ),
     Parameter("filter.enabled", "bool", True, "", "Fuse the tracker; false runs the model alone."),
     Parameter(
-        "filter.rank", "int", 24, "", "Columns of the covariance's square root.", 4, 40, read_only=True
+        "filter.rank",
+        "int",
+        24,
+        "",
+        "Columns of the covariance's square root, at least; two tubes have 16, 24, 32 or 40.",
+        4,
+        40,
+        read_only=True,
     ),
     Parameter(
         "filter.gate_probability",

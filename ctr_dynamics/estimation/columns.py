@@ -13,12 +13,13 @@ from scipy.sparse import csr_array
 
 from ctr_dynamics.model.mesh import Key, Mesh, build_mesh, section_lengths
 from ctr_dynamics.model.model import Model
-from ctr_dynamics.model.newton import lanes_for
+from ctr_dynamics.model.newton import lanes_for, lanes_free
 from ctr_dynamics.model.simulator import Record, remap_columns
 from ctr_dynamics.model.tangent import linearise, theta_tangent
 from ctr_dynamics.model.transfer import Transfer, coarse_key, transfer
 
 from .kernels import position_deviations, sparse_product
+from .reduction import Change
 from .uncertainty import ModelUncertainty
 
 Floats = NDArray[np.float64]
@@ -81,7 +82,9 @@ class Columns:
     """
 
     def __init__(self, model: Model, uncertainty: ModelUncertainty, rank: int) -> None:
-        self.model, self.uncertainty, self.rank = model, uncertainty, rank
+        self.model, self.uncertainty = model, uncertainty
+        # what else would idle beside them in the sweep of the tangent carries columns too
+        self.rank = rank + lanes_free(6 + model.n + rank)
         self._effect = csr_array(uncertainty.effect)
         self._work: dict[tuple, tuple] = {}
         self._coarse: dict[Key, tuple[Key, Mesh, Transfer | None]] = {}
@@ -212,11 +215,17 @@ class Columns:
             self._deviation = self.dnodes, pi, deviation
         return self._deviation[2]
 
-    def transform(self, T: Floats) -> None:
-        """Replace the columns V by V T; those that ``theta`` alone has move no field yet."""
-        self.theta = self.theta @ T
-        T = T[: self.stored.shape[2]]
-        self.stored, self.dnodes, self.dx = self.stored @ T, self.dnodes @ T, self.dx @ T
+    def change(self, change: Change) -> None:
+        """Go over to other coefficients."""
+        self.theta = change(self.theta)
+        _, fields, columns = self.stored.shape
+        self.stored = change(self.stored.reshape(-1, columns)).reshape(2, fields, -1)
+        self.dnodes, self.dx = change(self.dnodes), change(self.dx)
+
+    def energy(self) -> Floats:
+        """(r, r) V^T W V, J."""
+        weighted = self.root_weights() * self.fields
+        return weighted.T @ weighted
 
     def snapshot(self) -> tuple:
         """What :meth:`restore` needs; references do, for the next step leaves the arrays alone and goes on with a copy."""
@@ -238,9 +247,9 @@ class Columns:
         self._lent = True
         self.theta = theta.copy()
 
-    def weights(self) -> Floats:
-        """Energy weights on the current sections."""
+    def root_weights(self) -> Floats:
+        """(fields, 1) roots of the energy norm's weights on the current sections."""
         assert self.mesh is not None
         if self.key not in self._weights:
-            self._weights[self.key] = field_weights(self.model, self.mesh, self.beta)
+            self._weights[self.key] = np.sqrt(field_weights(self.model, self.mesh, self.beta))[:, None]
         return self._weights[self.key]

@@ -14,7 +14,6 @@ from typing import NamedTuple
 import numpy as np
 from filterpy.kalman import ExtendedKalmanFilter
 from numpy.typing import NDArray
-from scipy.linalg.lapack import dpotrf, dsyevd, dtrtri
 from scipy.stats import chi2
 
 from ctr_dynamics.model.mesh import Key
@@ -23,6 +22,7 @@ from ctr_dynamics.model.simulator import Inputs, Simulator, State, StepResult
 
 from .columns import Columns
 from .kernels import fade, move_unknowns, outside
+from .reduction import reduced
 from .tip import TipWindow
 from .tracker import DELAY, DRIFT, STATES, TrackerModel, innovation
 from .tracker_kernels import fused_tip
@@ -75,18 +75,6 @@ class TipEstimate(NamedTuple):
     finite: bool
 
 
-def _roots(covariance: Floats) -> tuple[Floats, Floats]:
-    """L with L L^T = ``covariance`` (r, r), and its inverse; by eigenvectors, with a pseudo-inverse, where some direction has no spread."""
-    root, failed = dpotrf(covariance, lower=1, clean=1)
-    diagonal = root.diagonal()
-    if not failed and diagonal.min() > 1e-7 * diagonal.max():
-        return root, dtrtri(root, lower=1)[0]
-    lam, E = np.linalg.eigh(0.5 * (covariance + covariance.T))
-    lam = np.maximum(lam, 0.0)
-    inverse = np.where(lam > 1e-14 * lam.max(), 1.0 / np.sqrt(np.maximum(lam, 1e-300)), 0.0)
-    return E * np.sqrt(lam), inverse[:, None] * E.T
-
-
 class Fusion:
     """Filter of one simulated robot.
 
@@ -98,6 +86,10 @@ class Fusion:
         self.simulator, self.tracker, self.options = simulator, tracker, options
         self.model: Model = simulator.model
         self.uncertainty = model_uncertainty(self.model)
+        sigma = np.where(self.uncertainty.sigma > 0, self.uncertainty.sigma, options.force_sigma)
+        self._of_parameters = (0.1 / sigma)[
+            :, None
+        ]  # part of the norm: a tenth of the fields' for each, in units of its prior
         self.nominal = simulator.parameters.copy()
         self.columns = Columns(self.model, self.uncertainty, options.rank)
         self.theta = np.zeros(len(self.uncertainty.names))
@@ -224,30 +216,18 @@ class Fusion:
         self.pi = pi
 
     def _reduce(self) -> None:
-        """Step (3): rotate to principal columns in the energy norm, drop the weakest, and make Pi_aa the identity."""
+        """Step (3): drop the directions that are weakest in the energy norm."""
         c = self.columns
+        energy = c.energy()
         r = c.theta.shape[1]
-        sigma = np.where(self.uncertainty.sigma > 0, self.uncertainty.sigma, self.options.force_sigma)
-        V = c.fields
-        energy = V.T @ (c.weights()[:, None] * V)
-        unit = max(float(np.trace(energy)) / r, 1e-12)
-        scaled = c.theta / sigma[:, None]
-        gram = unit * 0.01 * (scaled.T @ scaled)
-        gram[: len(energy), : len(energy)] += energy
-        root, inverse_root = _roots(self.pi[:r, :r])
-        _, U, _ = dsyevd(root.T @ gram @ root)  # ascending
-        U = U[:, : -self.options.rank - 1 : -1]
-        T = root @ U  # old coefficients = T new coefficients
-        S = U.T @ inverse_root  # new = S old
-        k = U.shape[1]
-        pi = np.zeros((k + STATES, k + STATES))
-        pi[:k, :k] = np.eye(k)
-        pi[:k, k:] = S @ self.pi[:r, r:]
-        pi[k:, :k] = pi[:k, k:].T
-        pi[k:, k:] = self.pi[r:, r:]
-        self.pi = pi
-        c.transform(T)
-        self.tips.transform(T)
+        gram = np.zeros((r, r))
+        gram[: len(energy), : len(energy)] = energy
+        unit = max(float(energy.trace()) / r, 1e-12)
+        scaled = (math.sqrt(unit) * self._of_parameters) * c.theta
+        gram += scaled.T @ scaled
+        self.pi, change = reduced(self.pi, gram, c.rank)
+        c.change(change)
+        self.tips.change(change, c.theta.shape[1])
         self.unreduced = 0
 
     def forget_parameters(self) -> None:

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .kernels import interpolate_columns, shift_tips, tip_between, tip_rows
+from .reduction import Change
 
 Floats = NDArray[np.float64]
 
@@ -116,12 +117,12 @@ class TipWindow:
         if self.end >= count + 2:
             interpolate_columns(self.columns[self.end - 2 - count : self.end], count)
 
-    def transform(self, T: Floats) -> None:
-        """Replace all columns V by V T; columns that have been appended since do not move the past."""
-        old = self.columns[self.begin : self.end]
-        _, rows, r = old.shape
-        self.columns = np.empty((len(self.stamps), rows, T.shape[1]))
-        np.matmul(old.reshape(-1, r), T[:r], out=self.columns[self.begin : self.end].reshape(-1, T.shape[1]))
+    def change(self, change: Change, size: int) -> None:
+        """Go over to ``size`` other coefficients; columns that have been appended since do not move the past."""
+        old = self.columns
+        self.columns = np.empty((len(self.stamps), 12, size))
+        rows = slice(12 * self.begin, 12 * self.end)
+        change(old.reshape(-1, old.shape[2])[rows], self.columns.reshape(-1, size)[rows])
 
     def shift(self, a: Floats) -> None:
         """Move every kept tip by the columns times ``a`` (r,)."""

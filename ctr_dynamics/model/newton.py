@@ -244,6 +244,11 @@ def lanes_for(count: int) -> tuple[int, ...]:
     return () if count == 1 else (0,) * math.ceil(count / 8)
 
 
+def lanes_free(count: int) -> int:
+    """Lanes that a sweep with ``count`` lanes has beside them."""
+    return max(1, 8 * len(lanes_for(count))) - count
+
+
 def aligned_zeros(size: int) -> np.ndarray:
     """Zeros that begin with a line of the cache, so that every pack of lanes lies in one line."""
     block = np.zeros(size + PACK - 1)

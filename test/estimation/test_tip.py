@@ -8,6 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from tracker_twin import expected, residual
 
+from ctr_dynamics.estimation.reduction import through
 from ctr_dynamics.estimation.rotations import conjugate, from_vector, matrix, multiply, to_vector
 from ctr_dynamics.estimation.tip import Tip, TipWindow, tip_rows
 from ctr_dynamics.estimation.tracker import DELAY, STATES, TrackerModel, innovation
@@ -307,7 +308,7 @@ def test_window_follows_changes_of_the_columns():
     window.append(0.0, node_at(0.0), change, 0.0)
     columns = window.last.columns.copy()
     T = RNG.normal(size=(3, 2))  # the third column has been appended since: it does not move this tip
-    window.transform(T)
+    window.change(through(T), 2)
     assert np.allclose(window.last.columns, np.c_[columns, np.zeros(12)] @ T)
 
 
@@ -346,7 +347,7 @@ def test_snapshots_by_reference_are_as_good_as_copies():
             window.interpolate(int(rng.integers(window.OPEN)))
             kept.append((k, window.snapshot(), copy.deepcopy(window)))
         elif action == "reduce" and k:
-            window.transform(rng.normal(size=(COLUMNS + 3, COLUMNS)))
+            window.change(through(rng.normal(size=(COLUMNS + 3, COLUMNS))), COLUMNS)
         elif action == "shift" and k:
             window.shift(1e-3 * rng.normal(size=COLUMNS))
         elif action == "back" and len(kept) > 5:
