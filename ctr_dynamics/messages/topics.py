@@ -382,7 +382,7 @@ TOPICS: tuple[Topic, ...] = (
         "diagnostic_msgs/msg/DiagnosticArray",
         "out",
         OUTPUT_QOS,
-        "about 1 Hz, and at once when validity or the warning of a snap changes",
+        "2 Hz in the node, 1 Hz in a replay, and at once when validity or the warning of a snap changes",
         "Health of solver, timing, tracker, joints, consistency, misfit and elastic stability.",
         (
             Field("header.stamp", "model time of the step it belongs to", "s, ns"),
