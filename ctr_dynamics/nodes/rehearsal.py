@@ -11,15 +11,25 @@ from ctr_dynamics.robot import Robot
 
 START_NS = 1_000_000_000_000
 JOINT_PERIOD_NS = 10_000_000
-TICKS = 40
+TICKS = 72
+BUSY = range(40, 66)  # ticks in which there is no time for corrections, until steps have to wait for them
+PUSHED = range(
+    30, 66
+)  # ticks in which the tracker shows what the model does not explain, so that the columns follow every step
+PUSH = 4e-3  # m
 JUMP = 10.0  # times the change of a load for which a step is divided
+
+
+def _none() -> float:
+    return 0.0
 
 
 def rehearse(robot: Robot, settings: Settings) -> int:
     """Run another estimator near the robot's rest position with every kind of input; returns how many steps.
 
     The actuators turn and slide a little, a load comes and goes, and jumps once, so that each run takes a step by itself, and the tracker
-    reports the predicted tip, now and then late enough to be fused by roll-back.
+    reports the predicted tip, now and then late enough to be fused by roll-back. For a while it contradicts the model, and corrections are put off
+    for as long as they may be: memory is then what it will be at most.
     """
     estimator = Estimator(robot, settings)
     encoder = StepEncoder(settings["output.frame_id"], robot.name)
@@ -33,14 +43,18 @@ def rehearse(robot: Robot, settings: Settings) -> int:
         estimator.add_joint_state(stamp_ns, names, positions)
         force = 1e-3 * motion + (JUMP * estimator.model.load_kink[1] if tick == TICKS // 2 else 0.0)
         estimator.add_tip_load(stamp_ns, (0.0, -float(force), 0.0), (0.0, 0.0, 0.0))
-        steps_now = estimator.advance(stamp_ns + JOINT_PERIOD_NS // 2)
+        spare_s = _none if tick in BUSY else None
+        steps_now = estimator.advance(stamp_ns + JOINT_PERIOD_NS // 2, spare_s)
         steps += len(steps_now)
         for out in steps_now:
             encoder.encode(out, estimator.health.statuses)
-        estimator.use_pause()
+        if tick not in BUSY:
+            estimator.use_pause()
         if steps_now and steps_now[-1].valid:
             out = steps_now[-1]
             w, *xyz = out.predicted_quaternion_wxyz.tolist()
             age_ns = JOINT_PERIOD_NS if tick % 3 else 4 * JOINT_PERIOD_NS
-            estimator.add_tracker_pose(out.stamp_ns - age_ns, out.predicted_position.tolist(), (*xyz, w))
+            x, y, z = out.predicted_position.tolist()
+            beside = PUSH if tick in PUSHED else 0.0
+            estimator.add_tracker_pose(out.stamp_ns - age_ns, (x + beside, y, z), (*xyz, w))
     return steps

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import heapq
+from array import array
 from collections import deque
 from typing import Any
 
@@ -21,7 +22,7 @@ class Histogram:
 
     def __init__(self, bin_ns: int = 10_000, bins: int = 5000) -> None:
         self.bin_ns = bin_ns
-        self.counts = [0] * (bins + 1)  # the last one holds everything beyond
+        self.counts = array("Q", bytes(8 * (bins + 1)))  # the last one holds everything beyond
         self.count = 0
         self.max_ns = 0
 
