@@ -16,8 +16,8 @@ BUSY = range(40, 66)  # ticks in which there is no time for corrections, until s
 PUSHED = range(
     30, 66
 )  # ticks in which the tracker shows what the model does not explain, so that the columns follow every step
-PUSH = 4e-3  # m
-JUMP = 10.0  # times the change of a load for which a step is divided
+PUSH = 2e-3  # m, to and fro
+JUMP_AT, JUMP = 20, 10.0  # tick of the jump, and times the change of a load for which a step is divided
 
 
 def _none() -> float:
@@ -41,7 +41,7 @@ def rehearse(robot: Robot, settings: Settings) -> int:
         motion = 0.5 * (1.0 - math.cos(2.0 * math.pi * tick / TICKS))
         positions = [x for alpha, beta in rest for x in (alpha + 0.02 * motion, beta - 2e-4 * motion)]
         estimator.add_joint_state(stamp_ns, names, positions)
-        force = 1e-3 * motion + (JUMP * estimator.model.load_kink[1] if tick == TICKS // 2 else 0.0)
+        force = 1e-3 * motion + (JUMP * estimator.model.load_kink[1] if tick == JUMP_AT else 0.0)
         estimator.add_tip_load(stamp_ns, (0.0, -float(force), 0.0), (0.0, 0.0, 0.0))
         spare_s = _none if tick in BUSY else None
         steps_now = estimator.advance(stamp_ns + JOINT_PERIOD_NS // 2, spare_s)
@@ -55,6 +55,6 @@ def rehearse(robot: Robot, settings: Settings) -> int:
             w, *xyz = out.predicted_quaternion_wxyz.tolist()
             age_ns = JOINT_PERIOD_NS if tick % 3 else 4 * JOINT_PERIOD_NS
             x, y, z = out.predicted_position.tolist()
-            beside = PUSH if tick in PUSHED else 0.0
+            beside = PUSH * (-1) ** tick if tick in PUSHED else 0.0
             estimator.add_tracker_pose(out.stamp_ns - age_ns, (x + beside, y, z), (*xyz, w))
     return steps
