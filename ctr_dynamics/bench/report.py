@@ -49,12 +49,12 @@ def text(result: Result) -> str:
     lines += [
         "",
         "replay with fusion and the model alone beside it",
-        "nodes  rank  times real time  p50 (ms)  p99 (ms)  p99.9 (ms)  max (ms)",
+        "nodes  rank  columns  times real time  p50 (ms)  p99 (ms)  p99.9 (ms)  max (ms)",
     ]
     for r in [*result["replay"], *result["rank"]]:
         tick = r["tick_ms"]
         lines.append(
-            f"{r['nodes']:5d}  {r['rank']:4d}  {r['realtime_ratio']:15.1f}  {tick['p50']:8.2f}  {tick['p99']:8.2f}  "
+            f"{r['nodes']:5d}  {r['rank']:4d}  {r['columns']:7d}  {r['realtime_ratio']:15.1f}  {tick['p50']:8.2f}  {tick['p99']:8.2f}  "
             f"{tick['p99.9']:10.2f}  {tick['max']:8.2f}"
         )
     error = result["time_error"]
