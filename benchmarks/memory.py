@@ -168,6 +168,8 @@ def main() -> int:
     )
     options = parser.parse_args()
     memory = (live if options.live else replayed)(options.bag, options.robot, options.minutes)
+    if not memory:
+        raise SystemExit("the run ended before its first minute was over")
     settled = memory[len(memory) // 6]
     growth = memory[-1] - settled
     print(f"\ngrowth after minute {len(memory) // 6 + 1}: {growth:+.1f} MB", flush=True)

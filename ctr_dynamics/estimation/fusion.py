@@ -87,9 +87,8 @@ class Fusion:
         self.model: Model = simulator.model
         self.uncertainty = model_uncertainty(self.model)
         sigma = np.where(self.uncertainty.sigma > 0, self.uncertainty.sigma, options.force_sigma)
-        self._of_parameters = (0.1 / sigma)[
-            :, None
-        ]  # part of the norm: a tenth of the fields' for each, in units of its prior
+        # parameters in the energy norm: a tenth of the fields' mean for each, in units of its prior
+        self._of_parameters = (0.1 / sigma)[:, None]
         self.nominal = simulator.parameters.copy()
         self.columns = Columns(self.model, self.uncertainty, options.rank)
         self.theta = np.zeros(len(self.uncertainty.names))

@@ -8,6 +8,7 @@ Where Pi is too near to singular for that, the principal columns are taken.
 
 from __future__ import annotations
 
+import math
 from typing import Protocol
 
 import numpy as np
@@ -40,8 +41,10 @@ def reduced(pi: Floats, gram: Floats, rank: int) -> tuple[Floats, Change]:
     r = len(gram)
     root, failed = dpotrf(pi[:r, :r], lower=1, clean=1)
     diagonal = root.diagonal()
-    if r == rank + APPENDED and not failed and diagonal.min() > REGULAR * diagonal.max():
-        _, weakest, _, _, failed = dsyevr(root.T @ gram @ root, range="I", il=1, iu=APPENDED)
+    energy = root.T @ gram @ root
+    regular = not failed and diagonal.min() > REGULAR * diagonal.max()
+    if r == rank + APPENDED and regular and math.isfinite(energy.sum()):
+        _, weakest, _, _, failed = dsyevr(energy, range="I", il=1, iu=APPENDED)
         if not failed:
             after, *parts = without(pi, root, weakest)
 

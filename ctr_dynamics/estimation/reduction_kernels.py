@@ -15,7 +15,7 @@ def solved_for(constraints, spread):
     places (d,).
     """
     d, r = constraints.shape
-    places = np.empty(d, dtype=np.int64)
+    places = np.arange(d)
     free = spread.copy()
     for step in range(d):
         largest, row = -1.0, step

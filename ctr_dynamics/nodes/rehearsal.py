@@ -13,14 +13,13 @@ START_NS = 1_000_000_000_000
 JOINT_PERIOD_NS = 10_000_000
 TICKS = 72
 BUSY = range(40, 66)  # ticks in which there is no time for corrections, until steps have to wait for them
-PUSHED = range(
-    30, 66
-)  # ticks in which the tracker shows what the model does not explain, so that the columns follow every step
+# ticks in which the tracker shows what the model does not explain, so that the columns follow every step
+PUSHED = range(30, 66)
 PUSH = 2e-3  # m, to and fro
 JUMP_AT, JUMP = 20, 10.0  # tick of the jump, and times the change of a load for which a step is divided
 
 
-def _none() -> float:
+def _no_time() -> float:
     return 0.0
 
 
@@ -43,7 +42,7 @@ def rehearse(robot: Robot, settings: Settings) -> int:
         estimator.add_joint_state(stamp_ns, names, positions)
         force = 1e-3 * motion + (JUMP * estimator.model.load_kink[1] if tick == JUMP_AT else 0.0)
         estimator.add_tip_load(stamp_ns, (0.0, -float(force), 0.0), (0.0, 0.0, 0.0))
-        spare_s = _none if tick in BUSY else None
+        spare_s = _no_time if tick in BUSY else None
         steps_now = estimator.advance(stamp_ns + JOINT_PERIOD_NS // 2, spare_s)
         steps += len(steps_now)
         for out in steps_now:

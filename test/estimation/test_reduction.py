@@ -68,6 +68,19 @@ def test_columns_are_eliminated_where_the_covariance_is_regular_and_principal_wh
     assert excess[0] > -1e-9 * excess[-1]  # nothing is added to the covariance
 
 
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_what_is_not_finite_stays_so_and_goes_no_further(bad):
+    V, pi, weights = case(3)
+    gram = V.T @ (weights[:, None] * V)
+    gram[4, 4] = bad
+    after, change = reduced(pi, gram, RANK)
+    assert after.shape == (RANK + OTHERS,) * 2
+    assert change(V).shape == (ROWS, RANK)
+    solved = np.full((APPENDED, WIDE), np.nan)
+    places = reduction_kernels.solved_for(solved, np.ones(WIDE))
+    assert sorted(places) == list(range(APPENDED))  # no place outside the columns
+
+
 def test_nothing_is_dropped_of_columns_that_are_few():
     V, pi, weights = case(5)
     after, change = reduced(pi, V.T @ (weights[:, None] * V), WIDE)
