@@ -19,6 +19,7 @@ import sys
 import tempfile
 import threading
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -58,8 +59,14 @@ class Sleeper(threading.Thread):
         }
 
 
-def run(bag: Path, settings: dict[str, Any], seconds: float, listen: bool) -> dict[str, Any]:
-    """One bag live; the estimator's timing report with its processor time."""
+def run(
+    bag: Path,
+    settings: dict[str, Any],
+    seconds: float,
+    listen: bool,
+    watch: Callable[[int], object] = lambda pid: None,
+) -> dict[str, Any]:
+    """One bag live; the estimator's timing report with its processor time. ``watch`` is called with its process number every 0.2 s."""
     domain = free_domain()
     with tempfile.TemporaryDirectory() as name, contextlib.ExitStack() as stack:
         folder = Path(name)
@@ -81,6 +88,7 @@ def run(bag: Path, settings: dict[str, Any], seconds: float, listen: bool) -> di
         sleeper.start()
         while driver.code is None and estimator.code is None:
             time.sleep(0.2)
+            watch(estimator.pid)
         machine = {**sleeper.stop(), "stolen_s": round(stolen_s() - stolen_before, 2)}
         used = processor_time(estimator.pid) - before
         if estimator.code is not None or driver.code != 0 or estimator.stop() != 0:

@@ -11,7 +11,6 @@ stands what the node reports of its deadlines.
 from __future__ import annotations
 
 import argparse
-import contextlib
 import json
 import resource
 import sys
@@ -19,6 +18,8 @@ import tempfile
 import time
 from collections.abc import Iterator
 from pathlib import Path
+
+import live_run
 
 from ctr_dynamics.bagio.reader import InputMessage, open_bag
 from ctr_dynamics.bagio.writer import write_bag
@@ -33,7 +34,6 @@ from ctr_dynamics.messages.encode import (
     encode_pose_stamped,
     encode_wrench_stamped,
 )
-from ctr_dynamics.nodes.processes import DRIVER, ESTIMATOR, NodeProcess, free_domain
 from ctr_dynamics.parameters import Settings
 from ctr_dynamics.robot import load_robot
 
@@ -124,36 +124,28 @@ def replayed(bag: Path, robot_name: str, minutes: int) -> list[float]:
 
 def live(bag: Path, robot_name: str, minutes: int) -> list[float]:
     """Memory of the estimator node at the end of every minute of a run over DDS; prints the table and the report of the deadlines."""
-    with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
-        long, report = folder / "long.mcap", folder / "timing.json"
+    print("| minute | resident (MB) |\n|---|---|", flush=True)
+    memory: list[float] = []
+    begin: float | None = None
+
+    def watch(pid: int) -> None:
+        nonlocal begin
+        begin = time.monotonic() if begin is None else begin
+        if time.monotonic() > begin + 60.0 * (len(memory) + 1):
+            memory.append(resident_mb(pid))
+            print(f"| {len(memory)} | {memory[-1]:.1f} |", flush=True)
+
+    with tempfile.TemporaryDirectory() as folder:
+        long = Path(folder) / "long.mcap"
         with write_bag(long, {}) as writer:
-            begin_ns = None
+            end_ns = None
             for item in endless(bag):
-                begin_ns = item.log_ns if begin_ns is None else begin_ns
-                if item.log_ns > begin_ns + minutes * MINUTE_NS:
+                end_ns = item.log_ns + minutes * MINUTE_NS if end_ns is None else end_ns
+                if item.log_ns > end_ns:
                     break
                 writer.write(item.topic, item.log_ns, serialised(item))
-        domain = free_domain()
-        node = {"robot": robot_name, "timing_report": str(report)}
-        played = {"bag": str(long), "wait_s": 900.0}
-        with contextlib.ExitStack() as stack:
-            estimator = stack.enter_context(NodeProcess(ESTIMATOR, node, domain, folder / "estimator.log"))
-            while estimator.code is None and "waiting for" not in estimator.output():
-                time.sleep(0.1)  # kernels are being compiled
-            driver = stack.enter_context(NodeProcess(DRIVER, played, domain, folder / "driver.log"))
-            print("| minute | resident (MB) |\n|---|---|", flush=True)
-            memory: list[float] = []
-            due = time.monotonic() + 60.0
-            while driver.code is None and estimator.code is None:
-                time.sleep(0.2)
-                if time.monotonic() > due:
-                    memory.append(resident_mb(estimator.pid))
-                    print(f"| {len(memory)} | {memory[-1]:.1f} |", flush=True)
-                    due += 60.0
-            if estimator.code is not None or driver.code != 0 or estimator.stop() != 0:
-                raise SystemExit(f"{driver.output()}\n{estimator.output()}")
-        print(f"\n{json.dumps(json.loads(report.read_text()))}")
+        report = live_run.run(long, {"robot": robot_name}, 60.0 * minutes, listen=False, watch=watch)
+    print(f"\n{json.dumps(report)}")
     return memory
 
 

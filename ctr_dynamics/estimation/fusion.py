@@ -22,7 +22,7 @@ from ctr_dynamics.model.simulator import Inputs, Simulator, State, StepResult
 
 from .columns import Columns
 from .kernels import fade, move_unknowns, outside
-from .reduction import reduced
+from .reduction import APPENDED, reduced
 from .tip import TipWindow
 from .tracker import DELAY, DRIFT, STATES, TrackerModel, innovation
 from .tracker_kernels import fused_tip
@@ -203,7 +203,7 @@ class Fusion:
         decay2 = math.exp(-2 * steps * self.simulator.scheme.dt / self.options.force_time)
         c = self.columns
         r = c.theta.shape[1]
-        wide = r + 3
+        wide = r + APPENDED
         theta = np.zeros((len(c.theta), wide))
         theta[:, :r] = c.theta
         theta[self._force, r:] = self.force_sigma * np.eye(3)

@@ -28,7 +28,7 @@ def rehearse(robot: Robot, settings: Settings) -> int:
 
     The actuators turn and slide a little, a load comes and goes, and jumps once, so that each run takes a step by itself, and the tracker
     reports the predicted tip, now and then late enough to be fused by roll-back. For a while it contradicts the model, and corrections are put off
-    for as long as they may be: memory is then what it will be at most.
+    for as long as they may be: memory is then nearly what it will be at most.
     """
     estimator = Estimator(robot, settings)
     encoder = StepEncoder(settings["output.frame_id"], robot.name)
