@@ -18,9 +18,10 @@ from ctr_dynamics.model.simulator import Record, remap_columns
 from ctr_dynamics.model.tangent import linearise, theta_tangent
 from ctr_dynamics.model.transfer import Transfer, coarse_key, transfer
 
-from .kernels import position_deviations, sparse_product
+from .kernels import sparse_product
 from .reduction import Change
 from .uncertainty import ModelUncertainty
+from .variance_kernels import position_deviations
 
 Floats = NDArray[np.float64]
 COLUMN_NODES = 12
@@ -69,6 +70,27 @@ def field_weights(model: Model, mesh: Mesh, beta: Floats) -> Floats:
     return weights
 
 
+def energy_rows(model: Model, mesh: Mesh, beta: Floats) -> tuple[NDArray[np.int64], Floats]:
+    """Fields (k,) that the energy norm of columns is taken from, and the roots (k, 1) of their weights.
+
+    The two middle stages of a cell stand for one place, and so do the last of a cell and the first of the next: one of each two is taken,
+    with the weights of both.
+    """
+    alike: list[NDArray[np.int64]] = []
+    begin = 0
+    for cells, size in [(c, 7 + 2 * model.n) for c in mesh.sec_cells] + [(mesh.base_cells, 2)] * model.n:
+        points = np.arange(4 * cells + 1)
+        points[2::4] -= 1
+        points[3::4] += 1
+        alike.append((begin + size * points[:, None] + np.arange(size)).ravel())
+        begin += size * len(points)
+    weights = field_weights(model, mesh, beta)
+    places = np.concatenate(alike)
+    whole = np.bincount(places, weights[: len(places)])
+    rows = np.flatnonzero(whole)
+    return rows, np.sqrt(whole[rows])[:, None]
+
+
 class Columns:
     """V and its parts.
 
@@ -89,7 +111,7 @@ class Columns:
         self._work: dict[tuple, tuple] = {}
         self._coarse: dict[Key, tuple[Key, Mesh, Transfer | None]] = {}
         self.transfer: Transfer | None = None
-        self._weights: dict[tuple, Floats] = {}
+        self._weights: dict[Key, tuple[NDArray[np.int64], Floats]] = {}
         self.key: Key = ((), ())
         self.mesh: Mesh | None = None
         self.beta = np.zeros(model.n)
@@ -224,7 +246,12 @@ class Columns:
 
     def energy(self) -> Floats:
         """(r, r) V^T W V, J."""
-        weighted = self.root_weights() * self.fields
+        assert self.mesh is not None
+        if self.key not in self._weights:
+            self._weights[self.key] = energy_rows(self.model, self.mesh, self.beta)
+        rows, roots = self._weights[self.key]
+        weighted = self.fields.take(rows, axis=0)
+        weighted *= roots
         return weighted.T @ weighted
 
     def snapshot(self) -> tuple:
@@ -246,10 +273,3 @@ class Columns:
         self.key, self.mesh, self.transfer, self.beta, theta, self.stored, self.dnodes, self.dx = snapshot
         self._lent = True
         self.theta = theta.copy()
-
-    def root_weights(self) -> Floats:
-        """(fields, 1) roots of the energy norm's weights on the current sections."""
-        assert self.mesh is not None
-        if self.key not in self._weights:
-            self._weights[self.key] = np.sqrt(field_weights(self.model, self.mesh, self.beta))[:, None]
-        return self._weights[self.key]

@@ -150,15 +150,16 @@ def tip_between(a, b, a_columns, b_columns, x, dt, mean, columns):
             columns[9 + i, c] = (1 - x) * a_columns[9 + i, c] + x * b_columns[9 + i, c]
 
 
-@compiled
+@compiled_sums
 def shift_tips(columns, a, means):
     """Move tips ``means`` (tips, 13) by their columns (tips, 12, r) times ``a`` (r,)."""
     d = np.empty(12)
     for tip in range(len(means)):
         for row in range(12):
-            d[row] = 0.0
+            total = 0.0
             for c in range(len(a)):
-                d[row] += columns[tip, row, c] * a[c]
+                total += columns[tip, row, c] * a[c]
+            d[row] = total
         mean = means[tip]
         for i in range(3):
             mean[i] += d[i]
@@ -216,42 +217,6 @@ def move_unknowns(dx, a, unknowns, earlier):
             unknowns[stage, i] += shift
             for step in range(len(earlier)):
                 earlier[step, stage, i] += shift
-
-
-@compiled_sums
-def quadratic(row, pi):
-    """row pi row^T of ``row`` (r,) under ``pi`` (at least r, r)."""
-    total = 0.0
-    for i in range(len(row)):
-        product = 0.0
-        for k in range(len(row)):
-            product += pi[i, k] * row[k]
-        total += row[i] * product
-    return total
-
-
-@compiled
-def deviations(rows, pi):
-    """(rows,) roots of the variances rows pi rows^T of ``rows`` (rows, r) under ``pi`` (at least r, r)."""
-    result = np.empty(len(rows))
-    for n in range(len(rows)):
-        result[n] = math.sqrt(max(quadratic(rows[n], pi), 0.0))
-    return result
-
-
-@compiled
-def position_deviations(dnodes, size, pi):
-    """(nodes,) deviation of the position per axis in m: root of a third of the trace of its covariance under ``pi`` (at least r, r).
-
-    ``dnodes`` (nodes * size, r): columns of the node states, position first.
-    """
-    result = np.empty(len(dnodes) // size)
-    for node in range(len(result)):
-        trace = 0.0
-        for axis in range(3):
-            trace += quadratic(dnodes[node * size + axis], pi)
-        result[node] = math.sqrt(max(trace, 0.0) / 3.0)
-    return result
 
 
 @compiled_sums

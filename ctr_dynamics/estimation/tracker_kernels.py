@@ -7,15 +7,14 @@ import numpy as np
 from .kernels import (
     applied,
     compiled,
-    compiled_sums,
     conjugate,
-    deviations,
     from_vector,
     matrix,
     multiply,
     registration_error,
     to_vector,
 )
+from .variance_kernels import covariance_of
 
 
 @compiled
@@ -33,45 +32,28 @@ def registered_pose(mean, rotation, lever, bias, pose):
     return R, C, N
 
 
-@compiled_sums
-def covariance_of(rows, pi, covariance):
-    """``covariance`` (k, k) = rows pi rows^T of ``rows`` (k, s) under ``pi`` (at least s, s)."""
-    size = rows.shape[1]
-    half = np.empty(size)
-    for n in range(len(rows)):
-        for p in range(size):
-            product = 0.0
-            for q in range(size):
-                product += pi[p, q] * rows[n, q]
-            half[p] = product
-        for i in range(n + 1):
-            product = 0.0
-            for p in range(size):
-                product += rows[i, p] * half[p]
-            covariance[i, n] = covariance[n, i] = product
-
-
 @compiled
-def registered_rows(mean, columns, rotation, lever, bias, pi, pose, covariance):
+def fused_tip(mean, columns, rotation, lever, bias, pi, force_rows, pose, covariance):
     """Pose (7,) of :func:`registered_pose` and the covariance (12, 12) of pose and twist (base axes) under ``pi`` (r + 13, r + 13).
 
-    ``columns`` (12, r): of the tip. Returns False if anything is not finite.
+    ``columns`` (12, r): of the tip; ``force_rows`` (3, r): of the tip force. Returns that force's deviations (3,), and whether all is finite.
     """
     r = columns.shape[1]
-    size = r + 13
+    size = r + 9  # delay and drift are left out
     R, C, N = registered_pose(mean, rotation, lever, bias, pose)
     arm = applied(R, bias[6:9])  # extra arm beyond the nominal lever moves the pose when the tip turns
-    J = np.zeros((12, size - 4))  # delay and drift are left out
-    for c in range(r):
-        ax, ay, az = columns[3, c], columns[4, c], columns[5, c]
-        dx = columns[0, c] + ay * arm[2] - az * arm[1]
-        dy = columns[1, c] + az * arm[0] - ax * arm[2]
-        dz = columns[2, c] + ax * arm[1] - ay * arm[0]
-        for i in range(3):
-            J[i, c] = C[i, 0] * dx + C[i, 1] * dy + C[i, 2] * dz
-            J[3 + i, c] = C[i, 0] * ax + C[i, 1] * ay + C[i, 2] * az
-            J[6 + i, c] = columns[6 + i, c]
-            J[9 + i, c] = columns[9 + i, c]
+    armx, army, armz = arm[0], arm[1], arm[2]
+    J = np.zeros((15, size))
+    for i in range(3):
+        x, y, z = C[i, 0], C[i, 1], C[i, 2]
+        for c in range(r):
+            ax, ay, az = columns[3, c], columns[4, c], columns[5, c]
+            dx = columns[0, c] + ay * armz - az * army
+            dy = columns[1, c] + az * armx - ax * armz
+            dz = columns[2, c] + ax * army - ay * armx
+            J[i, c] = x * dx + y * dy + z * dz
+            J[3 + i, c] = x * ax + y * ay + z * az
+        J[6 + i, :r], J[9 + i, :r], J[12 + i, :r] = columns[6 + i], columns[9 + i], force_rows[i]
     for c in range(3):
         nx, ny, nz = N[0, c], N[1, c], N[2, c]
         J[0, r + c] = ny * pose[2] - nz * pose[1]
@@ -81,23 +63,18 @@ def registered_rows(mean, columns, rotation, lever, bias, pi, pose, covariance):
             J[3 + i, r + c] = N[i, c]
             J[i, r + 3 + c] = N[i, c]
             J[i, r + 6 + c] = C[i, 0] * R[0, c] + C[i, 1] * R[1, c] + C[i, 2] * R[2, c]
-    covariance_of(J, pi, covariance)
-    total = 0.0
-    for i in range(12):
-        for n in range(12):
-            total += covariance[i, n]
+    whole = np.empty((15, 15))
+    covariance_of(J, pi, whole)
+    covariance[:] = whole[:12, :12]
+    sigma, total = np.empty(3), 0.0
+    for i in range(3):
+        sigma[i] = math.sqrt(max(whole[12 + i, 12 + i], 0.0))
+    for i in range(15):
+        for n in range(15):
+            total += whole[i, n]
     for i in range(7):
         total += pose[i]
-    return np.isfinite(total)
-
-
-@compiled
-def fused_tip(mean, columns, rotation, lever, bias, pi, force_rows, pose, covariance):
-    """As :func:`registered_rows`; returns the deviations (3,) of the tip force, whose columns are ``force_rows`` (3, r), and whether all is
-    finite."""
-    finite = registered_rows(mean, columns, rotation, lever, bias, pi, pose, covariance)
-    sigma = deviations(force_rows, pi)
-    return sigma, finite and np.isfinite(sigma.sum())
+    return sigma, np.isfinite(total)
 
 
 @compiled

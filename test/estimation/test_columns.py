@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.optimize import curve_fit
 
-from ctr_dynamics.estimation.columns import Columns
+from ctr_dynamics.estimation.columns import Columns, energy_rows, field_weights
 from ctr_dynamics.estimation.modes import MOST_KEPT, ModeTracker, modal_basis
 from ctr_dynamics.estimation.uncertainty import bias_sigma, model_uncertainty
 from ctr_dynamics.model.mesh import build_mesh
@@ -123,7 +123,7 @@ def test_columns_follow_finite_differences_of_the_simulation(robot, nodes, every
     columns.start(start.key, start.mesh, BETA, ALPHA, par, start.unknowns[-1])
     for record in records[every - 1 :: every]:
         assert columns.propagate(record, model.parameters, behind=(every - 1) * DT)
-    weight = columns.root_weights()[:, 0] ** 2
+    weight = field_weights(model, columns.mesh, BETA)
     for name in (
         "youngs_modulus.tube1",
         "precurvature.tube2",
@@ -153,6 +153,23 @@ def test_columns_follow_finite_differences_of_the_simulation(robot, nodes, every
         tip = columns.dnodes[-model_rows(model) :, i][:3]
         shift = ends[0].nodes[-1, :3] - ends[1].nodes[-1, :3]
         assert np.linalg.norm(tip - shift) < 0.05 * np.linalg.norm(shift) + 1e-7, name
+
+
+def test_energy_is_that_of_all_points(model):
+    """Half of the points stand for all: the others lie in the same places and carry nearly the same."""
+    unc = model_uncertainty(model)
+    start, _, records = simulated(model, model.parameters, (0.0, 0.0), 3)
+    columns = Columns(model, unc, rank=24)
+    columns.start(start.key, start.mesh, BETA, ALPHA, model.parameters, start.unknowns[-1])
+    for record in records:
+        assert columns.propagate(record, model.parameters)
+    weights = field_weights(model, columns.mesh, BETA)
+    rows, roots = energy_rows(model, columns.mesh, BETA)
+    assert len(rows) < 0.6 * np.count_nonzero(weights)
+    assert (roots**2).sum() == pytest.approx(weights.sum(), rel=1e-12)
+    wanted = columns.fields.T @ (weights[:, None] * columns.fields)
+    scale = np.sqrt(np.outer(wanted.diagonal(), wanted.diagonal()))
+    np.testing.assert_array_less(np.abs(columns.energy() - wanted), 1e-2 * scale + 1e-30)
 
 
 def model_rows(model):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.sparse import random_array
 
-from ctr_dynamics.estimation import kernels, rotations
+from ctr_dynamics.estimation import kernels, rotations, variance_kernels
 
 RNG = np.random.default_rng(3)
 
@@ -15,15 +15,27 @@ def covariance(size):
 
 
 @pytest.mark.parametrize("r", [1, 5, 16])
-def test_variances_are_those_of_the_columns(r):
-    rows, pi = RNG.normal(size=(3, r)), covariance(r + 13)
-    np.testing.assert_allclose(
-        kernels.deviations(rows, pi) ** 2, np.diag(rows @ pi[:r, :r] @ rows.T), rtol=1e-12
-    )
-    states = RNG.normal(size=(4, 22, r))
+@pytest.mark.parametrize("count", [3, 8, 15])
+def test_variances_are_those_of_the_columns(r, count):
+    """Rows fill packs of eight, or not; coefficients are summed four at a time, or not."""
+    rows, pi = RNG.normal(size=(count, r)), covariance(r + 13)
+    wanted, found = rows @ pi[:r, :r] @ rows.T, np.empty((count, count))
+    variance_kernels.covariance_of(rows, pi, found)
+    np.testing.assert_allclose(found, wanted, rtol=1e-12, atol=1e-12 * np.abs(wanted).max())
+    np.testing.assert_array_equal(found, found.T)
+    np.testing.assert_allclose(variance_kernels.variances(rows, pi), np.diag(wanted), rtol=1e-12)
+    rows[-1, -1] = np.nan
+    assert np.isnan(variance_kernels.variances(rows, pi)[-1])
+    variance_kernels.covariance_of(rows, pi, found)
+    assert np.isnan(found[-1]).all()
+
+
+def test_position_deviations_are_those_of_the_columns():
+    r = 5
+    states, pi = RNG.normal(size=(4, 22, r)), covariance(r + 13)
     wanted = [np.sqrt(np.trace(node[:3] @ pi[:r, :r] @ node[:3].T) / 3) for node in states]
-    np.testing.assert_allclose(kernels.position_deviations(states.reshape(-1, r), 22, pi), wanted, rtol=1e-12)
-    assert np.isnan(kernels.quadratic(np.full(r, np.nan), pi))
+    found = variance_kernels.position_deviations(states.reshape(-1, r), 22, pi)
+    np.testing.assert_allclose(found, wanted, rtol=1e-12)
 
 
 def test_columns_that_were_skipped_lie_between_their_neighbours():

@@ -12,7 +12,7 @@ from ctr_dynamics.estimation.reduction import through
 from ctr_dynamics.estimation.rotations import conjugate, from_vector, matrix, multiply, to_vector
 from ctr_dynamics.estimation.tip import Tip, TipWindow, tip_rows
 from ctr_dynamics.estimation.tracker import DELAY, STATES, TrackerModel, innovation
-from ctr_dynamics.estimation.tracker_kernels import fused_tip, registered_rows
+from ctr_dynamics.estimation.tracker_kernels import fused_tip
 
 RNG = np.random.default_rng(11)
 COLUMNS, STEP = 5, 1e-6
@@ -21,6 +21,9 @@ COLUMNS, STEP = 5, 1e-6
 def random_unit():
     q = RNG.normal(size=4)
     return q / np.linalg.norm(q)
+
+
+NO_FORCE = np.zeros((3, COLUMNS))
 
 
 def random_tip():
@@ -138,7 +141,9 @@ def test_registered_pose_and_covariance_equal_finite_differences():
         at = moved(tip, a)
         mean = np.concatenate([at.position, at.quaternion, at.velocity, at.rate])
         pose, covariance = np.empty(7), np.empty((12, 12))
-        finite = registered_rows(mean, tip.columns, tracker.rotation, tracker.lever, b, pi, pose, covariance)
+        _, finite = fused_tip(
+            mean, tip.columns, tracker.rotation, tracker.lever, b, pi, NO_FORCE, pose, covariance
+        )
         assert finite
         return pose, covariance
 
@@ -167,9 +172,8 @@ def test_registered_pose_is_what_a_perfect_tracker_with_nominal_geometry_sees():
     position, quaternion = tracker.to_base(*expected(tracker, bias, tip))
     pose, covariance = np.empty(7), np.empty((12, 12))
     mean = np.concatenate([tip.position, tip.quaternion, tip.velocity, tip.rate])
-    registered_rows(
-        mean, tip.columns, tracker.rotation, tracker.lever, bias, np.eye(COLUMNS + STATES), pose, covariance
-    )
+    pi = np.eye(COLUMNS + STATES)
+    fused_tip(mean, tip.columns, tracker.rotation, tracker.lever, bias, pi, NO_FORCE, pose, covariance)
     assert np.allclose(pose[:3], position, atol=1e-12)
     assert np.allclose(matrix(pose[3:]), matrix(quaternion), atol=1e-12)
 
@@ -180,9 +184,10 @@ def test_what_is_not_finite_is_noticed():
     pose, covariance = np.empty(7), np.empty((12, 12))
     pi = np.eye(COLUMNS + STATES)
     pi[0, 0] = np.nan
-    assert not registered_rows(
-        mean, tip.columns, tracker.rotation, tracker.lever, np.zeros(STATES), pi, pose, covariance
-    )
+    none = np.zeros(STATES)
+    assert not fused_tip(
+        mean, tip.columns, tracker.rotation, tracker.lever, none, pi, NO_FORCE, pose, covariance
+    )[1]
 
 
 def test_the_published_tip_comes_with_the_deviation_of_the_force():
@@ -191,12 +196,10 @@ def test_the_published_tip_comes_with_the_deviation_of_the_force():
     rng = np.random.default_rng(5)
     root = rng.normal(size=(COLUMNS + STATES, COLUMNS + STATES))
     pi, force_rows = root @ root.T, rng.normal(size=(3, COLUMNS))
-    plain, whole = (np.empty(7), np.empty((12, 12))), (np.empty(7), np.empty((12, 12)))
+    whole = np.empty(7), np.empty((12, 12))
     given = (mean, tip.columns, tracker.rotation, tracker.lever, bias, pi)
-    assert registered_rows(*given, *plain)
     sigma, finite = fused_tip(*given, force_rows, *whole)
     assert finite
-    assert all(np.array_equal(a, b) for a, b in zip(plain, whole, strict=True))
     assert np.allclose(sigma**2, np.diag(force_rows @ pi[:COLUMNS, :COLUMNS] @ force_rows.T))
     assert not fused_tip(*given, force_rows * np.nan, *whole)[1]
 
