@@ -251,7 +251,8 @@ def test_joints_that_are_wrong_for_a_while_beside_a_tracker_that_is_not(bag, tur
     assert all(out.valid for out, t in zip(run.outputs, run.t, strict=True) if t > since)
     error, _ = truth_error(run, bag, "p_trk", since)
     assert np.sqrt(np.mean(np.sum(error**2, axis=1))) < 6e-3  # m; 7 and 28 mm where readings were shut out
-    assert run.estimator.health.dropped == 0
+    health = run.estimator.health
+    assert health.dropped <= health.restarts  # a new start knows no tip of the moment before
 
 
 def test_joints_that_stay_out_of_range():
