@@ -16,7 +16,7 @@ import resource
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import live_run
@@ -27,7 +27,7 @@ from ctr_dynamics.bench.fused import DT_NS
 from ctr_dynamics.cli.demo import shipped_file
 from ctr_dynamics.estimation.estimator import Estimator
 from ctr_dynamics.messages import topics
-from ctr_dynamics.messages.cdr import JointStateIn, PoseIn
+from ctr_dynamics.messages.cdr import JointStateIn, PoseIn, WrenchIn
 from ctr_dynamics.messages.encode import (
     StepEncoder,
     encode_joint_state,
@@ -43,26 +43,34 @@ LIMIT = 0.01  # of the memory after a sixth of the time: growth allowed from the
 
 
 def endless(bag: Path) -> Iterator[InputMessage]:
-    """Messages of the bag in passes; stamps and log times are moved on by the same amount."""
+    """Messages of the bag in passes; stamps and log times are moved on by the same amount. Between them joints and load are led back."""
     items = [item for item in open_bag(bag).inputs() if item.message.stamp_ns > 0]
     joints = [item.message for item in items if isinstance(item.message, JointStateIn)]
+    loads = [item.message for item in items if isinstance(item.message, WrenchIn)]
     first, last = joints[0], joints[-1]
     period = last.stamp_ns - first.stamp_ns + RETURN_NS
     target = dict(zip(first.names, first.positions, strict=True))
     moved = 0
+
+    def between(a: Sequence[float], b: Sequence[float], share: float) -> tuple[float, ...]:
+        return tuple((1.0 - share) * x + share * y for x, y in zip(a, b, strict=True))
+
     while True:
         for item in items:
             message = item.message._replace(stamp_ns=item.message.stamp_ns + moved)
             yield item._replace(log_ns=item.log_ns + moved, message=message)
         for since in range(JOINTS_NS, RETURN_NS, JOINTS_NS):
             share = since / RETURN_NS
-            positions = tuple(
-                (1.0 - share) * position + share * target[name]
-                for name, position in zip(last.names, last.positions, strict=True)
-            )
+            positions = between(last.positions, [target[name] for name in last.names], share)
             stamp = last.stamp_ns + moved + since
             message = last._replace(stamp_ns=stamp, positions=positions)
             yield InputMessage(topics.JOINT_STATES, stamp, message)
+            if loads:
+                a, b = loads[-1], loads[0]
+                force, torque = between(a.force, b.force, share), between(a.torque, b.torque, share)
+                yield InputMessage(
+                    topics.TIP_LOAD, stamp, a._replace(stamp_ns=stamp, force=force, torque=torque)
+                )
         moved += period
 
 
