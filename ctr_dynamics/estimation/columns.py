@@ -203,17 +203,15 @@ class Columns:
                     (len(big[8]) // L, columns),
                 )  # fmt: skip
             lanes, big, work, inverse, shape = self._work[work_key]
-            if self._lent:
-                self.stored = self.stored.copy()
-                self._lent = False
+            stored = np.empty_like(self.stored) if self._lent else self.stored
             dx, dnodes = np.empty((m, columns)), np.empty(shape)
             ok = theta_tangent(
                 model.tubes, lanes, mesh, record.scheme.dt + behind, par.copy(), record.inputs[-1], record.found[-1], after,
-                rate, dpar, EPSILON, model.tangent_step, big, work, self.stored[0], self.stored[1], inverse, dx, dnodes,
+                rate, dpar, EPSILON, model.tangent_step, big, work, self.stored, stored, inverse, dx, dnodes,
             )  # fmt: skip
             if not ok:
                 return False
-            self.dx, self.dnodes = dx, dnodes
+            self.stored, self.dx, self.dnodes, self._lent = stored, dx, dnodes, False
             behind = 0.0
         return True
 

@@ -254,32 +254,13 @@ def linearise(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def theta_tangent(
-    tubes,
-    lanes,
-    mesh,
-    dt,
-    par,
-    inputs,
-    x,
-    after,
-    rate,
-    dpar,
-    epsilon,
-    perturb,
-    big,
-    work,
-    dy,
-    drate,
-    inverse,
-    dx,
-    dnodes,
-):
+def theta_tangent(tubes, lanes, mesh, dt, par, inputs, x, after, rate, dpar, epsilon, perturb, big, work, before, result, inverse,
+                  dx, dnodes):  # fmt: skip
     """Columns over one step by the one-stage theta method, linearised at the step's end: one sweep instead of one a stage.
 
     The covariance does not need the model's own time accuracy. ``after``, ``rate`` (fields,): fields and their rates at the end, ``x`` (m,) the
-    unknowns there, ``inputs`` (3N + 6,). ``dy``, ``drate`` (fields, r): columns of the fields and of their rates, advanced in place.
-    Returns False where the step's end cannot be linearised.
+    unknowns there, ``inputs`` (3N + 6,). ``before`` (2, fields, r): columns of the fields and of their rates before the step; those after it
+    go to ``result``, which may be the same array. Returns False where the step's end cannot be linearised.
     """
     hist, histb, dhist = work
     main = len(hist)
@@ -289,31 +270,15 @@ def theta_tangent(
         hist[i] = rate[i] - c0 * after[i]
     for i in range(len(histb)):
         histb[i] = rate[main + i] - c0 * after[main + i]
+    dy, drate = before[0], before[1]
     fields, columns = dy.shape
     for i in range(fields):
         for k in range(columns):
             dhist[i, k] = -c0 * dy[i, k] - ratio * drate[i, k]
     for i in range(len(inputs)):
         par[input_row(tubes, i)] = inputs[i]
-    if not linearise(
-        tubes,
-        lanes,
-        mesh,
-        c0,
-        par,
-        dpar,
-        x,
-        hist,
-        histb,
-        dhist,
-        epsilon,
-        perturb,
-        big,
-        inverse,
-        dx,
-        dy,
-        dnodes,
-    ):
+    dy, drate = result[0], result[1]
+    if not linearise(tubes, lanes, mesh, c0, par, dpar, x, hist, histb, dhist, epsilon, perturb, big, inverse, dx, dy, dnodes):  # fmt: skip
         return False
     for i in range(fields):
         for k in range(columns):
