@@ -177,7 +177,7 @@ def coverage(rows: list[dict[str, Any]], level: str) -> list[bool]:
 
 
 def table(rows: list[dict[str, Any]]) -> list[tuple[str, str, str]]:
-    """(figure, demanded, measured)."""
+    """(figure, aim, measured)."""
     by = {s: [r for r in rows if r["stratum"] == s] for s in {r["stratum"] for r in rows}}
     singles, pairs = by.get("single", []), by.get("pair", [])
     clear = [r for r in singles if r["separations"] and min(r["separations"].values()) >= 8.0]
@@ -263,7 +263,7 @@ def table(rows: list[dict[str, Any]]) -> list[tuple[str, str, str]]:
 
 def show(rows: list[dict[str, Any]], seeds: dict[str, int], wall: float | None) -> str:
     """The table as Markdown."""
-    lines = ["| figure | demanded | measured, Wilson 95 % interval |", "|---|---|---|"]
+    lines = ["| figure | aim | measured, Wilson 95 % interval |", "|---|---|---|"]
     lines += [f"| {a} | {b} | {c} |" for a, b, c in table(rows)]
     counts = {s: sum(r["stratum"] == s for r in rows) for s in seeds}
     lines.append("")

@@ -212,7 +212,14 @@ PARAMETERS: tuple[Parameter, ...] = (
         choices=("wait", "predict"),
     ),
     Parameter("output.backbone_every", "int", 11, "", "Steps per backbone path.", 1, 1000, read_only=True),
-    Parameter("output.frame_id", "str", "ctr_base", "", "Frame of every output.", read_only=True),
+    Parameter(
+        "output.frame_id",
+        "str",
+        "ctr_base",
+        "",
+        "Frame of every output, and the one that poses and loads must name (or none).",
+        read_only=True,
+    ),
     Parameter(
         "qos.subscription_reliability",
         "str",

@@ -29,7 +29,7 @@ COMMANDS = {
     "view": "Serve a bag or the live topics to Foxglove.",
     "bench": "Measure cost per step, real-time ratios and tick times.",
     "info": "Say what is in a bag: topics, rates, gaps, clock and unit problems.",
-    "warmup": "Compile every kernel into the cache.",
+    "warmup": "Compile the kernels of estimator and diagnosis into the cache.",
     "demo": "Estimator node and driver live over DDS on a shipped bag.",
 }
 

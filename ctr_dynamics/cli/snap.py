@@ -124,7 +124,9 @@ def snap(
     values: Annotated[
         list[str] | None,
         typer.Option(
-            "--set", metavar="NAME=VALUE", help="tube_coulomb, tube_viscous, epsilon, beta1; may be repeated."
+            "--set",
+            metavar="NAME=VALUE",
+            help="tube_coulomb, tube_viscous, epsilon, beta1, or a number of the robot file such as tubes[0].youngs_modulus; may be repeated.",
         ),
     ] = None,
     start: Annotated[

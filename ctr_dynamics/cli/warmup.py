@@ -1,4 +1,4 @@
-"""Compile every kernel into the cache, so that the first start of the node or of a command does not wait for it."""
+"""Compile the kernels of estimator and diagnosis into the cache, so that the first start of the node or of a command does not wait for it."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def warmup(
         typer.Option(help="Robot name or file; may be repeated. Without it: two and three tubes."),
     ] = None,
 ) -> None:
-    """Compile every kernel into the cache: estimator and diagnosis of every robot, two at a time."""
+    """Compile the kernels into the cache: estimator and diagnosis of every robot, two at a time."""
     names = robot or ["till2020_tissue", "three_tube"]
     for name in names:
         load_robot(name)

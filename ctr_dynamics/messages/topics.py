@@ -87,6 +87,7 @@ _STAMP = Field(
     "header.stamp", "model time t_k = stamp of the first complete joint state + k * 3,000,000 ns", "s, ns"
 )
 _FRAME = Field("header.frame_id", "`ctr_base` (parameter `output.frame_id`)")
+_BASE = "`ctr_base` (parameter `output.frame_id`) or empty"
 _POSITION = "position of the tip in the base frame"
 _ORIENTATION = "orientation of the tip frame in the base frame, unit quaternion in ROS order x, y, z, w"
 _NOT_INVALID = "Not published for a step whose `/ctr/estimator/valid` is false."
@@ -135,7 +136,7 @@ TOPICS: tuple[Topic, ...] = (
                 "acquisition time (parameter `tracker.delay_s` corrects a known delay)",
                 "s, ns",
             ),
-            Field("header.frame_id", "`ctr_base`; a pose in another frame is rejected"),
+            Field("header.frame_id", f"{_BASE}; a pose in another frame is rejected"),
             Field("pose.position", "position of the sensor", "m"),
             Field("pose.orientation", "orientation of the sensor, unit quaternion in ROS order x, y, z, w"),
         ),
@@ -154,7 +155,7 @@ TOPICS: tuple[Topic, ...] = (
         "Known wrench on the tip (a hung weight, a force sensor). Without this topic the known load is zero.",
         (
             Field("header.stamp", "time of the value; linear between stamps, held after the last", "s, ns"),
-            Field("header.frame_id", "`ctr_base`; the wrench is in base axes"),
+            Field("header.frame_id", f"{_BASE}; a wrench in another frame is rejected"),
             Field("wrench.force", "force on the tip, base axes", "N"),
             Field("wrench.torque", "torque about the tip point, base axes", "N m"),
         ),
@@ -224,6 +225,7 @@ TOPICS: tuple[Topic, ...] = (
         (
             "It is not the filter's prior. Its distance from the tracker shows what the simulation gets "
             "wrong.",
+            _NOT_INVALID,
         ),
     ),
     Topic(
@@ -300,6 +302,7 @@ TOPICS: tuple[Topic, ...] = (
         (
             "Modes are ordered by frequency, the slowest first. With M = len(name) / 3 the controller's "
             "state is `position[:M]` and `velocity[:M]`.",
+            "Not published before modes have been found.",
             _NOT_INVALID,
         ),
     ),

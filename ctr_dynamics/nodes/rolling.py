@@ -47,7 +47,8 @@ class RollingRecording:
                 f"record.rolling_path '{path}' is not a file in a folder that exists",
                 do="create the folder or name another file",
             )
-        self.command = f"ctr-dynamics diagnose {shlex.quote(str(self.path))} --robot {shlex.quote(robot)}"
+        named = f"{shlex.quote(str(self.path))} --robot {shlex.quote(robot)}"
+        self.command = f"ctr-dynamics diagnose {named} --output findings"
         self.written = 0
         self.error = ""
         self._span_ns = round(seconds * 1e9)

@@ -35,7 +35,7 @@ class ViewServer:
         try:
             import foxglove
         except ImportError:
-            raise InputError("the view needs foxglove-sdk", do="pip install 'ctr_dynamics[view]'") from None
+            raise InputError("the view needs foxglove-sdk", do="pip install foxglove-sdk") from None
         self.scene = Scene(robot)
         self.messages = 0
         self._context = foxglove.Context()

@@ -87,7 +87,7 @@ def test_what_cannot_be_written_is_said_and_the_thread_goes_on(made, tmp_path):
     recording.close(active=False)
     assert recording.error == ""
     status = recording.describe(Status("misfit", WARN, "misfit", {}))
-    assert f"diagnose {recording.path} --robot 'my robot.yaml'" in status.message
+    assert f"diagnose {recording.path} --robot 'my robot.yaml' --output findings" in status.message
     assert status.values["recording"] == str(recording.path)
 
 
@@ -116,7 +116,9 @@ def test_a_misfit_leaves_a_bag_that_diagnosis_reads(start, tmp_path):
 
         robot.agreeing_pose = shifted
         status = live.wait_for_status("misfit", 1, "2 times written")
-        assert f"run: ctr-dynamics diagnose {path} --robot till2020_tissue" in status.message
+        assert (
+            f"run: ctr-dynamics diagnose {path} --robot till2020_tissue --output findings" in status.message
+        )
         recording = read_recording(path, load_robot("till2020_tissue"))
         assert recording.duration > asked.duration
         assert recording.joints.shape[1] == 5
