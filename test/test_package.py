@@ -105,6 +105,9 @@ def test_sdist_and_wheel_are_complete_and_the_wheel_works(source, tmp_path):
         assert f"ctr_dynamics/config/robots/{name}.yaml" in in_sdist
         assert any(entry.endswith(f"share/ctr_dynamics/config/robots/{name}.yaml") for entry in in_wheel)
     assert "ctr_dynamics/config/estimator.yaml" in in_wheel
+    modules = {file.relative_to(ROOT).as_posix() for file in (ROOT / "ctr_dynamics").rglob("*.py")}
+    assert modules <= set(in_wheel)
+    assert modules <= set(in_sdist)
     assert not any(entry.startswith("test/") for entry in in_wheel)
     assert {"LICENSE", "package.xml", "requirements.txt", "resource/ctr_dynamics"} <= set(in_sdist)
 
