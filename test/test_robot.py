@@ -309,6 +309,8 @@ def test_number_of_further_errors_is_told(tissue):
         ("- 1\n", "is a list"),
         ("name: [\n", "not valid YAML in line 2"),
         ("name: a\nname: b\n", "key 'name' is given twice"),
+        ("name: {{ robot }}\n", "a key must be a word"),
+        ("? [a, b]\n: 1\n", "a key must be a word"),
         ("name: !!python/object:os.system x\n", "not valid YAML"),
         ("name: 2001-99-99\n", "not valid YAML"),
     ],

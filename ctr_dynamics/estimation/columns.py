@@ -25,6 +25,7 @@ from .variance_kernels import position_deviations
 
 Floats = NDArray[np.float64]
 COLUMN_NODES = 12
+MOVED = 1e-3  # m: the energy norm is renewed where a translation has changed by more
 EPSILON = 5e-9  # of one standard deviation: small against the curvature of the step, large against rounding
 
 
@@ -111,7 +112,7 @@ class Columns:
         self._work: dict[tuple, tuple] = {}
         self._coarse: dict[Key, tuple[Key, Mesh, Transfer | None]] = {}
         self.transfer: Transfer | None = None
-        self._weights: dict[Key, tuple[NDArray[np.int64], Floats]] = {}
+        self._weights: dict[Key, tuple[Floats, NDArray[np.int64], Floats]] = {}
         self.key: Key = ((), ())
         self.mesh: Mesh | None = None
         self.beta = np.zeros(model.n)
@@ -245,9 +246,10 @@ class Columns:
     def energy(self) -> Floats:
         """(r, r) V^T W V, J."""
         assert self.mesh is not None
-        if self.key not in self._weights:
-            self._weights[self.key] = energy_rows(self.model, self.mesh, self.beta)
-        rows, roots = self._weights[self.key]
+        known = self._weights.get(self.key)
+        if known is None or np.abs(known[0] - self.beta).max() > MOVED:
+            known = self._weights[self.key] = (self.beta, *energy_rows(self.model, self.mesh, self.beta))
+        _, rows, roots = known
         weighted = self.fields.take(rows, axis=0)
         weighted *= roots
         return weighted.T @ weighted

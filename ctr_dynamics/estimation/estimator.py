@@ -202,6 +202,7 @@ class Estimator:
         self.runs.clear()
         self.health.begin_anew()
         self._unjudged.clear()
+        self._reported.clear()
 
     def set_fusion(self, on: bool) -> None:
         """Use tracker samples, or let the model run alone; samples are compared all the same."""

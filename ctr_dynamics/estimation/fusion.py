@@ -113,12 +113,11 @@ class Fusion:
     def start(self, state: State, stamp: float) -> None:
         """Begin at the static equilibrium in ``state`` with the robot file's tolerances as the prior."""
         inputs = state.inputs
+        self.forget_parameters()
         pi_aa = self.columns.start(
             state.key, state.mesh, inputs.beta, inputs.alpha, self._block(inputs), state.unknowns[-1]
         )
         r = len(pi_aa)
-        self.theta[:] = 0.0
-        self._apply_theta()
         self.bias[:] = 0.0
         self.pi = np.zeros((r + STATES, r + STATES))
         self.pi[:r, :r] = pi_aa

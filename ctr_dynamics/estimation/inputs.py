@@ -105,7 +105,8 @@ class InputBuffer:
             and taken - last > self.timeout_ns
         ):
             # steps were taken with the held value: go on from there, not from a straight line over the gap
-            self.joints.add(taken, self.joints.values[-1])
+            held, _ = Signal.at(self.joints, taken, self.timeout_ns if self.predicting else 0)
+            self.joints.add(taken, held)
         kind = self.joints.add(stamp_ns, value)
         if kind == "duplicate":
             self.health.note(

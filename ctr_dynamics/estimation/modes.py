@@ -290,7 +290,13 @@ class ModeTracker:
     def _begin(self, state: State, parameters: Floats) -> None:
         now, layout = state.inputs, self.model.layout
         equilibrium = Statics(self.model, 1e-6).solve(
-            now.beta, now.alpha, now.force, now.torque, guess=state.unknowns[-1], parameters=parameters
+            now.beta,
+            now.alpha,
+            now.force,
+            now.torque,
+            guess=state.unknowns[-1],
+            parameters=parameters,
+            key=state.key,
         )
         if not equilibrium.converged or equilibrium.key != state.key:
             return

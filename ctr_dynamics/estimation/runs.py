@@ -121,10 +121,10 @@ class Runs:
         self._no_columns = np.zeros((self.alone.nodes.shape[1], 1))
         self._keep_alone_tip(t)
         for sample in self.inputs.samples:
-            sample.fused_k = None
-        while self.kept and self.kept[-1].k >= k:
-            self.kept.pop()
-        self.keep(k)
+            if sample.fused_k is not None and sample.fused_k >= k:
+                sample.fused_k = None
+        self.kept.clear()  # what was before the start does not lead to it
+        self.keep(k, always=True)
         return ""
 
     def step(self, k: int, track: Kept | None = None, *, keep: bool = True, fuse: bool = True) -> StepResult:

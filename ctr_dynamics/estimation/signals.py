@@ -43,8 +43,8 @@ class Signal:
         return "late"
 
     def forget(self, before_ns: int) -> None:
-        """Drop samples that no time from ``before_ns`` on needs."""
-        i = bisect.bisect_right(self.stamps, before_ns) - 1
+        """Drop samples that no time from ``before_ns`` on needs; two are left, for what comes after the last is on their line."""
+        i = min(bisect.bisect_right(self.stamps, before_ns) - 1, len(self.stamps) - 2)
         if i > 0:
             del self.stamps[:i], self.values[:i]
 

@@ -12,7 +12,7 @@ from numba import njit
 from numpy.typing import ArrayLike
 
 from ctr_dynamics.model.kernels import sweep
-from ctr_dynamics.model.mesh import Mesh, section_lengths
+from ctr_dynamics.model.mesh import Key, Mesh, section_lengths
 from ctr_dynamics.model.model import Model
 from ctr_dynamics.model.newton import CONVERGED, broadcast, lanes_for, solve
 from ctr_dynamics.model.workspace import lane_count
@@ -70,6 +70,7 @@ class Statics:
         guess: np.ndarray | None = None,
         end_angles: ArrayLike | None = None,
         parameters: np.ndarray | None = None,
+        key: Key | None = None,
     ) -> Equilibrium:
         """Equilibrium at beta (N,) m, alpha (N,) rad (at beta) under a wrench on tube 1's tip (N, N m, ``ctr_base``).
 
@@ -78,12 +79,13 @@ class Statics:
             end_angles: (N,) psi_L that choose the branch; without them and without a guess it is the first stable one that Newton from
                 straight tubes, continuous growth of precurvature, weight and load, or a search over end angles finds.
             parameters: (NP,) block instead of the robot file's.
+            key: of sections to keep where they fit, see :meth:`ctr_dynamics.model.model.Model.mesh`.
         Returns:
             Equilibrium
         """
         model, layout = self.model, self.model.layout
         beta = np.asarray(beta, float)
-        key, mesh = model.mesh(beta)
+        key, mesh = model.mesh(beta, key)
         par = (model.parameters if parameters is None else parameters).copy()
         par[layout["alpha"]] = alpha
         par[layout["alpha_rate"]] = 0.0

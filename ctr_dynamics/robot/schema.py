@@ -219,7 +219,7 @@ class Robot(Block):
                 return f"beta[{i}] = {b} is not finite; give a position in m"
             if b > 0:
                 return f"beta[{i}] = {b:g} m is above 0 m; tubes are held behind the base plate, beta <= 0"
-            if b + length < 0 or (i == 0 and b + length == 0):
+            if b + length <= 0:
                 return (
                     f"beta[{i}] = {b:g} m pulls the tube of {length:g} m wholly behind the base plate; "
                     f"keep it above {-length:g} m, and give metres"

@@ -1,0 +1,89 @@
+"""Starting anew, and what may be left of what was before."""
+
+import numpy as np
+import pytest
+from estimation_cases import START_NS, bag_messages, joints, play
+
+from ctr_dynamics.estimation.estimator import DT_NS
+from ctr_dynamics.model.model import Model
+from ctr_dynamics.model.statics import Statics
+from ctr_dynamics.robot import load_robot
+
+REST = np.array([1.5708, 1.5708, -0.2521, -0.1977])
+
+
+@pytest.fixture
+def running():
+    """An estimator in the middle of a bag, under `predict`."""
+    return play(bag_messages("clean_sweep", 1.0), {"output.policy": "predict"}).estimator
+
+
+def test_late_inputs_do_not_lead_back_to_before_a_new_start(running):
+    runs, k = running.runs, running.k
+    assert len(runs.kept) > 1
+    assert not runs.start(k)
+    assert [kept.k for kept in runs.kept] == [k]
+    last = running.inputs.joints.stamps[-1]
+    running.add_joint_state(last + 10_000_000, *joints(0.0, running.inputs.joints.values[-1]).content)
+    running.advance(START_NS + (k + 3) * DT_NS)
+    assert running.k >= k + 3
+    assert running.health.restarts == 0
+    assert runs.fused is not None
+
+
+def test_readings_that_were_fused_before_a_new_start_are_not_fused_again(running):
+    k = running.k
+    before = {s.stamp_ns: s.fused_k for s in running.inputs.samples if s.fused_k is not None}
+    assert before
+    running.runs.start(k)
+    after = {s.stamp_ns: s.fused_k for s in running.inputs.samples if s.fused_k is not None}
+    assert after == {stamp: at for stamp, at in before.items() if at < k}
+
+
+def test_a_new_filter_begins_with_the_parameters_of_the_file(running):
+    """Its columns belong to the robot that it goes on with, not to the one that the estimate had strayed to."""
+    fusion, state, t = running.fusion, running.runs.alone, running.k * DT_NS * 1e-9
+    columns = []
+    for strayed in (False, True):
+        fusion.forget_parameters()
+        if strayed:
+            fusion.theta[0] = fusion.uncertainty.highest[0]
+            fusion._apply_theta()
+        fusion.start(state.copy(), t)
+        columns.append(fusion.columns.stored.copy())
+    np.testing.assert_array_equal(*columns)
+
+
+def test_a_reset_forgets_which_readings_were_counted(running):
+    assert running._reported
+    running.reset()
+    assert not running._reported
+
+
+def test_after_a_gap_actuators_go_on_from_where_the_steps_had_them():
+    """Steps run on for 0.1 s by the last rate and then hold; joints that return do not find the tubes elsewhere."""
+    rate = np.array([1.0, -0.5, 0.0, 0.0])
+
+    def at(t):
+        return joints(t, REST + rate * min(t, 0.5))
+
+    moving = [at(0.01 * k) for k in range(41)]
+    run = play([*moving, *(at(0.01 * k) for k in range(80, 100))], {"output.policy": "predict"}, tick=0.003)
+    drives = run.estimator.inputs.joints
+    first = next(i for i, stamp in enumerate(drives.stamps) if stamp > START_NS + 700_000_000)
+    np.testing.assert_allclose(drives.values[first], REST + rate * 0.5, atol=1e-9)
+
+
+def test_an_equilibrium_keeps_sections_that_fit():
+    model = Model(load_robot("till2020_tissue"), nodes=12)
+    beta = REST[2:].copy()
+    key, _ = model.mesh(beta)
+    for _ in range(40):
+        beta[0] -= 1e-4
+        if model.mesh(beta)[0] != model.mesh(beta, key)[0]:
+            break
+    else:
+        pytest.fail("the sections never differ")
+    fresh, kept = (Statics(model).solve(beta, REST[:2], key=known) for known in (None, key))
+    assert (fresh.key, kept.key) == (model.mesh(beta)[0], key)
+    assert np.linalg.norm(fresh.nodes[-1, :3] - kept.nodes[-1, :3]) < 1e-6
