@@ -86,7 +86,7 @@ class _Base:
                 Finding("error", self.topic, f"{self.malformed} messages cannot be decoded ({self.fault})")
             )
         for frame, count in self.frames.items():
-            if frame != FRAME:
+            if frame and frame.lstrip("/") != FRAME:
                 found.append(
                     Finding(
                         "error",

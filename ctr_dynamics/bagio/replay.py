@@ -59,7 +59,7 @@ class StampClock:
 
     Drivers may stamp by another clock than the recorder's. The smallest difference between a joint state's
     log time and its stamp so far is taken as that of the clocks. A single stamp that is wildly off does not
-    count; three in a row do. The time given never runs backwards.
+    count; three in a row do. The time given runs backwards only then.
     """
 
     LIMIT_NS = 1_000_000_000
@@ -90,6 +90,7 @@ class StampClock:
             if self._streak >= 3:
                 self._offset_ns = offset_ns
                 self._streak = 0
+                self._now_ns = None
 
 
 def arrivals(messages: Iterator[InputMessage]) -> Iterator[list[InputMessage]]:
@@ -133,13 +134,13 @@ class Player:
         for group in arrivals(bag.inputs()):
             if until_ns is not None and group[0].log_ns > until_ns:
                 return
-            arrival_ns = self._clock.now_ns(group[0])
-            if arrival_ns is not None and now_ns is not None and arrival_ns - 1 > now_ns:
+            arrivals_ns = [self._clock.now_ns(item) for item in group]
+            if arrivals_ns[0] is not None and now_ns is not None and arrivals_ns[0] - 1 > now_ns:
                 # What a live node would have done by itself before these messages came.
-                yield from self._advance(arrival_ns - 1)
+                yield from self._advance(arrivals_ns[0] - 1)
             for item in group:
-                now_ns = self._clock.now_ns(item)
                 self._add(item)
+            now_ns = arrivals_ns[-1]
             yield from self._advance(now_ns)
         if until_ns is None:
             yield from self._timed(self.estimator.finish)
@@ -319,7 +320,7 @@ def _run(
             progress(min(1.0, (last_ns - first_ns) / span_ns) if span_ns > 0 else 1.0, steps)
     wall_s = time.perf_counter() - begin
     if steps == 0:
-        raise _no_step(bag, robot, player.joint_names, estimator.summary()["input_problems"]["joints"])
+        raise no_step(bag, robot, player.joint_names, estimator.summary()["input_problems"]["joints"])
     duration_s = (last_ns - first_ns) * 1e-9
     p50, p99, worst = np.percentile(np.array(player.times_s()) * 1e3, (50, 99, 100))
     numbers = {
@@ -373,7 +374,8 @@ def _input_notes(problems: dict[str, dict[str, Any]]) -> list[str]:
     ]
 
 
-def _no_step(bag: Bag, robot: Robot, names: set[str], problems: dict[str, Any]) -> InputError:
+def no_step(bag: Bag, robot: Robot, names: set[str], problems: dict[str, Any]) -> InputError:
+    """Why a replay of ``bag`` has had no step, from the joint ``names`` in it and the estimator's ``problems`` with them."""
     expected = ", ".join(f"tube{i}_rotation, tube{i}_translation" for i in range(1, robot.n_tubes + 1))
     found = ", ".join(sorted(names)[:12]) or "none"
     odd = "".join(f"; {note}" for note in _input_notes({"joints": problems}))

@@ -80,7 +80,7 @@ def _replay(
     server: ViewServer, bag: Path, robot: Robot, params: Path | None, assignments: list[str], speed: float
 ) -> None:
     """Inputs and the estimator's outputs of a bag, at the pace of their stamps."""
-    from ctr_dynamics.bagio.replay import Player
+    from ctr_dynamics.bagio.replay import Player, no_step
     from ctr_dynamics.estimation.estimator import Estimator
 
     settings = settings_for_replay(params, assignments, True)
@@ -90,13 +90,16 @@ def _replay(
     inputs = opened.messages({topic.name for topic in topics.INPUTS})
     pending = next(inputs, None)
     pace = Pace(speed)
-    for out in Player(estimator).play(opened):
+    player = Player(estimator)
+    for out in player.play(opened):
         pace.wait(out.stamp_ns)
         while pending is not None and pending.log_ns <= out.stamp_ns:
             server.put(pending.topic, pending.log_ns, pending.data)
             pending = next(inputs, None)
         for message in encoder.encode(out, estimator.health.statuses, estimator.health.snap_ahead):
             server.put(message.topic, message.stamp_ns, message.data)
+    if not estimator.health.steps:
+        raise no_step(opened, robot, player.joint_names, estimator.summary()["input_problems"]["joints"])
 
 
 def _live(server: ViewServer) -> None:

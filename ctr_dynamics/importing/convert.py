@@ -43,7 +43,7 @@ TOPIC_OF: dict[Kind, str] = {
 }
 RELATIVE_BELOW_S = 1_000_000  # a clock below is no system clock
 RELATIVE_START_S = 1_000_000_000  # stamps of such logs begin about here; a stamp must not be negative
-MAX_STAMP_S = 4_000_000_000  # what a ROS stamp nearly holds is 2^31 s; beyond, the unit is wrong
+MAX_STAMP_S = 2**31 - 1  # what a ROS stamp holds
 RATES_HZ = {"joints": (5.0, 5000.0), "tracker": (1.0, 2000.0), "load": (0.0, 1e5)}
 QUATERNION_LIMIT = 0.05
 
@@ -152,7 +152,7 @@ def _stamps(times: list[Decimal], source: Source, log: Log, where: str) -> list[
     if stamps[0] < 0 or stamps[-1] > MAX_STAMP_S * 10**9:
         raise InputError(
             f"stamps run from {stamps[0] * 1e-9:g} s to {stamps[-1] * 1e-9:g} s, outside 0 to {MAX_STAMP_S} s",
-            do="check the unit of time, or set start_s in the layout",
+            do="check the unit of time, or set start_s in the layout (-2082844800 for seconds since 1904, -2208988800 since 1900)",
             where=where,
         )
     if len(stamps) > 2:

@@ -23,8 +23,9 @@ from rosgraph_msgs.msg import Clock
 from ctr_dynamics.bagio.reader import RawMessage
 from ctr_dynamics.errors import InputError
 from ctr_dynamics.messages import topics
-from ctr_dynamics.messages.cdr import split_stamp
+from ctr_dynamics.messages.cdr import CdrError, split_stamp
 from ctr_dynamics.nodes import qos
+from ctr_dynamics.nodes.declaration import check_folder
 from ctr_dynamics.nodes.naming import NAMESPACE, message_class, node_topic
 from ctr_dynamics.nodes.playback import load, pace, shifted
 from ctr_dynamics.nodes.spinning import stop_on_signals
@@ -67,6 +68,7 @@ class DriverNode(Node):
                 f"reliability '{values['reliability']}' is unknown",
                 do=f"write {' or '.join(qos.RELIABILITY)}",
             )
+        check_folder("report", values["report"])
         self.messages = load(Path(values["bag"]), values["start_s"], values["duration_s"])
         profile = qos.profile(values["reliability"], values["depth"])
         present = {message.topic for message in self.messages}
@@ -105,12 +107,17 @@ class DriverNode(Node):
         start_ns = time.time_ns() + LEAD_NS
         shift_ns = 0 if self.clock_output is not None else start_ns - first_ns
         items = self._with_clock(first_ns)
-        published, worst_ns = 0, 0
+        published, left_out, worst_ns = 0, 0, 0
         for index, late_ns in pace([m.log_ns for m in items], start_ns, stop.is_set, time.time_ns):
             message = items[index]
             worst_ns = max(worst_ns, late_ns)
             if message.topic:
-                self.outputs[message.topic].publish(shifted(message.data, shift_ns))
+                try:
+                    data = shifted(message.data, shift_ns)
+                except CdrError:
+                    left_out += 1
+                    continue
+                self.outputs[message.topic].publish(data)
                 published += 1
             elif self.clock_output is not None:
                 self.clock_output.publish(message.data)
@@ -121,6 +128,7 @@ class DriverNode(Node):
             "shift_ns": shift_ns,
             "first_log_time_ns": first_ns,
             "messages": published,
+            "left_out": left_out,
             "of": len(self.messages),
             "max_lateness_ns": worst_ns,
         }
@@ -152,6 +160,8 @@ def main(args: list[str] | None = None) -> int:
                 f"published {report['messages']} of {report['of']} messages, "
                 f"at most {report['max_lateness_ns'] * 1e-6:.2f} ms late"
             )
+            if report["left_out"]:
+                node.get_logger().warning(f"{report['left_out']} messages have no usable stamp: left out")
             if node.values["report"]:
                 Path(node.values["report"]).write_text(json.dumps(report), encoding="utf-8")
             node.destroy_node()

@@ -26,7 +26,7 @@ from ctr_dynamics.messages import topics
 from ctr_dynamics.messages.cdr import CdrError, decode_joint_state, decode_pose_stamped, decode_wrench_stamped
 from ctr_dynamics.messages.encode import StepEncoder
 from ctr_dynamics.nodes import diagnostics, qos
-from ctr_dynamics.nodes.declaration import declare, watch
+from ctr_dynamics.nodes.declaration import check_folder, declare, watch
 from ctr_dynamics.nodes.memory import keep_memory
 from ctr_dynamics.nodes.naming import NAME, NAMESPACE, message_class, node_topic
 from ctr_dynamics.nodes.outputs import Outputs
@@ -55,6 +55,7 @@ class EstimatorNode(Node):
     def __init__(self) -> None:
         super().__init__(NAME, namespace=NAMESPACE, automatically_declare_parameters_from_overrides=True)
         self.settings = declare(self)
+        check_folder("timing_report", self.settings["timing_report"])
         self._robot = load_robot(self.settings["robot"])
         self._estimator = Estimator(self._robot, self.settings)
         self._prepared: tuple[Settings, set[str], Estimator | None] | None = None
@@ -64,8 +65,8 @@ class EstimatorNode(Node):
         self.timing = StepTiming(
             self.settings["output.policy"], round(self.settings["input_timeout_s"] * 1e9)
         )
-        self.recorder = self._open_recorder()
         self.rolling = self._open_rolling()
+        self.recorder = self._open_recorder()
         self._qos_faults = qos.QosFaults()
         self._undecodable: dict[str, tuple[int, str]] = {}
         self._next_diagnostics_ns = 0
@@ -343,8 +344,11 @@ class EstimatorNode(Node):
         if self.rolling is not None:
             self.rolling.close(self._estimator.health.misfit.alarm)
         path = self.settings["timing_report"]
-        if path:
-            Path(path).write_text(json.dumps(self.timing.report(), indent=1), encoding="utf-8")
+        try:
+            if path:
+                Path(path).write_text(json.dumps(self.timing.report(), indent=1), encoding="utf-8")
+        except OSError as error:
+            self.get_logger().error(f"the timing report could not be written: {error}")
         self.destroy_node()
 
 

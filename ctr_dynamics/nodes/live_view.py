@@ -17,7 +17,7 @@ from rclpy.signals import SignalHandlerOptions
 from ctr_dynamics.messages import topics
 from ctr_dynamics.nodes import qos
 from ctr_dynamics.nodes.naming import NAMESPACE, message_class
-from ctr_dynamics.nodes.spinning import make_executor
+from ctr_dynamics.nodes.spinning import make_executor, turn
 
 
 class LiveTopics:
@@ -53,7 +53,7 @@ class LiveTopics:
     def _spin(self) -> None:
         try:
             while self._context.ok():
-                self._executor.spin_until_future_complete(self._executor.create_future(), 0.1)
+                turn(self._executor)
         except ExternalShutdownException:
             pass
 

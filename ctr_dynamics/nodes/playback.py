@@ -10,7 +10,7 @@ from pathlib import Path
 from ctr_dynamics.bagio.reader import RawMessage, open_bag
 from ctr_dynamics.errors import InputError
 from ctr_dynamics.messages import topics
-from ctr_dynamics.messages.cdr import decode_stamp, split_stamp
+from ctr_dynamics.messages.cdr import CdrError, decode_stamp, split_stamp
 
 
 def load(bag: Path, start_s: float = 0.0, duration_s: float = 0.0) -> list[RawMessage]:
@@ -44,10 +44,14 @@ def shifted(data: bytes, shift_ns: int) -> bytes:
     """The serialised message with its header's stamp moved by `shift_ns`.
 
     Raises:
-        CdrError: too short to hold a header.
+        CdrError: too short to hold a header, or moved to a time that no stamp can hold.
     """
     order = "<" if data[1:2] == b"\x01" else ">"
-    stamp = struct.pack(order + "iI", *split_stamp(decode_stamp(data) + shift_ns))
+    moved_ns = decode_stamp(data) + shift_ns
+    try:
+        stamp = struct.pack(order + "iI", *split_stamp(moved_ns))
+    except struct.error:
+        raise CdrError(f"a stamp of {moved_ns * 1e-9:.0f} s is beyond 32 bits") from None
     return data[:4] + stamp + data[12:]
 
 

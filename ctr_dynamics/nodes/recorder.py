@@ -37,6 +37,8 @@ class Recorder:
     def put(self, topic: str, log_ns: int, data: bytes) -> None:
         """Have one message written; returns at once."""
         if self.error or self._queue.qsize() > self.LIMIT:
+            if not (self.dropped or self.error):
+                self._log_error(f"the disk is behind by {self.LIMIT} messages: further ones are not recorded")
             self.dropped += 1
         else:
             self._queue.put((topic, log_ns, data))
@@ -45,6 +47,8 @@ class Recorder:
         """Write what is queued, finish the file, end the thread."""
         self._queue.put(None)
         self._thread.join()
+        if self.dropped:
+            self._log_error(f"the recording lacks {self.dropped} of {self.dropped + self.written} messages")
 
     def _run(self) -> None:
         try:

@@ -17,6 +17,7 @@ from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedE
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 from rclpy.subscription import RCLError
+from rclpy.task import Future
 
 from ctr_dynamics.errors import InputError
 
@@ -64,6 +65,11 @@ def stop_on_signals() -> Iterator[Stop]:
             signal.signal(number, value)
 
 
+def turn(executor: Executor) -> None:
+    """Serve callbacks for a moment."""
+    executor.spin_until_future_complete(Future(executor=executor), POLL_S)
+
+
 def spin_until(node: Node, stop: threading.Event) -> None:
     """Serve the node's callbacks until `stop` is set or the context is shut down."""
     executor = make_executor(node.context)
@@ -71,7 +77,7 @@ def spin_until(node: Node, stop: threading.Event) -> None:
     try:
         # The plain spin() of the event-driven executor does not look at signals; short turns do.
         while not stop.is_set() and rclpy.ok(context=node.context):
-            executor.spin_until_future_complete(executor.create_future(), POLL_S)
+            turn(executor)
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
     finally:
@@ -98,6 +104,8 @@ def run_node(
         try:
             spin_until(node, stop)
         finally:
-            close(node)
-            rclpy.try_shutdown()
+            try:
+                close(node)
+            finally:
+                rclpy.try_shutdown()
     return 0

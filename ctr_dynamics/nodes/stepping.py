@@ -226,24 +226,28 @@ class StepLoop(threading.Thread):
             while self.inbox:
                 self.inbox.popleft()()
             self._advance()
+            if self._took_steps:
+                self._pause_due = True
+            if not self.estimator.correcting:
+                if self._pause_due and not self.inbox and self._pause():
+                    self._pause_due = False
+                    self.estimator.use_pause()
+            elif self._took_steps:
+                self._wake.set()  # now there is time for it
         except Exception as error:
             # The node stays up whatever a message provokes: the fault is shown, the estimator starts anew.
-            self.faults += 1
-            self.last_fault = f"{type(error).__name__}: {error}"
-            self._log_error(
-                f"fault in the stepping thread, the estimator starts anew\n{traceback.format_exc()}"
-            )
+            self._fault(error, "the estimator starts anew")
             self.reset()
-        if self._took_steps:
-            self._pause_due = True
-        if not self.estimator.correcting:
-            if self._pause_due and not self.inbox and self._pause():
-                self._pause_due = False
-                self.estimator.use_pause()
-        elif self._took_steps:
-            self._wake.set()  # now there is time for it
-        self._housekeeping(self._clock_ns(), self._pause())
+        try:
+            self._housekeeping(self._clock_ns(), self._pause())
+        except Exception as error:
+            self._fault(error, "steps go on")
         self._collect()
+
+    def _fault(self, error: Exception, what: str) -> None:
+        self.faults += 1
+        self.last_fault = f"{type(error).__name__}: {error}"
+        self._log_error(f"fault in the stepping thread, {what}\n{traceback.format_exc()}")
 
     def _pause(self) -> bool:
         """Whether there is time for what no output waits for."""

@@ -446,6 +446,8 @@ def test_stamp_clock_survives_one_wild_stamp_and_follows_a_lasting_change():
     seen = [clock.now_ns(joint_at(t + jump, t)) for t in (30_000_000, 40_000_000, 50_000_000)]
     assert seen == [30_000_000, 40_000_000, 50_000_000 + jump]
     assert clock.now_ns(joint_at(0, 60_000_000)) >= seen[-1]
+    back = [clock.now_ns(joint_at(t, t)) for t in (70_000_000, 80_000_000, 90_000_000)]
+    assert back[-1] == 90_000_000, "and back again, or steps would be due up to a time that never comes"
 
 
 def test_arrivals_are_grouped_by_log_time():

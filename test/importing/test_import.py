@@ -137,7 +137,7 @@ def test_frame_must_be_stated(logs, tmp_path, capsys):
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ("time [ms]", "time [s]", "outside 0 to 4000000000 s"),
+        ("time [ms]", "time [s]", "outside 0 to 2147483647 s"),
         ("time [ms]", "time", "unit 'none' is none of s"),
         ("tube1_rotation [deg]", "tube1_rotation [mm]", "unit 'mm' is none of rad"),
         ("tube1_rotation [deg]", "tube1_rotation", "unit 'none' is none of rad"),

@@ -146,6 +146,7 @@ def test_parameters_are_checked_when_set(start):
         ("tracker.lever_arm_m: [1.0, 2.5]", r"tracker\.lever_arm_m"),
         ("tracker.lever_arm_m: [0, 2.5, 0]", r"same type"),
         ("robot: nobody", r"'nobody'.*till2020_tissue"),
+        ("timing_report: /no/such/folder/t.json", r"timing_report '/no/such.*create the folder"),
     ],
 )
 def test_parameters_of_a_file_are_refused_with_a_clear_line(tmp_path, yaml, wanted):

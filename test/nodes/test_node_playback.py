@@ -6,7 +6,7 @@ import pytest
 from ctr_dynamics.bagio.reader import open_bag
 from ctr_dynamics.errors import InputError
 from ctr_dynamics.messages import topics
-from ctr_dynamics.messages.cdr import decode_joint_state, decode_stamp
+from ctr_dynamics.messages.cdr import CdrError, decode_joint_state, decode_stamp
 from ctr_dynamics.messages.encode import encode_joint_state, encode_pose_stamped
 from ctr_dynamics.nodes.listener import Heard
 from ctr_dynamics.nodes.live_report import Trace, compare, compare_truth, trace_of, tracker_of, truth_of
@@ -21,6 +21,13 @@ def test_shifting_moves_the_stamp_and_nothing_else():
     assert moved[:4] + moved[12:] == data[:4] + data[12:]
     big = b"\x00\x00\x00\x00" + (5).to_bytes(4, "big") + (7).to_bytes(4, "big") + data[12:]
     assert decode_stamp(shifted(big, 1_000_000_000)) == 6_000_000_007
+
+
+def test_a_stamp_that_cannot_be_moved_is_refused():
+    with pytest.raises(CdrError):
+        shifted(encode_joint_state(0, ["tube1_rotation"], [0.25])[:8], 1)
+    with pytest.raises(CdrError, match="beyond 32 bits"):
+        shifted(encode_joint_state((2**31 - 1) * 10**9, ["tube1_rotation"], [0.25]), 10**9)
 
 
 def test_a_part_of_a_bag_in_order_of_arrival(bags):

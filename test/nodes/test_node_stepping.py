@@ -204,6 +204,23 @@ def test_a_fault_is_shown_and_the_estimator_starts_anew(clock):
     assert "ZeroDivisionError" in errors[0]
 
 
+def test_faults_beside_the_steps_do_not_end_them(clock):
+    estimator = Scripted(clock.now)
+    loop, published, errors = make_loop(estimator, clock)
+
+    def fails(*_):
+        raise OSError("no room")
+
+    loop._housekeeping = estimator.use_pause = fails
+    for _ in range(2):
+        loop._round()
+        clock.now += STEP_NS
+    assert published
+    assert loop.faults == 3
+    assert estimator.resets == 1, "of the pause; diagnostics have nothing to do with the estimator"
+    assert all("no room" in error for error in errors)
+
+
 def test_corrections_are_told_how_much_time_there_is(clock):
     estimator = Scripted(clock.now)
     loop, published, _ = make_loop(estimator, clock)

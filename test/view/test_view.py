@@ -202,6 +202,12 @@ def test_view_serves_a_bag_to_foxglove(monkeypatch):
     assert codes == [0]
 
 
+def test_view_of_a_bag_that_gives_no_step_says_so(capsys):
+    pytest.importorskip("foxglove")
+    assert cli.main(["view", str(BAG), "--robot", "three_tube", "--port", "0"]) == 2
+    assert "no step was possible" in capsys.readouterr().err
+
+
 def test_view_listens_on_this_machine_only(capsys):
     pytest.importorskip("foxglove")
     with socket.create_server(("127.0.0.1", 0)) as taken:
