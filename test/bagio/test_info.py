@@ -172,6 +172,12 @@ def test_tracker(scenario, tmp_path, change, expected):
     assert expected in texts(scenario.inspect(tmp_path / "a.mcap"), topics.TRACKER_TIP)
 
 
+@pytest.mark.parametrize("frame", ["", "/ctr_base"])
+def test_frames_that_the_node_takes_are_no_fault(scenario, tmp_path, frame):
+    scenario.frame = frame
+    assert "is expected" not in texts(scenario.inspect(tmp_path / "a.mcap"), topics.TRACKER_TIP)
+
+
 @pytest.mark.parametrize(
     ("change", "expected"),
     [
