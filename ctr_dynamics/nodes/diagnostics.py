@@ -56,9 +56,14 @@ def timing_status(timing: StepTiming, faults: int, last_fault: str, withheld_beh
     return Status("timing", OK, f"{timing.steps} steps on time", values)
 
 
-def clock_status(clock: StampClock, now_ns: int, use_sim_time: bool) -> Status:
-    """Whether the stamps of the joints and the node's clock are of one time."""
-    values = {"offset (s)": f"{clock.offset_ns * 1e-9:.4f}", "use_sim_time": str(use_sim_time)}
+def clock_status(clock: StampClock, now_ns: int, use_sim_time: bool, limit_ns: int | None) -> Status:
+    """Whether the stamps of the joints and the node's clock are of one time; ``limit_ns``: age at arrival beyond which steps lack joints, if any."""
+    age_s = clock.age_ns * 1e-9
+    values = {
+        "offset (s)": f"{clock.offset_ns * 1e-9:.4f}",
+        "age at arrival (s)": f"{age_s:.4f}",
+        "use_sim_time": str(use_sim_time),
+    }
     if now_ns <= 0:
         return Status(
             "clock", WARN, "use_sim_time is set, no /clock has come; steps follow the joints", values
@@ -70,6 +75,14 @@ def clock_status(clock: StampClock, now_ns: int, use_sim_time: bool) -> Status:
             WARN,
             f"joint stamps are {abs(clock.offset_ns) * 1e-9:.3f} s {side} the node's clock, limit "
             f"{clock.limit_ns * 1e-9:g} s: steps go by the stamps; synchronise clocks or set use_sim_time",
+            values,
+        )
+    if limit_ns is not None and clock.age_ns > limit_ns:
+        return Status(
+            "clock",
+            WARN,
+            f"joint stamps are {age_s:.3f} s behind the node's clock at arrival, limit {limit_ns * 1e-9:g} s: synchronise clocks, "
+            "or raise input_timeout_s",
             values,
         )
     return Status("clock", OK, "joint stamps and the node's clock agree", values)

@@ -239,7 +239,12 @@ class EstimatorNode(Node):
             diagnostics.timing_status(
                 self.timing, self.loop.faults, self.loop.last_fault, self.outputs.withheld_behind_ns
             ),
-            diagnostics.clock_status(self.loop.stamp_clock, now_ns, self._use_sim_time),
+            diagnostics.clock_status(
+                self.loop.stamp_clock,
+                now_ns,
+                self._use_sim_time,
+                self.timing.input_timeout_ns if self.timing.policy == "predict" else None,
+            ),
             diagnostics.topics_status(self._qos_faults.by_topic, self._undecodable, self.loop.refused),
         ]
 

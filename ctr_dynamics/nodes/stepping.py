@@ -68,6 +68,9 @@ class Call:
         self.done.set()
 
 
+AGES = 100  # joint states of which the quickest tells how old stamps are at arrival
+
+
 class StampClock:
     """Time on the clock of the joint stamps, from the node's clock.
 
@@ -82,10 +85,12 @@ class StampClock:
         self.agrees = True
         self._known = False
         self._streak = 0
+        self._ages: deque[int] = deque(maxlen=AGES)
 
     def sample(self, stamp_ns: int, arrival_ns: int) -> None:
         """A joint state with that stamp arrived at that time of the node's clock."""
         offset = arrival_ns - stamp_ns
+        self._ages.append(offset)
         if self._known and abs(offset - self.offset_ns) > self.limit_ns:
             self._streak += 1
             if self._streak < 3:
@@ -98,6 +103,11 @@ class StampClock:
             offset = min(offset, self.offset_ns)
         self.offset_ns = offset
         self._known = True
+
+    @property
+    def age_ns(self) -> int:
+        """How old, by the node's clock, the stamp of the quickest of the last joint states was at its arrival."""
+        return min(self._ages, default=0)
 
     def at(self, now_ns: int) -> int:
         """The stamps' time at a time of the node's clock."""

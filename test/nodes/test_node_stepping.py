@@ -8,8 +8,8 @@ from types import SimpleNamespace
 
 import pytest
 
-from ctr_dynamics.estimation.outputs import ERROR
-from ctr_dynamics.nodes.diagnostics import topics_status
+from ctr_dynamics.estimation.outputs import ERROR, OK, WARN
+from ctr_dynamics.nodes.diagnostics import clock_status, topics_status
 from ctr_dynamics.nodes.stepping import CATCH_UP_NS, INBOX_LIMIT, STEP_NS, StampClock, StepLoop
 from ctr_dynamics.nodes.timing import Histogram, StepTiming
 
@@ -325,6 +325,18 @@ def test_stamp_clock_follows_a_foreign_clock_after_three_stamps():
         clock.sample(90_100 * MS, 90_101 * MS)
     assert clock.agrees
     assert clock.offset_ns == 0
+
+
+def test_joints_that_are_old_at_arrival_are_said_where_steps_are_without_them():
+    clock = StampClock()
+    for k in range(5):
+        clock.sample(10 * k * MS, (10 * k + 400 + k) * MS)
+    assert clock.agrees
+    status = clock_status(clock, 1, False, 100 * MS)
+    assert (status.level, clock.age_ns) == (WARN, 400 * MS)
+    assert "0.400 s behind the node's clock at arrival, limit 0.1 s" in status.message
+    assert clock_status(clock, 1, False, None).level == OK
+    assert clock_status(clock, 1, False, 500 * MS).level == OK
 
 
 def test_lateness_under_predict_is_against_the_stamp():
