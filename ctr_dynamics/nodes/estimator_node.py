@@ -186,7 +186,14 @@ class EstimatorNode(Node):
             self._note_undecodable(topics.JOINT_STATES, error)
             return
         clock = self.loop.stamp_clock
-        clock.sample(message.stamp_ns, arrival_ns)
+        if not clock.sample(message.stamp_ns, arrival_ns):
+            ahead_s = (message.stamp_ns - clock.at(arrival_ns)) * 1e-9
+            self._estimator.health.note(
+                "joints",
+                "far ahead",
+                f"stamp {ahead_s:.3f} s ahead, limit {clock.limit_ns * 1e-9:g} s; left out unless others follow",
+            )
+            return
         self.timing.arrived(message.stamp_ns, clock.at(arrival_ns))
         self._estimator.add_joint_state(message.stamp_ns, message.names, message.positions)
 

@@ -87,14 +87,14 @@ class StampClock:
         self._streak = 0
         self._ages: deque[int] = deque(maxlen=AGES)
 
-    def sample(self, stamp_ns: int, arrival_ns: int) -> None:
-        """A joint state with that stamp arrived at that time of the node's clock."""
+    def sample(self, stamp_ns: int, arrival_ns: int) -> bool:
+        """A joint state with that stamp arrived at that time of the node's clock; False where it is wildly ahead, and nothing follows it yet."""
         offset = arrival_ns - stamp_ns
         self._ages.append(offset)
         if self._known and abs(offset - self.offset_ns) > self.limit_ns:
             self._streak += 1
             if self._streak < 3:
-                return
+                return offset > self.offset_ns
         self._streak = 0
         self.agrees = abs(offset) <= self.limit_ns
         if self.agrees:
@@ -103,6 +103,7 @@ class StampClock:
             offset = min(offset, self.offset_ns)
         self.offset_ns = offset
         self._known = True
+        return True
 
     @property
     def age_ns(self) -> int:

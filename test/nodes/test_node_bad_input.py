@@ -66,7 +66,10 @@ def test_joint_states_that_cannot_be_used(start):
         live.wait_for_status("joints", 1, "duplicate stamp")
         robot.joints(time.time_ns() - 60_000_000_000)
         live.wait_for_status("joints", 1, "time ran backwards")
+        robot.joints(time.time_ns() + 3_600_000_000_000)
+        live.wait_for_status("joints", 1, "far ahead")
         assert_goes_on(live)
+        assert abs(live.stamps(topics.TIP_POSE)[-1] - time.time_ns()) < 60_000_000_000
 
 
 def test_undecodable_messages_are_counted(start):
