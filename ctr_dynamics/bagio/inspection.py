@@ -9,7 +9,7 @@ from itertools import pairwise
 from typing import Any, Literal, Protocol
 
 from ctr_dynamics.messages import cdr
-from ctr_dynamics.messages.topics import JOINT_STATES, TIP_LOAD, TRACKER_TIP
+from ctr_dynamics.messages.topics import JOINT_STATES, TIP_LOAD, TRACKER_TIP, accepts_frame
 
 FRAME = "ctr_base"
 LENGTH_LIMIT_M = 1.0  # no laboratory robot is longer
@@ -86,7 +86,7 @@ class _Base:
                 Finding("error", self.topic, f"{self.malformed} messages cannot be decoded ({self.fault})")
             )
         for frame, count in self.frames.items():
-            if frame and frame.lstrip("/") != FRAME:
+            if not accepts_frame(frame, FRAME):
                 found.append(
                     Finding(
                         "error",

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctr_dynamics.effects.setup import Setup
+from ctr_dynamics.messages.topics import accepts_frame
 
 from .signals import finite, joint_order
 
@@ -60,7 +61,7 @@ def pose_values(
     Raises:
         Unusable: another frame, numbers that are not finite, or no unit quaternion.
     """
-    if frame_id and frame_id.lstrip("/") != frame:
+    if not accepts_frame(frame_id, frame):
         raise Unusable(
             "other frame",
             f"pose in frame '{frame_id}', expected '{frame}'; register the tracker or rename its frame",
@@ -87,7 +88,7 @@ def wrench_values(
     Raises:
         Unusable: another frame, or numbers that are not finite.
     """
-    if frame_id and frame_id.lstrip("/") != frame:
+    if not accepts_frame(frame_id, frame):
         raise Unusable("other frame", f"load in frame '{frame_id}', expected '{frame}'; send it in base axes")
     if not (finite(force) and finite(torque)):
         raise Unusable(

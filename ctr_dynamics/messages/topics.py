@@ -411,3 +411,8 @@ TOPICS: tuple[Topic, ...] = (
 TOPIC: dict[str, Topic] = {topic.name: topic for topic in TOPICS}
 INPUTS: tuple[Topic, ...] = tuple(topic for topic in TOPICS if topic.direction == "in")
 OUTPUTS: tuple[Topic, ...] = tuple(topic for topic in TOPICS if topic.direction == "out")
+
+
+def accepts_frame(frame_id: str, frame: str) -> bool:
+    """Whether a message that names ``frame_id`` may be taken for one in ``frame``: that one, with a slash before it or not, or none."""
+    return not frame_id or frame_id.lstrip("/") == frame

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Callable, Sequence
-from pathlib import Path
 from typing import Any
 
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
@@ -43,19 +42,6 @@ def declare(node: Node) -> Settings:
         # The value has been checked: a whole number given for a float is a float by now.
         node.declare_parameter(name, value, _descriptor(entry, value), ignore_override=True)
     return settings
-
-
-def check_folder(name: str, path: str) -> None:
-    """Refuse the file ``path`` of the parameter ``name`` where it could not be written at the end; empty is none.
-
-    Raises:
-        InputError: its folder does not exist, or it is one itself.
-    """
-    if path and (Path(path).is_dir() or not Path(path).absolute().parent.is_dir()):
-        raise InputError(
-            f"{name} '{path}' is not a file in a folder that exists",
-            do="create the folder or name another file",
-        )
 
 
 def watch(

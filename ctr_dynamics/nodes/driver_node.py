@@ -25,10 +25,10 @@ from ctr_dynamics.errors import InputError
 from ctr_dynamics.messages import topics
 from ctr_dynamics.messages.cdr import CdrError, split_stamp
 from ctr_dynamics.nodes import qos
-from ctr_dynamics.nodes.declaration import check_folder
 from ctr_dynamics.nodes.naming import NAMESPACE, message_class, node_topic
 from ctr_dynamics.nodes.playback import load, pace, shifted
 from ctr_dynamics.nodes.spinning import stop_on_signals
+from ctr_dynamics.parameters import check_folder
 
 LEAD_NS = 500_000_000
 """From the match of the topics, as the publishers see it, to the first message: on a busy machine subscribers see it that much later."""

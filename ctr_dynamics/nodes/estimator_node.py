@@ -26,7 +26,7 @@ from ctr_dynamics.messages import topics
 from ctr_dynamics.messages.cdr import CdrError, decode_joint_state, decode_pose_stamped, decode_wrench_stamped
 from ctr_dynamics.messages.encode import StepEncoder
 from ctr_dynamics.nodes import diagnostics, qos
-from ctr_dynamics.nodes.declaration import check_folder, declare, watch
+from ctr_dynamics.nodes.declaration import declare, watch
 from ctr_dynamics.nodes.memory import keep_memory
 from ctr_dynamics.nodes.naming import NAME, NAMESPACE, message_class, node_topic
 from ctr_dynamics.nodes.outputs import Outputs
@@ -36,7 +36,7 @@ from ctr_dynamics.nodes.rolling import RollingRecording
 from ctr_dynamics.nodes.spinning import run_node
 from ctr_dynamics.nodes.stepping import StepLoop
 from ctr_dynamics.nodes.timing import StepTiming
-from ctr_dynamics.parameters import Settings
+from ctr_dynamics.parameters import Settings, check_folder
 from ctr_dynamics.robot import load_robot
 
 DIAGNOSTICS_NS = 500_000_000

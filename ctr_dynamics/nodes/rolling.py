@@ -15,6 +15,7 @@ from ctr_dynamics.bagio.writer import write_bag
 from ctr_dynamics.errors import InputError
 from ctr_dynamics.estimation.outputs import Status
 from ctr_dynamics.messages.topics import TIP_LOAD
+from ctr_dynamics.parameters import check_folder
 
 LIMIT_BYTES = 256 * 2**20  # kept in memory, whatever the rates of the inputs
 
@@ -42,11 +43,7 @@ class RollingRecording:
         log: Callable[[str], Any],
     ) -> None:
         self.path = Path(path)
-        if self.path.is_dir() or not self.path.parent.is_dir():
-            raise InputError(
-                f"record.rolling_path '{path}' is not a file in a folder that exists",
-                do="create the folder or name another file",
-            )
+        check_folder("record.rolling_path", str(self.path))
         named = f"{shlex.quote(str(self.path))} --robot {shlex.quote(robot)}"
         self.command = f"ctr-dynamics diagnose {named} --output findings"
         self.written = 0

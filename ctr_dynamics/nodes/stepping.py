@@ -90,12 +90,12 @@ class StampClock:
     def sample(self, stamp_ns: int, arrival_ns: int) -> bool:
         """A joint state with that stamp arrived at that time of the node's clock; False where it is wildly ahead, and nothing follows it yet."""
         offset = arrival_ns - stamp_ns
-        self._ages.append(offset)
         if self._known and abs(offset - self.offset_ns) > self.limit_ns:
             self._streak += 1
             if self._streak < 3:
                 return offset > self.offset_ns
         self._streak = 0
+        self._ages.append(offset)
         self.agrees = abs(offset) <= self.limit_ns
         if self.agrees:
             offset = 0
