@@ -115,11 +115,9 @@ def build_mesh(tubes: Tubes, beta: np.ndarray, key: Key, base_cells: int = 4) ->
     positions = np.array([0.0] + [s for s, _, _ in points])
     lengths = np.diff(positions)
     cells = np.array(key[1], dtype=np.int64)
-    present, active = (
-        [],
-        [next(j for j, g in enumerate(t) if beta[i] + g.end > 0.0) for i, t in enumerate(tubes)],
-    )
-    ust, remaining = [], n
+    at_plate = [next(j for j, g in enumerate(t) if beta[i] + g.end > 0.0) for i, t in enumerate(tubes)]
+    active = list(at_plate)
+    present, ust, remaining = [], [], n
     for k, (_, i, j) in enumerate(points):
         present.append(remaining)
         for cell in range(cells[k]):
@@ -138,12 +136,11 @@ def build_mesh(tubes: Tubes, beta: np.ndarray, key: Key, base_cells: int = 4) ->
     base_points = STAGES * base_cells + 1
     ust_base = np.zeros((n, base_points))
     for i, segments in enumerate(tubes):
-        behind = [g for g in segments if beta[i] + g.start < 0.0]
-        if behind:
-            ust0[i] = behind[-1].curvature(-beta[i])
-            edges = -beta[i] * np.arange(base_cells + 1) / base_cells
-            means = [_mean_twist(segments, a, b) for a, b in itertools.pairwise(edges)]
-            ust_base[i] = [*np.repeat(means, STAGES).tolist(), ust0[i, 2]]
+        # of a breakpoint just at the plate the side in front, and of a tube that begins there its beginning: a mesh serves other translations too
+        ust0[i] = segments[at_plate[i]].curvature(-beta[i])
+        edges = -beta[i] * np.arange(base_cells + 1) / base_cells
+        means = [_mean_twist(segments, a, b) for a, b in itertools.pairwise(edges)]
+        ust_base[i] = [*np.repeat(means, STAGES).tolist(), ust0[i, 2]]
     return Mesh(
         sec_cells=cells,
         sec_tubes=np.array(present, dtype=np.int64),
@@ -157,14 +154,19 @@ def build_mesh(tubes: Tubes, beta: np.ndarray, key: Key, base_cells: int = 4) ->
 
 
 def _mean_twist(segments: tuple[Segment, ...], start: float, end: float) -> float:
-    """Mean of u*_z (1/m) between two arc lengths of a tube, exact across segments, so that the twist behind the plate is."""
+    """Mean of u*_z (1/m) between two arc lengths of a tube, exact across segments, so that the twist behind the plate is.
+
+    Where they are one, u*_z there."""
+    if end <= start:
+        here = next((g for g in segments if start < g.end), segments[-1])
+        return float(here.curvature(start)[2])
     total = 0.0
     for g in segments:
         a, b = max(start, g.start) - g.start, min(end, g.end) - g.start
         if b > a:
             power = np.arange(1, g.coefficients.shape[1] + 1)
             total += float(g.coefficients[2] @ ((b**power - a**power) / power))
-    return total / (end - start) if end > start else 0.0
+    return total / (end - start)
 
 
 def point_count(mesh: Mesh) -> int:

@@ -175,6 +175,18 @@ def test_twist_of_a_torsional_precurvature_behind_the_plate_is_exact():
         assert 2 * np.arctan2(h[3], h[0]) == pytest.approx(4.0 * 0.03 - 1.0 * (-beta - 0.03), abs=1e-12)
 
 
+def test_a_mesh_made_where_a_tube_begins_at_the_plate_serves_behind_it():
+    """The same mesh holds while no breakpoint passes the plate, so it must not keep that nothing was behind."""
+    tube = make_tube(segments=((0.07, (0, 0, 4.0)), (0.1, (5.0, 0, 4.0))))
+    model = Model(make_robot([tube], [-0.05]), nodes=20)
+    assert not model.moving_precurvature
+    key, mesh = model.mesh(np.zeros(1))
+    for beta in (0.0, -0.02):
+        assert model.mesh(np.array([beta]), key)[1] is mesh
+        h = Statics(model).solve([beta], [0.0], key=key).nodes[0, 3:7]
+        assert 2 * np.arctan2(h[3], h[0]) == pytest.approx(-4.0 * beta, abs=1e-12)
+
+
 def test_convergence_in_arc_length_is_fourth_order():
     """Tip of a loaded, damped step's sections against very many nodes.
 
