@@ -60,6 +60,10 @@ def test_deviations_of_diameters_go_into_modulus_and_density(tmp_path):
     area = ((ro + step) ** 2 - ri**2) / (ro**2 - ri**2) - 1
     assert tube.youngs_modulus.relative == pytest.approx(math.hypot(0.03, bending / step * sigma), rel=1e-4)
     assert tube.density.relative == pytest.approx(area / step * sigma, rel=1e-4)
+    given = "od=2mm+-0.02mm, id=1mm, straight=100mm, E=60GPa+-3%, G=20GPa+-4%, density=6.5g/cm^3"
+    assert new(path, "--force", "--tube", given) == 0
+    shear = load_robot(path).tubes[0].shear_modulus
+    assert shear.relative == pytest.approx(math.hypot(0.04, bending / step * sigma), rel=1e-4)
 
 
 def test_prompts_ask_for_everything(tmp_path, monkeypatch, capsys):

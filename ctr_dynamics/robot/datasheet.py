@@ -254,7 +254,10 @@ def _tube(name: str, data: Mapping[str, Measured], number: int) -> dict[str, Any
         "precurvature": segments,
     }
     if "G" in data:
-        tube["shear_modulus"] = data["G"].quantity("Pa")
+        shear = data["G"]
+        tube["shear_modulus"] = Measured(
+            shear.value, shear.value * math.hypot(shear.relative, bending)
+        ).quantity("Pa")
     return tube
 
 
@@ -270,5 +273,5 @@ def robot_file_text(robot: Robot, said: Sequence[str]) -> str:
 
 ASSUMED = (
     "Assumed, not measured: friction (Till et al. 2020, Table III, 50 %), drift of the tracker (a quarter of its noise over 2 s),",
-    "direction of gravity within 0.2 deg. Deviations of the diameters are contained in those of youngs_modulus and density.",
+    "direction of gravity within 0.2 deg. Deviations of the diameters are contained in those of the moduli and of density.",
 )
