@@ -120,7 +120,9 @@ class Columns:
         self._lent = False  # whether a snapshot holds `stored`
 
     def start(self, key: tuple, mesh: Mesh, beta: Floats, alpha: Floats, par: Floats, x: Floats) -> Floats:
-        """Columns of the static equilibrium's dependence on the uncertain parameters; returns Pi_aa (r, r)."""
+        """Columns of the static equilibrium's dependence on the uncertain parameters; returns Pi_aa (r, r).
+
+        At an equilibrium that cannot be linearised (a fold) the fields' columns begin at zero and fill while the robot moves."""
         model, unc = self.model, self.uncertainty
         own, mesh, moved = self._own(key, mesh, beta)
         count = len(unc.names)
@@ -137,10 +139,11 @@ class Columns:
         scale = np.where(unc.sigma > 0, unc.sigma, 1e-3)
         dx, fields = np.zeros((m, count)), np.zeros((main + base, count))
         dnodes = np.zeros((len(big[8]) // (8 * len(lanes)), count))
-        linearise(
+        if not linearise(
             model.tubes, lanes, mesh, 0.0, par, unc.effect * scale, x, np.zeros(main), np.zeros(base),
             np.zeros((main + base, count)), 1e-4, model.tangent_step, big, np.zeros((m, m)), dx, fields, dnodes,
-        )  # fmt: skip
+        ):  # fmt: skip
+            dx[:], fields[:], dnodes[:] = 0.0, 0.0, 0.0  # some may have been written
         self.key, self.mesh, self.transfer = own, mesh, moved
         self.beta = beta.copy()
         r = self.rank

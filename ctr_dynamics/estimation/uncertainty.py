@@ -126,9 +126,9 @@ def bias_sigma(robot: Robot) -> np.ndarray:
     tracker = robot.tracker
     return np.concatenate(
         [
-            np.full(3, np.max(tracker.registration_rotation.tolerance)),
-            np.full(3, np.max(tracker.registration_translation.tolerance)),
-            np.full(3, np.max(tracker.lever_arm.tolerance)),
+            tracker.registration_rotation.tolerance,
+            tracker.registration_translation.tolerance,
+            tracker.lever_arm.tolerance,
             [tracker.delay.tolerance],
             np.full(3, tracker.noise.drift.value),
         ]

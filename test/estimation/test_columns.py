@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from scipy.optimize import curve_fit
 
+import ctr_dynamics.estimation.columns as columns_module
 from ctr_dynamics.estimation.columns import Columns, energy_rows, field_weights
 from ctr_dynamics.estimation.modes import MOST_KEPT, ModeTracker, modal_basis
 from ctr_dynamics.estimation.uncertainty import bias_sigma, model_uncertainty
@@ -87,6 +88,33 @@ def test_uncertain_parameters_are_the_robot_files(robot, model):
     biases = bias_sigma(robot)
     assert biases[3:6] == pytest.approx([2e-4] * 3)
     assert biases[9] == pytest.approx(1e-3)
+
+
+def test_every_axis_of_the_tracker_has_its_own_deviation(robot):
+    tracker = robot.tracker
+    translation = tracker.registration_translation.model_copy(update={"tolerance": (1e-4, 2e-4, 3e-3)})
+    changed = robot.model_copy(
+        update={"tracker": tracker.model_copy(update={"registration_translation": translation})}
+    )
+    assert bias_sigma(changed)[3:6].tolist() == [1e-4, 2e-4, 3e-3]
+    np.testing.assert_array_equal(
+        np.delete(bias_sigma(changed), [3, 4, 5]), np.delete(bias_sigma(robot), [3, 4, 5])
+    )
+
+
+def test_an_equilibrium_that_cannot_be_linearised_begins_without_deviation(model, monkeypatch):
+    def at_a_fold(*arguments):
+        *_, dx, fields, dnodes = arguments
+        dx[:], fields[:], dnodes[:] = np.nan, np.nan, np.nan
+        return False
+
+    monkeypatch.setattr(columns_module, "linearise", at_a_fold)
+    found = Statics(model).solve(BETA, ALPHA)
+    columns = Columns(model, model_uncertainty(model), rank=24)
+    columns.start(found.key, found.mesh, BETA, ALPHA, model.parameters, found.x)
+    assert not columns.stored.any()
+    assert not columns.dnodes.any()
+    assert columns.theta.any()
 
 
 # -- propagation --
