@@ -105,7 +105,7 @@ class Estimator:
         self, stamp_ns: int, force: Sequence[float], torque: Sequence[float], frame_id: str = ""
     ) -> None:
         """Take in a known wrench on the tip (N, N m about the tip point, ``ctr_base`` axes)."""
-        change = self.inputs.add_load(stamp_ns, force, torque, frame_id)
+        change = self.inputs.add_load(stamp_ns, force, torque, frame_id, self.k)
         if change is not None:
             from_ns, jumped = change
             self._changed(from_ns)
@@ -260,16 +260,20 @@ class Estimator:
         if counters is not None:
             self._recount(counters, before, [])
         self.health.sweeps += result.sweeps
-        if not result.ok:
-            self.health.failed(result.reason)
-            self._failures += 1
-            if self._failures >= MAX_FAILURES:
-                self._failures = 0
-                self.runs.fused = None
-                self.health.restarts += 1
-            return self._invalid(k, f"step failed: {result.reason}")
-        self._failures = 0
-        return self._output(k, result)
+        self._judge(result)
+        return self._output(k, result) if result.ok else self._invalid(k, f"step failed: {result.reason}")
+
+    def _judge(self, result: StepResult) -> None:
+        """Count a step's outcome; after too many failures in a row the model is to start anew."""
+        if result.ok:
+            self._failures = 0
+            return
+        self.health.failed(result.reason)
+        self._failures += 1
+        if self._failures >= MAX_FAILURES:
+            self._failures = 0
+            self.runs.fused = None
+            self.health.restarts += 1
 
     # -- roll-back --
 
@@ -322,13 +326,11 @@ class Estimator:
             result = self.runs.step(
                 again, course.get(again) if again < changed else None, keep=again >= covered
             )
+            self._judge(result)
+            if self.runs.fused is None:
+                break
             if not result.ok:
                 changed = 0.0
-                self.health.failed(result.reason)
-                alone_s = self.runs.alone_tips.last.stamp
-                if alone_s < seconds(again) - 1e-9:  # the model alone failed too
-                    self.runs.fused = None
-                    break
             self._redo_s += 0.1 * (time.perf_counter() - begin - self._redo_s)
         fused = self.runs.innovations[before:]
         if fused:
@@ -355,14 +357,8 @@ class Estimator:
         del self.runs.innovations[before:]
         h.return_to(counters)
         for innovation in fresh:
-            if innovation.dof:
-                h.measured(
-                    innovation.nis,
-                    innovation.dof,
-                    innovation.accepted,
-                    innovation.accepted and not innovation.reason,
-                )
-            self.runs.innovations.append(innovation)
+            h.measured(innovation)
+        self.runs.innovations.extend(fresh)
 
     # -- outputs --
 

@@ -14,7 +14,7 @@ from scipy.stats import chi2
 from ctr_dynamics.snap.stability import Stability
 
 from .misfit import MisfitMonitor
-from .outputs import ERROR, OK, WARN, Status
+from .outputs import ERROR, OK, WARN, Innovation, Status
 
 Floats = NDArray[np.float64]
 SNAP_WARNING_S = 1.0  # a snap that is nearer than this is warned of
@@ -91,22 +91,24 @@ class Health:
         self.failures += 1
         self.reasons[reason] = self.reasons.get(reason, 0) + 1
 
-    def measured(self, nis: float, dof: int, accepted: bool, within: bool) -> None:
-        """Count a tracker sample that reached the gate: fused or not, and whether it lay within."""
+    def measured(self, sample: Innovation) -> None:
+        """Count a tracker sample: how far it lies from the outputs of its time, whether it reached the gate, lay within and was fused."""
+        if sample.moment is not None and sample.fused is not None:
+            alone, fused = sample.moment.residual, sample.fused
+            self._squares = self._squares[0] + float(alone @ alone), self._squares[1] + float(fused @ fused)
+            self._compared += 1
+        if not sample.dof:
+            self.dropped += 1
+            return
         self.nis_count += 1
-        self.nis_sum += nis
-        self.nis_dof += dof
-        self.recent.append((nis / dof, within))
+        self.nis_sum += sample.nis
+        self.nis_dof += sample.dof
+        self.recent.append((sample.nis / sample.dof, sample.accepted and not sample.reason))
         self._within = sum(inside for _, inside in self.recent)
-        if accepted:
+        if sample.accepted:
             self.accepted += 1
         elif self.fusing:
             self.rejected += 1
-
-    def compared(self, alone: Floats, fused: Floats) -> None:
-        """Count a reading that lies ``alone`` (3,) and ``fused`` (3,) m from the outputs of its time."""
-        self._squares = self._squares[0] + float(alone @ alone), self._squares[1] + float(fused @ fused)
-        self._compared += 1
 
     def residual_rms(self) -> dict[str, float | None]:
         """m between readings and outputs: of the model alone, and fused where the filter is on."""

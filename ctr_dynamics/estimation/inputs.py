@@ -68,6 +68,7 @@ class InputBuffer:
         self.t0_ns: int | None = None
         self.joints = Drives(setup.n, setup.backlash, round(setup.actuator_delay * 1e9))
         self.load = Signal(6)
+        self._opening: int | None = None  # ns of the sample without load that was put before the first load
         self.samples: list[Sample] = []
         self.backwards = 0
 
@@ -169,9 +170,11 @@ class InputBuffer:
         self.health.note("tracker", kind, text)
 
     def add_load(
-        self, stamp_ns: int, force: Sequence[float], torque: Sequence[float], frame_id: str
+        self, stamp_ns: int, force: Sequence[float], torque: Sequence[float], frame_id: str, k: int
     ) -> tuple[int, bool] | None:
-        """Take in a known wrench; returns the ns from which on the load is known otherwise than before, and whether it has jumped."""
+        """Take in a known wrench after step ``k``; returns the ns from which on the load is known otherwise than before, and whether it has jumped.
+
+        One that comes beyond the window counts only where it is the newest: it acts from the oldest step on that can be taken again."""
         frame = str(self.settings["output.frame_id"])
         try:
             value = wrench_values(stamp_ns, force, torque, frame_id, frame)
@@ -179,7 +182,20 @@ class InputBuffer:
             self.health.note("load", problem.kind, problem.text)
             return None
         stamp_ns += self._load_delay_ns
-        load = self.load
+        load, taken = self.load, self.stamp(k)
+        if load.stamps and taken is not None and stamp_ns < min(load.stamps[-1], taken - self.window_ns):
+            late = (taken - stamp_ns) * 1e-9
+            self.health.note(
+                "load",
+                "too late",
+                f"load came {late:.3f} s after its stamp and after newer ones, limit {self.window_ns * 1e-9:g} s",
+            )
+            return None
+        if load.stamps[:1] == [self._opening] and stamp_ns < load.stamps[0]:
+            del load.stamps[0], load.values[0]  # it opened before a load that was taken for the first
+            first = True
+        else:
+            first = not load.stamps
         kind = load.add(stamp_ns, value)
         if kind == "duplicate":
             self.health.note(
@@ -191,9 +207,9 @@ class InputBuffer:
             return None
         i = load.stamps.index(stamp_ns)
         before = load.values[i - 1] if i else np.zeros(6)
-        if len(load.stamps) == 1:
+        if first:
             self._open_load(self.t0_ns)
-            from_ns = (self.t0_ns if len(load.stamps) == 1 else stamp_ns) - 1
+            from_ns = (self.t0_ns if self._opening is None else stamp_ns) - 1
         elif i == 0:
             from_ns = self.t0_ns - 1
         elif kind == "late" or not np.array_equal(value, before):
@@ -205,8 +221,9 @@ class InputBuffer:
     def _open_load(self, t0_ns: int) -> None:
         """Before the first load there is none, or that one if it comes soon enough after the first joints."""
         first = self.load.stamps[0]
-        if first - t0_ns > LOAD_GRACE_NS:
-            self.load.stamps.insert(0, first - 1)
+        self._opening = first - 1 if first - t0_ns > LOAD_GRACE_NS else None
+        if self._opening is not None:
+            self.load.stamps.insert(0, self._opening)
             self.load.values.insert(0, np.zeros(6))
 
     # -- what steps need of it --

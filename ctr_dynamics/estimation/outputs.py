@@ -50,7 +50,8 @@ class Moment(NamedTuple):
 class Innovation(NamedTuple):
     """A processed tracker sample: residual (6,) and its predicted variance (6,) (position m in the tracker's axes, rotation rad in the
     sensor's), NIS, degrees of freedom, whether it was fused, how late it came (s), and why it was not fused; for the misfit monitor
-    ``white``, the whitened residual (6,), and the ``moment``, None where the model alone has no tip of that time."""
+    ``white``, the whitened residual (6,), and the ``moment``, None where the model alone has no tip of that time; ``fused`` (3,) m, reading
+    minus the fused tip that was published for its time, None likewise."""
 
     stamp_ns: int
     residual: Floats
@@ -62,6 +63,7 @@ class Innovation(NamedTuple):
     reason: str = ""
     white: Floats | None = None
     moment: Moment | None = None
+    fused: Floats | None = None
 
 
 class SolverStats(NamedTuple):

@@ -190,60 +190,49 @@ class Runs:
         assert self.fused is not None
         for sample, time_s, position in due:
             sample.fused_k = k
-            moment = self._compare(time_s, position, sample.quaternion)
+            moment, left = self._compare(time_s, position, sample.quaternion)
             if self.health.fusing:
                 update = self.fusion.update(self.fused, time_s, position, sample.quaternion)
             else:
                 update = self.fusion.compare(time_s, position, sample.quaternion)
             if update.dof:
                 self.sampled_ns = max(self.sampled_ns or 0, sample.stamp_ns)
-                self.health.measured(
-                    update.nis, update.dof, update.accepted, update.accepted and not update.reason
-                )
             else:
-                self.health.dropped += 1
                 self.health.note(
                     "tracker",
                     "outside the window",
                     f"pose of t = {time_s:.3f} s at step {k}: {update.reason}",
                 )
-            self.innovations.append(
-                Innovation(
-                    sample.stamp_ns,
-                    update.residual,
-                    update.variance,
-                    update.nis,
-                    update.dof,
-                    update.accepted,
-                    sample.late_s,
-                    update.reason,
-                    update.white,
-                    moment,
-                )
-            )
+            innovation = Innovation(
+                sample.stamp_ns, update.residual, update.variance, update.nis, update.dof, update.accepted, sample.late_s,
+                update.reason, update.white, moment, left,
+            )  # fmt: skip
+            self.health.measured(innovation)
+            self.innovations.append(innovation)
         self.inputs.forget_samples(k)
         self.health.force_sigma = self.fusion.force_sigma
 
-    def _compare(self, time_s: float, position: Floats, quaternion: Floats) -> Moment | None:
-        """Residuals of the published outputs against a reading, before its update, and the moment of it."""
+    def _compare(
+        self, time_s: float, position: Floats, quaternion: Floats
+    ) -> tuple[Moment | None, Floats | None]:
+        """The moment of a reading, before its update, and how far it lies from the fused tip that was published for its time."""
         n = self.model.n
         own_s = time_s - self.tracker.delay
         fused = self.fusion.tips.at(own_s, DT, columns=False)
         alone = self.alone_tips.at(own_s, DT, columns=False)
         earlier = self.alone_tips.at(own_s - 2 * DT, DT, columns=False) or alone
         if fused is None or alone is None or earlier is None:
-            return None
+            return None, None
         position, _ = self.tracker.to_base(position, quaternion)
         estimate = registered(self.tracker, self.fusion.bias, fused)[:3]
-        left = position - alone.position
-        self.health.compared(left, position - estimate)
         assert self.inputs.t0_ns is not None
         joints, rates = self.inputs.joints.at(self.inputs.t0_ns + own_s * 1e9)
         acceleration = (alone.velocity - earlier.velocity) / (2 * DT)
-        return Moment(
-            left, alone.position, alone.quaternion, alone.velocity, acceleration,
+        moment = Moment(
+            position - alone.position, alone.position, alone.quaternion, alone.velocity, acceleration,
             joints[:n], rates[:n], rates[n:],
         )  # fmt: skip
+        return moment, position - estimate
 
     # -- states to return to --
 

@@ -1,6 +1,7 @@
 """Inputs that come late, out of order or early: roll-back, the window of kept tips, and the two output policies."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -192,6 +193,52 @@ def test_a_jump_of_the_load_is_corrected_at_once_though_there_is_no_time(release
         if a.k * STEP > 1.15
     ]
     assert max(apart) < 0.3e-3
+
+
+def test_first_loads_in_the_wrong_order_act_as_in_the_right_one(release):
+    """Before the first of them by stamp there is no load, whichever came first."""
+    joints = [m for m in release if m.kind == "joints" and m.stamp <= 0.6e9]
+    loads = [m for m in release if m.kind == "load" and 0.3e9 <= m.stamp <= 0.6e9]
+    in_order = play(joints + loads, tick=STEP)
+    overtaken = (loads[1].arrival - loads[0].arrival) * 1e-9 + 0.02
+    assert overtaken < 0.2
+    run = play([*joints, loads[0].late(overtaken), *loads[1:]], tick=STEP)
+    assert np.abs(run.last.predicted_position - in_order.last.predicted_position).max() < 1e-6
+    before = round(0.299 / STEP)
+    assert np.array_equal(
+        run.column("predicted_position")[:before], in_order.column("predicted_position")[:before]
+    )
+
+
+def test_a_load_beyond_the_window_counts_only_where_it_is_the_newest(release):
+    messages = [m for m in release if m.stamp <= 0.8e9]
+    loads = [m for m in messages if m.kind == "load"]
+    chosen = loads[3]
+    run = play([m.late(0.3) if m is chosen else m for m in messages])
+    left_out = play([m for m in messages if m is not chosen])
+    problem = run.estimator.health.load["too late"]
+    assert problem.count == 1
+    assert "limit 0.2 s" in problem.last
+    assert np.array_equal(run.column("tip_position"), left_out.column("tip_position"))
+
+    # the only news of a load for long, late as it is, is what hangs there now
+    kept = [m for m in messages if m.kind != "load"] + loads[:1]
+    gone = replace(loads[5], content=((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), loads[5].content[2]))
+    run, unaware = play([*kept, gone.late(0.3)]), play(kept)
+    assert "too late" not in run.estimator.health.load
+    assert np.abs(run.last.predicted_position - unaware.last.predicted_position).max() > 1e-3
+
+
+def test_figures_of_poses_that_are_first_fused_on_a_way_back_count_once(sweep, in_time):
+    """Residuals and NIS are means over the same samples, however late these came."""
+    late = [m.late(0.012) if m.kind == "joints" else m for m in sweep]
+    run = play(late, {"output.policy": "predict"}, tick=STEP, spare=lambda made: 0.0)
+    h, reference = run.estimator.health, in_time.estimator.health
+    assert h.rolled_back > 100
+    assert (h._compared, h.nis_count) == (reference._compared, reference.nis_count)
+    found, expected = h.residual_rms(), reference.residual_rms()
+    assert found["predicted"] == pytest.approx(expected["predicted"], rel=1e-3)
+    assert found["fused"] == pytest.approx(expected["fused"], rel=0.02)
 
 
 @pytest.mark.parametrize("late", [0.004, 0.040, 0.090])

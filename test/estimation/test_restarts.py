@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 from estimation_cases import START_NS, bag_messages, joints, play
 
-from ctr_dynamics.estimation.estimator import DT_NS
+from ctr_dynamics.estimation.estimator import DT_NS, MAX_FAILURES
 from ctr_dynamics.model.model import Model
+from ctr_dynamics.model.simulator import StepResult
 from ctr_dynamics.model.statics import Statics
 from ctr_dynamics.robot import load_robot
 
@@ -72,6 +73,30 @@ def test_after_a_gap_actuators_go_on_from_where_the_steps_had_them():
     drives = run.estimator.inputs.joints
     first = next(i for i, stamp in enumerate(drives.stamps) if stamp > START_NS + 700_000_000)
     np.testing.assert_allclose(drives.values[first], REST + rate * 0.5, atol=1e-9)
+
+
+@pytest.mark.parametrize(("failing", "given_up"), [(3, False), (MAX_FAILURES, True)])
+def test_a_way_back_bears_as_many_failed_steps_as_the_way_on(running, monkeypatch, failing, given_up):
+    runs, k = running.runs, running.k
+    taken = runs.step
+    failed = []
+
+    def step(number, *arguments, **options):
+        if len(failed) < failing:
+            failed.append(number)
+            return StepResult(False, "made to fail", 0, 0, 0)
+        return taken(number, *arguments, **options)
+
+    monkeypatch.setattr(runs, "step", step)
+    stamps = running.inputs.joints.stamps
+    between = (stamps[-4] + stamps[-5]) // 2  # a joint state that came late
+    running.add_joint_state(between, *joints(0.0, running.inputs.joints.values[-4]).content)
+    running._go_back()
+    assert running.k == k
+    assert failed[0] < k
+    assert (runs.fused is None) == given_up
+    assert running.health.restarts == int(given_up)
+    assert running.health.reasons["made to fail"] == len(failed)
 
 
 def test_an_equilibrium_keeps_sections_that_fit():
