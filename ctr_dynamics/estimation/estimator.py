@@ -183,11 +183,17 @@ class Estimator:
             self.health.misfit.add(self._unjudged.popleft())
         if self.runs.fused is None:
             return
+        self.fusion.settle()
         if self._watch_due:
             self._watch_due = False
             self._watch_stability(self.k)
         else:
             self._modes.refresh(self.runs.fused, self.runs.simulator.parameters)
+
+    def rehearse(self) -> None:
+        """Go through the next step without taking it, a moment before the joints that it waits for: it takes a third less time then."""
+        if self.runs.fused is not None and self._return_to is None:
+            self.runs.rehearse(self.k + 1)
 
     def finish(self) -> list[StepOutput]:
         """Steps up to the last joint stamp."""

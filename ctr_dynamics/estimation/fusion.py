@@ -102,6 +102,7 @@ class Fusion:
         self._refused = False
         self._rest = 0  # steps since the last correction; more than `unreduced` where none has come since the columns were reduced
         self._skipped = 0  # steps that the columns have not followed yet
+        self._unsettled = False  # whether the columns are to be reduced before the next step
         self._followed: Key = ((), ())  # sections of the last step that they have
         self._force = self.uncertainty.force
         self._force_decay = math.exp(-simulator.scheme.dt / options.force_time)
@@ -130,7 +131,7 @@ class Fusion:
             i = force.start + axis
             self.pi[i, i] = (self.options.force_sigma / size) ** 2
         self._refused = False
-        self._rest, self._skipped = 1, 0
+        self._rest, self._skipped, self._unsettled = 1, 0, False
         self._followed = state.key
         self.force_sigma = self.options.force_sigma
         self.tips.clear(r)
@@ -143,15 +144,19 @@ class Fusion:
         par[layout["force"]], par[layout["torque"]] = inputs.force, inputs.torque
         return par
 
-    def predict(self, state: State, result: StepResult, stamp: float, sampled: bool = True) -> bool:
+    def predict(
+        self, state: State, result: StepResult, stamp: float, sampled: bool = True, pause: bool = True
+    ) -> bool:
         """Steps (1)-(3) after the simulator took a step to ``stamp`` (s). False where the tangent does not exist; the columns then stay.
 
         The columns follow every third step, and every one after which a sample is fused (``sampled``) or they are reduced: they change little
         within 3 ms. The tip of a step that they skipped gets those between its neighbours'. With a strong drive of the tip force they follow
         every step and are reduced twice as often. They are reduced, and the force's new randomness is taken in, some steps behind a correction:
         randomness taken in just before a sample has moved nothing yet that the sample could show. At the latest they are after
-        ``reduce_between[1]`` steps, or, so that no step does all the work, at the first one without a sample within the next eight.
+        ``reduce_between[1]`` steps, or, so that no step does all the work, at the first one within the next eight that has no sample and a
+        ``pause`` behind it: the reduction itself is left to :meth:`settle`.
         """
+        self.settle()
         dt = self.simulator.scheme.dt
         self.unreduced += 1
         fade(self._force_decay, self.theta[self._force], self.columns.theta[self._force])
@@ -162,7 +167,8 @@ class Fusion:
         self._rest += 1
         corrected = self._rest <= self.unreduced  # since the columns were reduced
         behind = corrected and (self._rest >= APART or self.unreduced >= fewest + 2 * APART)
-        reduce = self.unreduced >= (most + 2 * APART if sampled else fewest if behind else most)
+        crowded = sampled or not (pause or driven)
+        reduce = self.unreduced >= (most + 2 * APART if crowded else fewest if behind else most)
         key = result.records[0].key
         follow = (
             driven
@@ -180,11 +186,17 @@ class Fusion:
         if follow and self._skipped:
             self.tips.interpolate(self._skipped)
         self._skipped = 0 if follow else self._skipped + 1
-        if reduce:
+        self._unsettled = reduce
+        return ok
+
+    def settle(self) -> None:
+        """Steps (2) and (3), where they are due. No output waits for them: the next step does it first, or the owner in a pause before it, which
+        makes no difference to any number."""
+        if self._unsettled:
+            self._unsettled = False
             self._drive_drift(self.unreduced)
             self._drive_force(self.unreduced)
             self._reduce()
-        return ok
 
     def _drive_drift(self, steps: int) -> None:
         """The tracker's drift over ``steps`` steps: it fades and is driven anew."""
@@ -375,7 +387,7 @@ class Fusion:
         """The filter's part of a state to which :meth:`restore` can return."""
         return (
             self.theta.copy(), self.bias.copy(), self.pi.copy(), self.unreduced, self.force_sigma,
-            (self._refused, self._rest, self._skipped, self._followed), self.columns.snapshot(), self.tips.snapshot(),
+            (self._refused, self._rest, self._skipped, self._followed, self._unsettled), self.columns.snapshot(), self.tips.snapshot(),
         )  # fmt: skip
 
     def restore(self, snapshot: tuple) -> None:
@@ -386,7 +398,7 @@ class Fusion:
     def _restore(self, snapshot: tuple) -> None:
         """All but the tips."""
         theta, bias, pi, self.unreduced, self.force_sigma, course, columns, _ = snapshot
-        self._refused, self._rest, self._skipped, self._followed = course
+        self._refused, self._rest, self._skipped, self._followed, self._unsettled = course
         self.theta, self.bias, self.pi = theta.copy(), bias.copy(), pi.copy()
         self.columns.restore(columns)
         self._apply_theta()

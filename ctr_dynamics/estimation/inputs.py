@@ -5,6 +5,7 @@ What comes in is checked and counted, and said from which stamp on it changes wh
 
 from __future__ import annotations
 
+import bisect
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -247,6 +248,13 @@ class InputBuffer:
                 if time_s - tracker.delay <= t + 1e-9:
                     due.append((sample, time_s, position))
         return due
+
+    def covers_no_more(self, k: int) -> bool:
+        """Whether step ``k`` is the last one that a joint state covers; under ``predict`` every step is taken by itself."""
+        stamp, stamps = self.stamp(k), self.joints.stamps
+        assert stamp is not None
+        i = bisect.bisect_left(stamps, stamp)
+        return self.predicting or (i < len(stamps) and stamps[i] < stamp + DT_NS)
 
     def first_fusion(self, tracker: TrackerModel, k: int) -> float:
         """The first step after ``k`` at which a sample has been used or now will be; infinite where there is none."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -146,7 +147,8 @@ class Runs:
             self.fusion.follow(track.fusion, self.fused)
         else:
             due = self.inputs.due_samples(self.tracker, t) if fuse else []
-            if not self.fusion.predict(self.fused, result, t, sampled=bool(due)):
+            pause = self.inputs.covers_no_more(k)
+            if not self.fusion.predict(self.fused, result, t, sampled=bool(due), pause=pause):
                 self.health.note(
                     "tracker", "tangent", "the step could not be linearised; the covariance was held"
                 )
@@ -154,6 +156,23 @@ class Runs:
         if keep or k % KEEP_EVERY == 0:
             self.keep(k)
         return result
+
+    def rehearse(self, k: int) -> None:
+        """Take step ``k`` with the joints as they are known, fuse a sample that waits, and take both back: what they read and run is in the
+        processor's caches then."""
+        here, t = self._now(k - 1), seconds(k)
+        self._signals.clear()
+        result, alone = self._step_both(seconds(k - 1), events=self.inputs.load_bends(k), record=True)
+        if result.ok and alone.ok:
+            assert self.fused is not None
+            self._keep_alone_tip(t)
+            self.fusion.predict(self.fused, result, t)
+            for sample, time_s, position in self.inputs.due_samples(self.tracker, math.inf)[:1]:
+                time_s = min(time_s, t + self.tracker.delay)
+                self._compare(time_s, position, sample.quaternion)
+                self.fusion.update(self.fused, time_s, position, sample.quaternion)
+            self.fusion.tip_estimate()
+        self.restore(here)
 
     def _step_both(self, t: float, events: Sequence[float], record: bool) -> tuple[StepResult, StepResult]:
         """Both runs from ``t`` (s) on, together where they can go together."""
@@ -240,23 +259,25 @@ class Runs:
         """Remember both runs after step ``k``, for as long as inputs may come late: every step where joints are extrapolated, else every eighth."""
         if not (always or self.inputs.predicting) and k % KEEP_EVERY:
             return
-        assert self.fused is not None and self.alone is not None
         if self.kept and self.kept[-1].k == k:
             self.kept.pop()  # the filter has started anew since
-        self.kept.append(
-            Kept(
-                k,
-                self.fused.copy(),
-                self.alone.copy(),
-                self.fusion.snapshot(),
-                self.alone_tips.snapshot(),
-                {s.stamp_ns: s.fused_k for s in self.inputs.samples if s.fused_k is not None},
-            )
-        )
+        self.kept.append(self._now(k))
         oldest = k - self.inputs.window_ns // DT_NS - 9
         while len(self.kept) > 1 and self.kept[1].k <= oldest:
             self.kept.popleft()
         self.inputs.forget_signals(self.kept[0].k)
+
+    def _now(self, k: int) -> Kept:
+        """Where both runs are, after step ``k``."""
+        assert self.fused is not None and self.alone is not None
+        return Kept(
+            k,
+            self.fused.copy(),
+            self.alone.copy(),
+            self.fusion.snapshot(),
+            self.alone_tips.snapshot(),
+            {s.stamp_ns: s.fused_k for s in self.inputs.samples if s.fused_k is not None},
+        )
 
     def restore(self, kept: Kept) -> None:
         """Be where the runs were at ``kept``."""

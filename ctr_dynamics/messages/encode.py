@@ -6,12 +6,12 @@ stand the encoders of the input topics (for simulated bags and the driver) and o
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Callable, Iterable, Sequence
 from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ctr_dynamics.messages import templates, topics
 from ctr_dynamics.messages.cdr import ENCAPSULATION, CdrWriter
@@ -23,6 +23,9 @@ OK, WARN, ERROR, STALE = 0, 1, 2, 3
 _TRUE = ENCAPSULATION + b"\x01"
 _FALSE = ENCAPSULATION + b"\x00"
 _XYZW = [1, 2, 3, 0]
+_INNOVATION = [f"{label}.{axis}" for label in ("residual", "variance") for axis in topics.AXES]
+_INNOVATION += ["nis", "dof", "accepted", "delay_s"]
+_NO_TORQUE = np.zeros(3)
 
 
 class Encoded(NamedTuple):
@@ -114,17 +117,13 @@ def mode_names(count: int) -> list[str]:
 
 def innovation_entries(innovation: Innovation) -> dict[str, float]:
     """Named numbers of the innovation message; what is not finite is left out."""
-    entries: dict[str, float] = {}
-    for label, vector in (("residual", innovation.residual), ("variance", innovation.variance)):
-        entries.update({f"{label}.{axis}": float(x) for axis, x in zip(topics.AXES, vector, strict=True)})
-    entries["nis"] = float(innovation.nis)
-    entries["dof"] = float(innovation.dof)
-    entries["accepted"] = float(innovation.accepted)
-    entries["delay_s"] = float(innovation.delay_s)
+    i = innovation
+    values = [*i.residual.tolist(), *i.variance.tolist(), i.nis, i.dof, i.accepted, i.delay_s]
+    entries = {name: float(x) for name, x in zip(_INNOVATION, values, strict=True) if math.isfinite(x)}
     if not innovation.accepted:
         words = re.sub(r"[^a-z0-9]+", "_", innovation.reason.lower()).strip("_")
         entries[f"reason.{words or 'unknown'}"] = 1.0
-    return {name: x for name, x in entries.items() if np.isfinite(x)}
+    return entries
 
 
 class StepEncoder:
@@ -146,12 +145,8 @@ class StepEncoder:
         self.backbone_every = backbone_every
         self.hardware_id = hardware_id
         self._was: tuple[bool, bool] | None = None  # validity and alarm of the step before
-        self._pose = templates.stamped_numbers(topics.TIP_POSE, frame_id, 43)
-        self._twist = templates.stamped_numbers(topics.TIP_TWIST, frame_id, 42)
-        self._predicted = templates.stamped_numbers(topics.TIP_POSE_PREDICTED, frame_id, 7)
-        self._force = templates.stamped_numbers(topics.DISTURBANCE, frame_id, 6)
-        self._sigma = templates.stamped_numbers(topics.DISTURBANCE_SIGMA, frame_id, 3)
-        self._modes: dict[int, templates.Template] = {}
+        # of a step: those that hold float64 numbers, filled together, by the number of modes; points by their number
+        self._numbers: dict[int, templates.Template] = {}
         self._clouds: dict[int, templates.Template] = {}
         self._paths: dict[int, templates.Template] = {}
         self._innovations: dict[tuple[str, ...], templates.Template] = {}
@@ -193,50 +188,44 @@ class StepEncoder:
         return encode_diagnostics(out.stamp_ns, [output, *statuses], self.hardware_id)
 
     def _outputs(self, out: StepOutput) -> list[Encoded]:
-        stamp = out.stamp_ns
-        points = len(out.backbone)
+        stamp, modes = out.stamp_ns, out.modes
+        count = len(modes.frequency_hz)
         backbone = np.asarray(out.backbone)
-        force = np.zeros(6)
-        force[:3] = out.disturbance_force
-        messages = [
-            Encoded(
-                topics.TIP_POSE,
-                stamp,
-                self._pose.fill(
-                    stamp, out.tip_position, out.tip_quaternion_wxyz[_XYZW], out.tip_covariance.reshape(36)
-                ),
-            ),
-            Encoded(
-                topics.TIP_TWIST,
-                stamp,
-                self._twist.fill(stamp, out.tip_velocity, out.tip_velocity_covariance.reshape(36)),
-            ),
-            Encoded(
-                topics.TIP_POSE_PREDICTED,
-                stamp,
-                self._predicted.fill(stamp, out.predicted_position, out.predicted_quaternion_wxyz[_XYZW]),
-            ),
-            Encoded(topics.BACKBONE_STATE, stamp, self._cloud(points).fill(stamp, backbone)),
-            Encoded(topics.DISTURBANCE, stamp, self._force.fill(stamp, force)),
-            Encoded(topics.DISTURBANCE_SIGMA, stamp, self._sigma.fill(stamp, out.disturbance_sigma)),
-        ]
-        if len(out.modes.frequency_hz):
-            messages.append(Encoded(topics.MODES, stamp, self._mode_message(out)))
+        points = len(backbone)
+        template = self._template(count)
+        filled = template.fill(
+            stamp,
+            out.tip_position, out.tip_quaternion_wxyz[_XYZW], out.tip_covariance,
+            out.tip_velocity, out.tip_velocity_covariance,
+            out.predicted_position, out.predicted_quaternion_wxyz[_XYZW],
+            out.disturbance_force, _NO_TORQUE, out.disturbance_sigma,
+            modes.amplitude, modes.frequency_hz, modes.damping, modes.rate, np.zeros(2 * count),
+        )  # fmt: skip
+        messages = [Encoded(topic, stamp, data) for topic, data in zip(template.topics, filled, strict=True)]
+        messages.append(Encoded(topics.BACKBONE_STATE, stamp, *self._cloud(points).fill(stamp, backbone)))
         if out.k % self.backbone_every == 0:
-            poses = backbone[:, 1:8].astype(float).reshape(-1)
-            messages.append(Encoded(topics.BACKBONE, stamp, self._path(points).fill(stamp, poses)))
+            messages.append(
+                Encoded(
+                    topics.BACKBONE, stamp, *self._path(points).fill(stamp, backbone[:, 1:8].astype(float))
+                )
+            )
         return messages
 
-    def _mode_message(self, out: StepOutput) -> bytes:
-        modes = out.modes
-        count = len(modes.frequency_hz)
-        template = self._modes.get(count)
-        if template is None:
-            template = templates.joint_state(topics.MODES, self.frame_id, mode_names(count), velocities=True)
-            self._modes[count] = template
-        rates: NDArray = np.zeros(3 * count)
-        rates[:count] = modes.rate
-        return template.fill(out.stamp_ns, modes.amplitude, modes.frequency_hz, modes.damping, rates)
+    def _template(self, count: int) -> templates.Template:
+        """Of the messages of numbers with ``count`` modes."""
+        if count not in self._numbers:
+            frame = self.frame_id
+            layouts = [
+                templates.stamped_numbers(topics.TIP_POSE, frame, 43),
+                templates.stamped_numbers(topics.TIP_TWIST, frame, 42),
+                templates.stamped_numbers(topics.TIP_POSE_PREDICTED, frame, 7),
+                templates.stamped_numbers(topics.DISTURBANCE, frame, 6),
+                templates.stamped_numbers(topics.DISTURBANCE_SIGMA, frame, 3),
+            ]
+            if count:
+                layouts.append(templates.joint_state(topics.MODES, frame, mode_names(count), velocities=True))
+            self._numbers[count] = templates.Template(*layouts)
+        return self._numbers[count]
 
     def _cloud(self, points: int) -> templates.Template:
         if points not in self._clouds:
@@ -247,7 +236,7 @@ class StepEncoder:
 
     def _path(self, points: int) -> templates.Template:
         if points not in self._paths:
-            self._paths[points] = templates.path(topics.BACKBONE, self.frame_id, points)
+            self._paths[points] = templates.Template(templates.path(topics.BACKBONE, self.frame_id, points))
         return self._paths[points]
 
     def _innovation(self, item: Innovation) -> Encoded:
@@ -257,10 +246,10 @@ class StepEncoder:
         if template is None:
             if len(self._innovations) > 64:  # reasons are few; a stream of new ones must not fill the memory
                 self._innovations.clear()
-            template = templates.joint_state(topics.INNOVATION, self.frame_id, names, velocities=False)
-            self._innovations[names] = template
+            layout = templates.joint_state(topics.INNOVATION, self.frame_id, names, velocities=False)
+            template = self._innovations[names] = templates.Template(layout)
         values = np.fromiter(entries.values(), dtype=float, count=len(entries))
-        return Encoded(topics.INNOVATION, item.stamp_ns, template.fill(item.stamp_ns, values))
+        return Encoded(topics.INNOVATION, item.stamp_ns, *template.fill(item.stamp_ns, values))
 
 
 def encode_step(out: StepOutput, frame_id: str = "ctr_base") -> list[Encoded]:

@@ -7,7 +7,9 @@ into place through NumPy views. A template is a buffer that is used again: it be
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,63 +29,76 @@ class NotFiniteError(RuntimeError):
         )
 
 
+class Layout(NamedTuple):
+    """A message with placeholders: topic, bytes, and byte offsets of every stamp and of every float64, in the order of filling."""
+
+    topic: str
+    data: bytes
+    stamps: Sequence[int]
+    numbers: Sequence[int] = ()
+
+
 class Template:
-    """One message layout: its bytes, where its stamps are, and a block of float64 numbers.
+    """One or more messages that are filled together, in one buffer: one stamp, one block of float64 numbers.
 
     Args:
-        topic: name of the topic, for error texts.
-        writer: the message as laid out with placeholders.
-        stamps: byte offsets of every stamp in it.
-        numbers: byte offset of every float64 to fill, in the order of filling.
+        layouts: of the messages, in the order of their numbers.
     """
 
-    def __init__(
-        self, topic: str, writer: CdrWriter, stamps: Sequence[int], numbers: Sequence[int] = ()
-    ) -> None:
-        self.topic = topic
-        self.data = writer.data
-        size = len(self.data) - 4
-        self._words = np.frombuffer(self.data, "<u4", count=size // 4, offset=4)
-        self._doubles = np.frombuffer(self.data, "<f8", count=size // 8, offset=4)
-        self._seconds = np.array([(offset - 4) // 4 for offset in stamps], dtype=np.intp)
+    def __init__(self, *layouts: Layout) -> None:
+        self.topics = [layout.topic for layout in layouts]
+        self.counts = [len(layout.numbers) for layout in layouts]
+        self.data = bytearray()
+        stamps: list[int] = []
+        numbers: list[int] = []
+        spans: list[tuple[int, int]] = []
+        for layout in layouts:
+            self.data += bytes(
+                (4 - len(self.data)) % 8
+            )  # behind its first four bytes a message is aligned to eight
+            begin = len(self.data)
+            self.data += layout.data
+            spans.append((begin, len(self.data)))
+            stamps += [begin + offset for offset in layout.stamps]
+            numbers += [begin + offset for offset in layout.numbers]
+        self._spans = spans
+        self._words = np.frombuffer(self.data, "<u4", count=len(self.data) // 4)
+        self._doubles = np.frombuffer(self.data, "<f8", count=len(self.data) // 8)
+        self._seconds = np.array(stamps, dtype=np.intp) // 4
         self._nanoseconds = self._seconds + 1
-        index = np.array([(offset - 4) // 8 for offset in numbers], dtype=np.intp)
-        contiguous = index.size > 0 and bool(np.all(np.diff(index) == 1))
-        self._slots: slice | NDArray[np.intp] = (
-            slice(int(index[0]), int(index[-1]) + 1) if contiguous else index
-        )
-        self._single = int(self._seconds[0]) if self._seconds.size == 1 else -1
+        self._slots = np.array(numbers, dtype=np.intp) // 8
 
     def stamp(self, stamp_ns: int) -> None:
         """Write the stamp wherever it stands."""
         seconds, nanoseconds = split_stamp(stamp_ns)
-        seconds &= 0xFFFFFFFF  # int32 seconds in a uint32 view
-        if self._single >= 0:
-            self._words[self._single] = seconds
-            self._words[self._single + 1] = nanoseconds
-        else:
-            self._words[self._seconds] = seconds
-            self._words[self._nanoseconds] = nanoseconds
+        self._words[self._seconds] = seconds & 0xFFFFFFFF  # int32 seconds in a uint32 view
+        self._words[self._nanoseconds] = nanoseconds
 
-    def fill(self, stamp_ns: int, *values: NDArray | Sequence[float]) -> bytes:
-        """The message with this stamp and these numbers.
+    def fill(self, stamp_ns: int, *values: NDArray | Sequence[float]) -> list[bytes]:
+        """The messages with this stamp and these numbers.
 
         Raises:
             NotFiniteError: a number is NaN or infinite.
         """
-        numbers = np.concatenate(values) if len(values) > 1 else np.asarray(values[0], dtype=float)
-        if not np.isfinite(numbers).all():
-            raise NotFiniteError(self.topic, stamp_ns, numbers)
+        numbers = np.concatenate(values, axis=None)
+        if not math.isfinite(numbers.sum()) and not np.isfinite(numbers).all():
+            self._refuse(stamp_ns, numbers)
         self.stamp(stamp_ns)
         self._doubles[self._slots] = numbers
-        return bytes(self.data)
+        whole = bytes(self.data)
+        return [whole[begin:end] for begin, end in self._spans]
+
+    def _refuse(self, stamp_ns: int, numbers: NDArray) -> None:
+        for topic, part in zip(self.topics, np.split(numbers, np.cumsum(self.counts)[:-1]), strict=True):
+            if not np.isfinite(part).all():
+                raise NotFiniteError(topic, stamp_ns, part)
 
 
 def _span(offset: int, count: int) -> list[int]:
     return list(range(offset, offset + 8 * count, 8))
 
 
-def stamped_numbers(topic: str, frame_id: str, count: int) -> Template:
+def stamped_numbers(topic: str, frame_id: str, count: int) -> Layout:
     """A header and then `count` float64.
 
     PoseStamped has 7, PoseWithCovarianceStamped 43, TwistWithCovarianceStamped 42, WrenchStamped 6,
@@ -92,10 +107,10 @@ def stamped_numbers(topic: str, frame_id: str, count: int) -> Template:
     writer = CdrWriter()
     stamp = writer.header(0, frame_id)
     offset = writer.float64s([0.0] * count)
-    return Template(topic, writer, [stamp], _span(offset, count))
+    return Layout(topic, writer.done(), [stamp], _span(offset, count))
 
 
-def joint_state(topic: str, frame_id: str, names: Sequence[str], velocities: bool) -> Template:
+def joint_state(topic: str, frame_id: str, names: Sequence[str], velocities: bool) -> Layout:
     """A JointState with these names; fills positions, then velocities when wanted. Efforts are empty."""
     count = len(names)
     writer = CdrWriter()
@@ -105,10 +120,10 @@ def joint_state(topic: str, frame_id: str, names: Sequence[str], velocities: boo
     moving = count if velocities else 0
     numbers += _span(writer.float64_sequence([0.0] * moving), moving)
     writer.float64_sequence([])
-    return Template(topic, writer, [stamp], numbers)
+    return Layout(topic, writer.done(), [stamp], numbers)
 
 
-def path(topic: str, frame_id: str, points: int) -> Template:
+def path(topic: str, frame_id: str, points: int) -> Layout:
     """A nav_msgs/Path of that many poses; fills x, y, z, qx, qy, qz, qw of each."""
     writer = CdrWriter()
     stamps = [writer.header(0, frame_id)]
@@ -117,7 +132,7 @@ def path(topic: str, frame_id: str, points: int) -> Template:
     for _ in range(points):
         stamps.append(writer.header(0, frame_id))
         numbers += _span(writer.float64s([0.0] * 7), 7)
-    return Template(topic, writer, stamps, numbers)
+    return Layout(topic, writer.done(), stamps, numbers)
 
 
 _FLOAT32 = 7  # sensor_msgs/PointField.FLOAT32
@@ -142,14 +157,16 @@ class PointCloudTemplate(Template):
         writer.uint32(4 * len(fields) * points)
         offset = writer.raw(bytes(4 * len(fields) * points))
         writer.boolean(True)
-        super().__init__(topic, writer, [stamp])
-        self._points = np.frombuffer(self.data, "<f4", count=len(fields) * points, offset=offset)
+        super().__init__(Layout(topic, writer.done(), [stamp]))
+        begin, _ = self._spans[0]
+        self._points = np.frombuffer(self.data, "<f4", count=len(fields) * points, offset=begin + offset)
 
-    def fill(self, stamp_ns: int, *values: NDArray | Sequence[float]) -> bytes:
+    def fill(self, stamp_ns: int, *values: NDArray | Sequence[float]) -> list[bytes]:
         """The message with this stamp and these points, shape (points, fields)."""
         (points,) = values
         self._points[:] = np.asarray(points, dtype=np.float32).reshape(-1)
         if not np.isfinite(self._points).all():
-            raise NotFiniteError(self.topic, stamp_ns, self._points.copy())
+            raise NotFiniteError(self.topics[0], stamp_ns, self._points.copy())
         self.stamp(stamp_ns)
-        return bytes(self.data)
+        begin, end = self._spans[0]
+        return [bytes(self.data[begin:end])]

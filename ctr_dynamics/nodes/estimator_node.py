@@ -91,6 +91,7 @@ class EstimatorNode(Node):
             self.timing,
             self.get_logger().error,
             wall=not self._use_sim_time,
+            rehearse=self._rehearse,
         )
         self._offered = [
             self.create_service(Trigger, "~/reset", self._on_reset),
@@ -218,6 +219,10 @@ class EstimatorNode(Node):
     def _note_undecodable(self, topic: str, error: CdrError) -> None:
         count, _ = self._undecodable.get(topic, (0, ""))
         self._undecodable[topic] = (count + 1, str(error))
+
+    def _rehearse(self) -> None:
+        self._estimator.rehearse()
+        self.outputs.rehearse()
 
     def _housekeeping(self, now_ns: int, pause: bool) -> None:
         """Diagnostics, at once when validity or the warning of a snap has changed and else at 2 Hz of the wall clock."""

@@ -35,6 +35,10 @@ GATHER_NS = 4_000_000
 """So long after the first joints the model starts: a load of the same time comes a moment later, and starting takes longer than that."""
 PAUSE_NS = 1_000_000
 """What is done in a pause takes about as long."""
+REHEARSAL_NS = 2_500_000
+"""So long before the joints are expected that several steps wait for, a step is rehearsed; earlier, caches would have forgotten it again."""
+REHEARSALS = 3
+"""Steps of a rehearsal: the covariance follows every third."""
 
 
 class Steps(Protocol):
@@ -127,6 +131,7 @@ class StepLoop(threading.Thread):
         log_error: takes one line for the log.
         wall: whether that clock runs at the rate of the wall clock, so that one may sleep until a stamp.
         gather_ns: how long the first inputs are gathered.
+        rehearse: goes through a step without taking it; called a moment before joints that several steps wait for.
     """
 
     def __init__(
@@ -139,6 +144,7 @@ class StepLoop(threading.Thread):
         log_error: Callable[[str], Any],
         wall: bool = True,
         gather_ns: int = GATHER_NS,
+        rehearse: Callable[[], object] = lambda: None,
     ) -> None:
         super().__init__(name="stepping", daemon=True)
         self.estimator = estimator
@@ -154,10 +160,12 @@ class StepLoop(threading.Thread):
         self._log_error = log_error
         self._wall = wall
         self._gather_ns = gather_ns
+        self._rehearse_step = rehearse
         self._took_steps = False
         # a step was due in this round and the estimator did not take it: it wants an input
         self._starved = False
         self._pause_due = False
+        self._rehearsed_ns: int | None = None  # for the joints that were expected then
         self._wake = threading.Event()
         self._stopping = False
         self._last: tuple[int, int] | None = None  # k and stamp of the last step taken
@@ -245,6 +253,7 @@ class StepLoop(threading.Thread):
                     self.estimator.use_pause()
             elif self._took_steps:
                 self._wake.set()  # now there is time for it
+            self._rehearse()
         except Exception as error:
             # The node stays up whatever a message provokes: the fault is shown, the estimator starts anew.
             self._fault(error, "the estimator starts anew")
@@ -259,6 +268,25 @@ class StepLoop(threading.Thread):
         self.faults += 1
         self.last_fault = f"{type(error).__name__}: {error}"
         self._log_error(f"fault in the stepping thread, {what}\n{traceback.format_exc()}")
+
+    def _rehearsal_ns(self) -> int | None:
+        """When steps are to be rehearsed; None where that has been done, or where an input covers hardly more than one step."""
+        expected_ns = self.timing.next_arrival_ns
+        if self._last is None or not self._wall or self.timing.policy == "predict" or expected_ns is None:
+            return None
+        several = expected_ns - self._last[1] > 2 * STEP_NS
+        return expected_ns - REHEARSAL_NS if several and expected_ns != self._rehearsed_ns else None
+
+    def _rehearse(self) -> None:
+        """Go through steps a moment before several will be due at once, so that these meet warm caches."""
+        due_ns = self._rehearsal_ns()
+        if due_ns is None or self._now_ns() < due_ns:
+            return
+        self._rehearsed_ns = self.timing.next_arrival_ns
+        for _ in range(REHEARSALS):
+            if self.inbox or self._now_ns() > due_ns + REHEARSAL_NS:
+                return
+            self._rehearse_step()
 
     def _pause(self) -> bool:
         """Whether there is time for what no output waits for."""
@@ -340,6 +368,9 @@ class StepLoop(threading.Thread):
             wait_ns = min(due_ns - self._now_ns(), IDLE_NS)
             if wait_ns <= 0 and self._starved:
                 wait_ns = RETRY_NS  # do not spin
+        rehearsal_ns = self._rehearsal_ns()
+        if rehearsal_ns is not None:
+            wait_ns = min(wait_ns, rehearsal_ns - self._now_ns())
         if wait_ns > 0:
             self._wake.wait(wait_ns * 1e-9)
 

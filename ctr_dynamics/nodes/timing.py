@@ -60,6 +60,8 @@ class StepTiming:
 
     Steps that fall due while the start is still being solved (the static equilibrium of the first joints) are
     counted apart as `start`: the node cannot publish before it has a state.
+
+    `next_arrival_ns`: when the next joint state is to be expected, as long after the last one as their stamps are apart; None before two.
     """
 
     def __init__(self, policy: str, input_timeout_ns: int) -> None:
@@ -78,6 +80,8 @@ class StepTiming:
         self.corrections = Histogram()
         self._worst: list[tuple[int, int]] = []  # heap of (lateness, k)
         self._arrivals: deque[tuple[int, int]] = deque(maxlen=4096)  # (joint stamp, arrival), stamps rising
+        self._newest_ns: int | None = None  # stamp of the newest joint state
+        self.next_arrival_ns: int | None = None
         self._last_k: int | None = None
         self._start_until_ns: int | None = None
 
@@ -85,6 +89,10 @@ class StepTiming:
         """A joint state came in; ones that do not bring the stamps forward cover nothing new."""
         if not self._arrivals or joint_stamp_ns > self._arrivals[-1][0]:
             self._arrivals.append((joint_stamp_ns, arrival_ns))
+        if self._newest_ns is None or joint_stamp_ns > self._newest_ns:
+            if self._newest_ns is not None:
+                self.next_arrival_ns = arrival_ns + joint_stamp_ns - self._newest_ns
+            self._newest_ns = joint_stamp_ns
 
     def restarted(self) -> None:
         """The estimator starts anew: k begins at 0 again."""
@@ -92,6 +100,7 @@ class StepTiming:
         self._last_k = None
         self._start_until_ns = None
         self._arrivals.clear()
+        self._newest_ns = self.next_arrival_ns = None
 
     def stepped(self, steps: int, duration_ns: int) -> None:
         """One call of the estimator took `duration_ns` and gave `steps` steps, at least one."""

@@ -12,7 +12,7 @@ import numpy as np
 
 from ctr_dynamics.bagio.writer import atomic_file, write_bag
 from ctr_dynamics.messages.encode import encode_joint_state
-from ctr_dynamics.messages.templates import path, stamped_numbers
+from ctr_dynamics.messages.templates import Template, path, stamped_numbers
 from ctr_dynamics.snap.experiment import Trajectory
 from ctr_dynamics.snap.features import Extremum
 from ctr_dynamics.snap.scurve import SCurve
@@ -73,9 +73,9 @@ def write_backbones(file: Path, run: Trajectory, slower: float, metadata: Mappin
     """
     nodes = run.positions.shape[1]
     whole, inner, outer = (
-        path(BACKBONE, FRAME, nodes),
-        stamped_numbers(INNER, FRAME, 7),
-        stamped_numbers(OUTER, FRAME, 7),
+        Template(path(BACKBONE, FRAME, nodes)),
+        Template(stamped_numbers(INNER, FRAME, 7)),
+        Template(stamped_numbers(OUTER, FRAME, 7)),
     )
     theta_f = np.concatenate([[run.theta_f_rest], run.theta_f])
     marker = np.concatenate([[run.theta_f_rest], run.marker_angle])
@@ -95,8 +95,8 @@ def write_backbones(file: Path, run: Trajectory, slower: float, metadata: Mappin
             end = positions[-1] if not len(run.outer_tip) or k == 0 else run.outer_tip[k - 1]
             near = int(np.argmin(((positions - end) ** 2).sum(axis=1))) if k else nodes - 1
             messages = [
-                (BACKBONE, whole.fill(stamp, np.column_stack([positions, xyzw]).ravel())),
-                (INNER, inner.fill(stamp, positions[-1], xyzw[-1])),
+                (BACKBONE, whole.fill(stamp, np.column_stack([positions, xyzw]))[0]),
+                (INNER, inner.fill(stamp, positions[-1], xyzw[-1])[0]),
                 (
                     ANGLES,
                     encode_joint_state(
@@ -111,7 +111,7 @@ def write_backbones(file: Path, run: Trajectory, slower: float, metadata: Mappin
                 ),
             ]
             if k:
-                messages.append((OUTER, outer.fill(stamp, positions[near], xyzw[near])))
+                messages.append((OUTER, outer.fill(stamp, positions[near], xyzw[near])[0]))
             for topic, data in messages:
                 bag.write(topic, stamp, data, types[topic])
                 count += 1

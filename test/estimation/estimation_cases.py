@@ -112,14 +112,17 @@ def play(
     tick: float = 0.0,
     robot: Any = "till2020_tissue",
     spare: Callable[[Estimator], float] | None = None,
+    prepare: Callable[[Estimator], object] = lambda made: None,
 ) -> Run:
     """Messages in the order of their arrival; the clock is that of the stamps.
 
     Args:
         tick: s between further calls of `advance`, as a live node makes them; 0 calls it at arrivals only.
         spare: of the estimator, the time (s) until the next step, as `advance` asks for it.
+        prepare: is given the estimator before the first message.
     """
     made, outputs = estimator(settings, robot), []
+    prepare(made)
     spare_s = None if spare is None else partial(spare, made)
     now = None
     for arrival, group in groupby(sorted(messages, key=lambda m: m.arrival), key=lambda m: m.arrival):

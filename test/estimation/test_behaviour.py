@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from estimation_cases import (
     BAGS,
+    START_NS,
     Message,
     bag_messages,
     check_outputs,
@@ -17,7 +18,7 @@ from estimation_cases import (
 )
 from tracker_twin import expected
 
-from ctr_dynamics.estimation.estimator import LOST
+from ctr_dynamics.estimation.estimator import DT_NS, LOST
 from ctr_dynamics.estimation.rotations import conjugate, from_vector, matrix, multiply
 from ctr_dynamics.estimation.tip import Tip
 from ctr_dynamics.estimation.tracker import STATES, tracker_model
@@ -150,8 +151,8 @@ def test_steps_are_divided_where_the_known_load_bends(release, plain):
     assert not any(out.solver.outcome.startswith("divided") for out in play(noisy).outputs)
 
 
-def test_two_runs_are_the_same_bytes(release, plain):
-    again = play(release)
+def same_bytes(again, plain):
+    """Asserts that two runs differ in nothing."""
     assert len(again.outputs) == len(plain.outputs)
     for a, b in zip(again.outputs, plain.outputs, strict=True):
         for name, value in a._asdict().items():
@@ -160,6 +161,75 @@ def test_two_runs_are_the_same_bytes(release, plain):
                 assert value.tobytes() == other.tobytes(), (a.k, name)
         assert a.modes.amplitude.tobytes() == b.modes.amplitude.tobytes()
         assert [i.nis for i in a.innovations] == [i.nis for i in b.innovations]
+
+
+def test_two_runs_are_the_same_bytes(release, plain):
+    same_bytes(play(release), plain)
+
+
+@pytest.mark.parametrize(("policy", "tick"), [("wait", 0.0), ("predict", 0.003)])
+def test_rehearsed_steps_leave_no_trace(release, policy, tick):
+    """Whatever is gone through ahead of the joints, with a sample waiting or not, is as if it had not been."""
+    settings = {"output.policy": policy}
+    messages = [m for m in release if m.stamp <= 1.3e9]
+    with_sample = []
+
+    def busy(made):
+        advance = made.advance
+
+        def rehearsed(*arguments):
+            for _ in range(2):
+                made.rehearse()
+            with_sample.append(any(s.fused_k is None for s in made.inputs.samples))
+            return advance(*arguments)
+
+        made.advance = rehearsed
+
+    plain = play(messages, settings, tick=tick)
+    run = play(messages, settings, tick=tick, prepare=busy)
+    same_bytes(run, plain)
+    assert any(with_sample)
+    assert not all(with_sample)
+    assert run.estimator.summary() == plain.estimator.summary()
+
+
+def test_what_is_settled_in_pauses_is_as_if_the_next_step_had_done_it(release):
+    messages = [m for m in release if m.stamp <= 1.3e9]
+    settled = []
+
+    def pausing(made):
+        advance = made.advance
+
+        def paused(*arguments):
+            steps = advance(*arguments)
+            settled.append(made.fusion._unsettled)
+            made.fusion.settle()
+            return steps
+
+        made.advance = paused
+
+    run = play(messages, prepare=pausing)
+    assert sum(settled) > 5
+    same_bytes(run, play(messages))
+
+
+def test_reductions_follow_the_last_step_that_a_joint_state_covers(release):
+    made = estimator()
+    found = []
+    settle, inputs = made.fusion.settle, made.inputs
+
+    def noted():
+        if made.fusion._unsettled:
+            stamp = inputs.stamp(made.k - 1)
+            found.append((made.k - 1, any(stamp <= s < stamp + DT_NS for s in inputs.joints.stamps)))
+        settle()
+
+    made.fusion.settle = noted
+    for message in sorted((m for m in release if m.stamp <= 1.3e9), key=lambda m: m.arrival):
+        message.give(made)
+        made.advance(START_NS + message.arrival)
+    assert len(found) > 5
+    assert all(last for _, last in found), found
 
 
 def test_registration_parameter_undoes_a_moved_tracker(release, plain):

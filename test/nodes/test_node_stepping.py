@@ -10,7 +10,15 @@ import pytest
 
 from ctr_dynamics.estimation.outputs import ERROR, OK, WARN
 from ctr_dynamics.nodes.diagnostics import clock_status, topics_status
-from ctr_dynamics.nodes.stepping import CATCH_UP_NS, INBOX_LIMIT, STEP_NS, StampClock, StepLoop
+from ctr_dynamics.nodes.stepping import (
+    CATCH_UP_NS,
+    INBOX_LIMIT,
+    REHEARSAL_NS,
+    REHEARSALS,
+    STEP_NS,
+    StampClock,
+    StepLoop,
+)
 from ctr_dynamics.nodes.timing import Histogram, StepTiming
 
 MS = 1_000_000
@@ -50,7 +58,7 @@ class Scripted:
         self.t0_ns, self.k = None, 0
 
 
-def make_loop(estimator, clock, policy="predict", publish=None, gather_ns=0):
+def make_loop(estimator, clock, policy="predict", publish=None, gather_ns=0, rehearse=lambda: None):
     """A loop whose rounds the test calls itself; `published` holds the stamps."""
     published = []
     errors = []
@@ -67,6 +75,7 @@ def make_loop(estimator, clock, policy="predict", publish=None, gather_ns=0):
         StepTiming(policy, 100 * MS),
         errors.append,
         gather_ns=gather_ns,
+        rehearse=rehearse,
     )
     return loop, published, errors
 
@@ -399,3 +408,68 @@ def test_under_wait_every_step_is_out_before_the_next_is_taken(clock):
     loop, _, _ = make_loop(estimator, clock, policy="wait", publish=publish)
     loop._round()
     assert taken == [(k, k + 1) for k in range(6)]
+
+
+def test_steps_are_rehearsed_once_a_moment_before_joints_that_several_wait_for(clock):
+    class Waiting(Scripted):
+        """Takes the steps that joints cover."""
+
+        def advance(self, now_ns=None, spare_s=None, most=None):
+            return super().advance(min(now_ns, self.covered_ns), spare_s, most)
+
+    estimator = Waiting(clock.now)
+    rehearsed = []
+    loop, _, _ = make_loop(estimator, clock, policy="wait", rehearse=lambda: rehearsed.append(clock.now))
+    waits = noted_waits(loop)
+    for _ in range(2):
+        estimator.covered_ns = clock.now
+        loop.timing.arrived(clock.now, clock.now)
+        for _ in range(4):
+            loop._round()
+        clock.now += 10 * MS
+    begin = clock.now - 10 * MS  # of the second joint state; the third is expected 10 ms behind it
+    clock.now = begin + 1 * MS
+    loop._sleep()
+    assert waits.pop() == pytest.approx(1e-9 * (9 * MS - REHEARSAL_NS))
+    loop._round()
+    assert rehearsed == []
+    clock.now = begin + 10 * MS - REHEARSAL_NS
+    loop._round()
+    assert rehearsed == [clock.now] * REHEARSALS
+    loop._round()
+    loop._sleep()
+    assert len(rehearsed) == REHEARSALS
+    assert waits.pop() > 1e-9 * REHEARSAL_NS
+    # joints that came early: what waits for them goes first
+    loop.timing.arrived(begin + 10 * MS, begin + 10 * MS)
+    clock.now = begin + 20 * MS - REHEARSAL_NS
+    loop.inbox.append(lambda: None)
+    loop._rehearse()
+    assert len(rehearsed) == REHEARSALS
+
+
+@pytest.mark.parametrize(("policy", "period_ns"), [("predict", 10 * MS), ("wait", 4 * MS)])
+def test_nothing_is_rehearsed_where_steps_come_one_by_one(clock, policy, period_ns):
+    estimator = Scripted(clock.now)
+    rehearsed = []
+    loop, _, _ = make_loop(estimator, clock, policy=policy, rehearse=lambda: rehearsed.append(clock.now))
+    for _ in range(40):
+        if (clock.now - estimator.t0_ns) % period_ns == 0:
+            loop.timing.arrived(clock.now, clock.now)
+        loop._round()
+        clock.now += MS
+    assert estimator.k > 10
+    assert rehearsed == []
+
+
+def test_the_next_joints_are_expected_in_the_rhythm_of_their_stamps():
+    timing = StepTiming("wait", 100 * MS)
+    assert timing.next_arrival_ns is None
+    timing.arrived(10 * MS, 11 * MS)
+    assert timing.next_arrival_ns is None
+    timing.arrived(20 * MS, 24 * MS)
+    assert timing.next_arrival_ns == 34 * MS
+    timing.arrived(15 * MS, 25 * MS)  # late: it covers nothing new
+    assert timing.next_arrival_ns == 34 * MS
+    timing.restarted()
+    assert timing.next_arrival_ns is None
