@@ -250,11 +250,16 @@ class InputBuffer:
         return due
 
     def covers_no_more(self, k: int) -> bool:
-        """Whether step ``k`` is the last one that a joint state covers; under ``predict`` every step is taken by itself."""
+        """Whether step ``k`` is the last one that a joint state covers; joints that are not in yet are taken to keep their rhythm."""
         stamp, stamps = self.stamp(k), self.joints.stamps
         assert stamp is not None
         i = bisect.bisect_left(stamps, stamp)
-        return self.predicting or (i < len(stamps) and stamps[i] < stamp + DT_NS)
+        if i < len(stamps):
+            return stamps[i] < stamp + DT_NS
+        if len(stamps) < 2:
+            return True
+        period = stamps[-1] - stamps[-2]
+        return -(stamp - stamps[-1]) % period < DT_NS
 
     def first_fusion(self, tracker: TrackerModel, k: int) -> float:
         """The first step after ``k`` at which a sample has been used or now will be; infinite where there is none."""

@@ -40,7 +40,7 @@ def timing_status(timing: StepTiming, faults: int, last_fault: str, withheld_beh
         return Status(
             "timing",
             ERROR,
-            f"{faults} faults inside the node, the last {last_fault}; the estimator started anew, see log",
+            f"{faults} faults inside the node, see the log; the last: {last_fault}",
             values,
         )
     if timing.skipped:

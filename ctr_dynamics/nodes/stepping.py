@@ -266,7 +266,7 @@ class StepLoop(threading.Thread):
 
     def _fault(self, error: Exception, what: str) -> None:
         self.faults += 1
-        self.last_fault = f"{type(error).__name__}: {error}"
+        self.last_fault = f"{type(error).__name__}: {error}; {what}"
         self._log_error(f"fault in the stepping thread, {what}\n{traceback.format_exc()}")
 
     def _rehearsal_ns(self) -> int | None:

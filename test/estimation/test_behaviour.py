@@ -12,6 +12,7 @@ from estimation_cases import (
     bag_messages,
     check_outputs,
     estimator,
+    joints,
     play,
     rms,
     truth_error,
@@ -211,6 +212,16 @@ def test_what_is_settled_in_pauses_is_as_if_the_next_step_had_done_it(release):
     run = play(messages, prepare=pausing)
     assert sum(settled) > 5
     same_bytes(run, play(messages))
+
+
+def test_the_last_step_that_a_joint_state_covers_is_known_before_it_comes():
+    made = estimator()
+    for at in range(0, 100, 10):
+        joints(at * 1e-3, (1.5708, 1.5708, -0.2521, -0.1977)).give(made)
+    covers_no_more = made.inputs.covers_no_more
+    expected = [k for k in range(60) if -3 * k % 10 < 3]
+    assert [k for k in range(60) if covers_no_more(k)] == expected
+    assert expected[:5] == [0, 3, 6, 10, 13]
 
 
 def test_reductions_follow_the_last_step_that_a_joint_state_covers(release):

@@ -208,7 +208,7 @@ def test_a_fault_is_shown_and_the_estimator_starts_anew(clock):
     loop, _, errors = make_loop(estimator, clock)
     loop._round()
     assert loop.faults == 1
-    assert loop.last_fault == "ZeroDivisionError: no"
+    assert loop.last_fault == "ZeroDivisionError: no; the estimator starts anew"
     assert estimator.resets == 1
     assert "ZeroDivisionError" in errors[0]
 
@@ -226,6 +226,7 @@ def test_faults_beside_the_steps_do_not_end_them(clock):
         clock.now += STEP_NS
     assert published
     assert loop.faults == 3
+    assert loop.last_fault == "OSError: no room; steps go on"
     assert estimator.resets == 1, "of the pause; diagnostics have nothing to do with the estimator"
     assert all("no room" in error for error in errors)
 
