@@ -189,14 +189,16 @@ class Fusion:
         self._unsettled = reduce
         return ok
 
-    def settle(self) -> None:
-        """Steps (2) and (3), where they are due. No output waits for them: the next step does it first, or the owner in a pause before it, which
-        makes no difference to any number."""
-        if self._unsettled:
-            self._unsettled = False
-            self._drive_drift(self.unreduced)
-            self._drive_force(self.unreduced)
-            self._reduce()
+    def settle(self) -> bool:
+        """Steps (2) and (3), where they are due; returns whether they were. No output waits for them: the next step does them first, or the owner in
+        a pause before it, which makes no difference to any number."""
+        if not self._unsettled:
+            return False
+        self._unsettled = False
+        self._drive_drift(self.unreduced)
+        self._drive_force(self.unreduced)
+        self._reduce()
+        return True
 
     def _drive_drift(self, steps: int) -> None:
         """The tracker's drift over ``steps`` steps: it fades and is driven anew."""

@@ -229,6 +229,34 @@ def test_a_load_beyond_the_window_counts_only_where_it_is_the_newest(release):
     assert np.abs(run.last.predicted_position - unaware.last.predicted_position).max() > 1e-3
 
 
+def test_a_way_back_begins_with_what_a_pause_has_settled(sweep):
+    """Each joint state leads back to a step that the columns are reduced behind: once is enough."""
+    counts = []
+
+    def with_pauses(made):
+        advance, reduce = made.advance, made.fusion._reduce
+
+        def paused(*arguments):
+            steps = advance(*arguments)
+            if steps:
+                made.use_pause()
+            return steps
+
+        def counted():
+            counts[-1] += 1
+            reduce()
+
+        made.advance, made.fusion._reduce = paused, counted
+
+    late = [m.late(0.001) if m.kind == "joints" else m for m in sweep]
+    for policy in ("wait", "predict"):
+        counts.append(0)
+        run = play(late, {"output.policy": policy}, tick=STEP, prepare=with_pauses)
+    assert run.estimator.health.rolled_back > 300
+    assert counts[0] > 15
+    assert counts[1] <= counts[0] + 3
+
+
 def test_figures_of_poses_that_are_first_fused_on_a_way_back_count_once(sweep, in_time):
     """Residuals and NIS are means over the same samples, however late these came."""
     late = [m.late(0.012) if m.kind == "joints" else m for m in sweep]
