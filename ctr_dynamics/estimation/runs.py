@@ -159,14 +159,14 @@ class Runs:
 
     def rehearse(self, k: int) -> None:
         """Take step ``k`` with the joints as they are known, fuse a sample that waits, and take both back: what they read and run is in the
-        processor's caches then."""
+        processor's caches then. A step in which the runs do not go together is not gone into."""
         here, t = self._now(k - 1), seconds(k)
         self._signals.clear()
-        result, alone = self._step_both(seconds(k - 1), events=self.inputs.load_bends(k), record=True)
-        if result.ok and alone.ok:
+        both = self._together(seconds(k - 1), self.inputs.load_bends(k), record=True)
+        if both is not None and both[0].ok and both[1].ok:
             assert self.fused is not None
             self._keep_alone_tip(t)
-            self.fusion.predict(self.fused, result, t)
+            self.fusion.predict(self.fused, both[0], t)
             for sample, time_s, position in self.inputs.due_samples(self.tracker, math.inf)[:1]:
                 time_s = min(time_s, t + self.tracker.delay)
                 self._compare(time_s, position, sample.quaternion)
@@ -174,16 +174,22 @@ class Runs:
             self.fusion.tip_estimate()
         self.restore(here)
 
+    def _together(
+        self, t: float, events: Sequence[float], record: bool
+    ) -> tuple[StepResult, StepResult] | None:
+        """Both runs from ``t`` (s) on in the same sweeps; None where they cannot go together."""
+        assert self.fused is not None and self.alone is not None
+        if len(self.simulator.divisions(t, events)) != 2:
+            return None
+        return self.pair.step(self.fused, self.alone, t, self._corrected(), self._bare, record=record)
+
     def _step_both(self, t: float, events: Sequence[float], record: bool) -> tuple[StepResult, StepResult]:
         """Both runs from ``t`` (s) on, together where they can go together."""
         assert self.fused is not None and self.alone is not None
-        corrected = self._corrected()
-        if len(self.simulator.divisions(t, events)) == 2:
-            both = self.pair.step(self.fused, self.alone, t, corrected, self._bare, record=record)
-            if both is not None:
-                return both
-        return (
-            self.simulator.step(self.fused, t, corrected, record="end" if record else False, events=events),
+        return self._together(t, events, record) or (
+            self.simulator.step(
+                self.fused, t, self._corrected(), record="end" if record else False, events=events
+            ),
             self.reference.step(self.alone, t, self._bare, events=events),
         )
 

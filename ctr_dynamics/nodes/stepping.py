@@ -274,7 +274,7 @@ class StepLoop(threading.Thread):
         expected_ns = self.timing.next_arrival_ns
         if self._last is None or not self._wall or self.timing.policy == "predict" or expected_ns is None:
             return None
-        several = expected_ns - self._last[1] > 2 * STEP_NS
+        several = self.timing.period_ns > 2 * STEP_NS
         return expected_ns - REHEARSAL_NS if several and expected_ns != self._rehearsed_ns else None
 
     def _rehearse(self) -> None:

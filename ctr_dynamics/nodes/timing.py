@@ -61,7 +61,7 @@ class StepTiming:
     Steps that fall due while the start is still being solved (the static equilibrium of the first joints) are
     counted apart as `start`: the node cannot publish before it has a state.
 
-    `next_arrival_ns`: when the next joint state is to be expected, as long after the last one as their stamps are apart; None before two.
+    `period_ns`: between the stamps of the last two joint states; `next_arrival_ns`: when the next one is to be expected, None before two.
     """
 
     def __init__(self, policy: str, input_timeout_ns: int) -> None:
@@ -81,6 +81,7 @@ class StepTiming:
         self._worst: list[tuple[int, int]] = []  # heap of (lateness, k)
         self._arrivals: deque[tuple[int, int]] = deque(maxlen=4096)  # (joint stamp, arrival), stamps rising
         self._newest_ns: int | None = None  # stamp of the newest joint state
+        self.period_ns = 0
         self.next_arrival_ns: int | None = None
         self._last_k: int | None = None
         self._start_until_ns: int | None = None
@@ -91,7 +92,8 @@ class StepTiming:
             self._arrivals.append((joint_stamp_ns, arrival_ns))
         if self._newest_ns is None or joint_stamp_ns > self._newest_ns:
             if self._newest_ns is not None:
-                self.next_arrival_ns = arrival_ns + joint_stamp_ns - self._newest_ns
+                self.period_ns = joint_stamp_ns - self._newest_ns
+                self.next_arrival_ns = arrival_ns + self.period_ns
             self._newest_ns = joint_stamp_ns
 
     def restarted(self) -> None:
