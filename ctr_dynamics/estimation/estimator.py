@@ -183,8 +183,7 @@ class Estimator:
             self.health.misfit.add(self._unjudged.popleft())
         if self.runs.fused is None:
             return
-        if self.fusion.settle() and self.runs.kept[-1].k == self.k:
-            self.runs.keep(self.k)  # so that who returns to it need not do that again
+        self.runs.settle(self.k)
         if self._watch_due:
             self._watch_due = False
             self._watch_stability(self.k)

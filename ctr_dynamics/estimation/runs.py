@@ -259,6 +259,11 @@ class Runs:
         )  # fmt: skip
         return moment, position - estimate
 
+    def settle(self, k: int) -> None:
+        """What the outputs of step ``k`` did not wait for; who returns to that step need not do it again."""
+        if self.fusion.settle() and self.kept[-1].k == k:
+            self.keep(k)
+
     # -- states to return to --
 
     def keep(self, k: int, always: bool = False) -> None:
@@ -266,7 +271,7 @@ class Runs:
         if not (always or self.inputs.predicting) and k % KEEP_EVERY:
             return
         if self.kept and self.kept[-1].k == k:
-            self.kept.pop()  # the filter has started anew since
+            self.kept.pop()  # the filter has started anew or been settled since
         self.kept.append(self._now(k))
         oldest = k - self.inputs.window_ns // DT_NS - 9
         while len(self.kept) > 1 and self.kept[1].k <= oldest:

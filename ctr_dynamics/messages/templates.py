@@ -53,9 +53,8 @@ class Template:
         numbers: list[int] = []
         spans: list[tuple[int, int]] = []
         for layout in layouts:
-            self.data += bytes(
-                (4 - len(self.data)) % 8
-            )  # behind its first four bytes a message is aligned to eight
+            # behind its first four bytes a message is aligned to eight
+            self.data += bytes((4 - len(self.data)) % 8)
             begin = len(self.data)
             self.data += layout.data
             spans.append((begin, len(self.data)))
@@ -68,11 +67,13 @@ class Template:
         self._nanoseconds = self._seconds + 1
         self._slots = np.array(numbers, dtype=np.intp) // 8
 
-    def stamp(self, stamp_ns: int) -> None:
-        """Write the stamp wherever it stands."""
+    def stamped(self, stamp_ns: int) -> list[bytes]:
+        """The messages with the numbers that they hold and this stamp."""
         seconds, nanoseconds = split_stamp(stamp_ns)
         self._words[self._seconds] = seconds & 0xFFFFFFFF  # int32 seconds in a uint32 view
         self._words[self._nanoseconds] = nanoseconds
+        whole = bytes(self.data)
+        return [whole[begin:end] for begin, end in self._spans]
 
     def fill(self, stamp_ns: int, *values: NDArray | Sequence[float]) -> list[bytes]:
         """The messages with this stamp and these numbers.
@@ -81,14 +82,13 @@ class Template:
             NotFiniteError: a number is NaN or infinite.
         """
         numbers = np.concatenate(values, axis=None)
-        if not math.isfinite(numbers.sum()) and not np.isfinite(numbers).all():
+        if not math.isfinite(numbers.sum()):
             self._refuse(stamp_ns, numbers)
-        self.stamp(stamp_ns)
         self._doubles[self._slots] = numbers
-        whole = bytes(self.data)
-        return [whole[begin:end] for begin, end in self._spans]
+        return self.stamped(stamp_ns)
 
     def _refuse(self, stamp_ns: int, numbers: NDArray) -> None:
+        """Raises NotFiniteError for the first message whose numbers are not finite."""
         for topic, part in zip(self.topics, np.split(numbers, np.cumsum(self.counts)[:-1]), strict=True):
             if not np.isfinite(part).all():
                 raise NotFiniteError(topic, stamp_ns, part)
@@ -167,6 +167,4 @@ class PointCloudTemplate(Template):
         self._points[:] = np.asarray(points, dtype=np.float32).reshape(-1)
         if not np.isfinite(self._points).all():
             raise NotFiniteError(self.topics[0], stamp_ns, self._points.copy())
-        self.stamp(stamp_ns)
-        begin, end = self._spans[0]
-        return [bytes(self.data[begin:end])]
+        return self.stamped(stamp_ns)

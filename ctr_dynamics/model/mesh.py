@@ -138,9 +138,11 @@ def build_mesh(tubes: Tubes, beta: np.ndarray, key: Key, base_cells: int = 4) ->
     for i, segments in enumerate(tubes):
         # of a breakpoint just at the plate the side in front, and of a tube that begins there its beginning: a mesh serves other translations too
         ust0[i] = segments[at_plate[i]].curvature(-beta[i])
-        edges = -beta[i] * np.arange(base_cells + 1) / base_cells
-        means = [_mean_twist(segments, a, b) for a, b in itertools.pairwise(edges)]
-        ust_base[i] = [*np.repeat(means, STAGES).tolist(), ust0[i, 2]]
+        ust_base[i] = ust0[i, 2]
+        if beta[i] < 0.0:
+            edges = -beta[i] * np.arange(base_cells + 1) / base_cells
+            means = [_mean_twist(segments, a, b) for a, b in itertools.pairwise(edges)]
+            ust_base[i, :-1] = np.repeat(means, STAGES)
     return Mesh(
         sec_cells=cells,
         sec_tubes=np.array(present, dtype=np.int64),
@@ -154,12 +156,7 @@ def build_mesh(tubes: Tubes, beta: np.ndarray, key: Key, base_cells: int = 4) ->
 
 
 def _mean_twist(segments: tuple[Segment, ...], start: float, end: float) -> float:
-    """Mean of u*_z (1/m) between two arc lengths of a tube, exact across segments, so that the twist behind the plate is.
-
-    Where they are one, u*_z there."""
-    if end <= start:
-        here = next((g for g in segments if start < g.end), segments[-1])
-        return float(here.curvature(start)[2])
+    """Mean of u*_z (1/m) between two arc lengths of a tube, exact across segments, so that the twist behind the plate is."""
     total = 0.0
     for g in segments:
         a, b = max(start, g.start) - g.start, min(end, g.end) - g.start

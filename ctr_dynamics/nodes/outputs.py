@@ -39,8 +39,6 @@ class Outputs:
         self.withheld_behind_ns = (
             0  # how far the last step lay before what was published; 0: it was published
         )
-        self.valid: bool | None = None
-        self.reason = "no step has been taken yet: waiting for the first complete joint state"
         self._may_go_back = False
         self._last: Any = None  # the last step that was published
         self._encoder = encoder
@@ -69,9 +67,19 @@ class Outputs:
         self.last_stamp_ns = out.stamp_ns
         for message in messages:
             self._send(*message)
-        self.valid = bool(out.valid)
-        self.reason = out.reason
         return True
+
+    @property
+    def valid(self) -> bool | None:
+        """Whether the last step that was published is valid; None before the first."""
+        return None if self._last is None else bool(self._last.valid)
+
+    @property
+    def reason(self) -> str:
+        """Why it is not; empty when it is."""
+        if self._last is None:
+            return "no step has been taken yet: waiting for the first complete joint state"
+        return str(self._last.reason)
 
     def rehearse(self) -> None:
         """Make the last step's messages again, for nobody, so that the next ones are made sooner."""

@@ -272,10 +272,10 @@ class StepLoop(threading.Thread):
     def _rehearsal_ns(self) -> int | None:
         """When steps are to be rehearsed; None where that has been done, or where an input covers hardly more than one step."""
         expected_ns = self.timing.next_arrival_ns
-        if self._last is None or not self._wall or self.timing.policy == "predict" or expected_ns is None:
+        if expected_ns is None or expected_ns == self._rehearsed_ns or self._last is None or not self._wall:
             return None
-        several = self.timing.period_ns > 2 * STEP_NS
-        return expected_ns - REHEARSAL_NS if several and expected_ns != self._rehearsed_ns else None
+        several = self.timing.policy != "predict" and self.timing.period_ns > 2 * STEP_NS
+        return expected_ns - REHEARSAL_NS if several else None
 
     def _rehearse(self) -> None:
         """Go through steps a moment before several will be due at once, so that these meet warm caches."""

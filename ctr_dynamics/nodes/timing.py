@@ -88,13 +88,13 @@ class StepTiming:
 
     def arrived(self, joint_stamp_ns: int, arrival_ns: int) -> None:
         """A joint state came in; ones that do not bring the stamps forward cover nothing new."""
-        if not self._arrivals or joint_stamp_ns > self._arrivals[-1][0]:
-            self._arrivals.append((joint_stamp_ns, arrival_ns))
-        if self._newest_ns is None or joint_stamp_ns > self._newest_ns:
-            if self._newest_ns is not None:
-                self.period_ns = joint_stamp_ns - self._newest_ns
-                self.next_arrival_ns = arrival_ns + self.period_ns
-            self._newest_ns = joint_stamp_ns
+        if self._newest_ns is not None:
+            if joint_stamp_ns <= self._newest_ns:
+                return
+            self.period_ns = joint_stamp_ns - self._newest_ns
+            self.next_arrival_ns = arrival_ns + self.period_ns
+        self._newest_ns = joint_stamp_ns
+        self._arrivals.append((joint_stamp_ns, arrival_ns))
 
     def restarted(self) -> None:
         """The estimator starts anew: k begins at 0 again."""
