@@ -27,6 +27,8 @@ METADATA_NAME = "ctr_dynamics"
 _FILE_CHUNK_BYTES = 2**20
 _LIVE_CHUNK_BYTES = 2**16
 _LIVE_FLUSH_S = 0.5
+_COMPRESSION = CompressionType.LZ4
+"""Digits of numbers hardly compress: zstd makes 15 % less of them, in five times the time."""
 
 
 @contextlib.contextmanager
@@ -83,7 +85,7 @@ class BagWriter:
     """
 
     def __init__(self, stream: IO[bytes], metadata: Mapping[str, str]) -> None:
-        self._writer = Writer(stream, chunk_size=_FILE_CHUNK_BYTES, compression=CompressionType.ZSTD)
+        self._writer = Writer(stream, chunk_size=_FILE_CHUNK_BYTES, compression=_COMPRESSION)
         self._writer.start(profile="ros2", library=LIBRARY)
         self._writer.add_metadata(METADATA_NAME, dict(metadata))
         self._channels = _Channels(self._writer)
@@ -150,7 +152,7 @@ class LiveRecorder:
         self._writer = Writer(
             cast(IO[bytes], _Unbuffered(self._stream)),
             chunk_size=_LIVE_CHUNK_BYTES,
-            compression=CompressionType.LZ4,
+            compression=_COMPRESSION,
         )
         self._writer.start(profile="ros2", library=LIBRARY)
         self._writer.add_metadata(METADATA_NAME, dict(metadata))
