@@ -13,6 +13,8 @@ from .kernels import corrected_rows, stage_rows
 from .signals import Samples
 
 Floats = NDArray[np.float64]
+REJOIN_S = 0.01
+"""Time constant with which actuators that differ from what is known of them join it: a few steps, so that their rates stay those of a motion."""
 
 
 class Signals:
@@ -26,14 +28,44 @@ class Signals:
     def clear(self) -> None:
         """Forget the step: other times or inputs come."""
         self._known: dict[bytes, tuple[Floats, Floats]] = {}
+        self._from: tuple[float, Floats] | None = None
+
+    def go_on_from(self, t: float, inputs: Inputs) -> None:
+        """Have the actuators go on, after ``t`` (s), from where ``inputs`` had them then, and join what is known of them now little by little.
+
+        Joints that come in change what was extrapolated. A course that goes on without having been corrected for that would take the change as
+        a jump of the actuators within one step.
+        """
+        known, _ = self.rows(np.array([t]))
+        self.clear()
+        n = self.n
+        self._from = (
+            t,
+            np.concatenate([inputs.alpha, inputs.beta]) - np.delete(known[0, : 3 * n], slice(n, 2 * n)),
+        )
 
     def rows(self, times: Floats) -> tuple[Floats, Floats]:
         """(stages, inputs) rows as :func:`ctr_dynamics.model.simulator.stage_inputs` orders them at ``times`` (stages,) s from t0, and beta's
         rate (N,) m/s at the last."""
         key = times.tobytes()
         if key not in self._known:
-            self._known[key] = self._at(times)
+            rows, beta_rate = self._at(times)
+            if self._from is not None:
+                self._join(times, rows, beta_rate)
+            self._known[key] = rows, beta_rate
         return self._known[key]
+
+    def _join(self, times: Floats, rows: Floats, beta_rate: Floats) -> None:
+        """Add what is left of the difference at ``times`` to the actuators and their rates."""
+        assert self._from is not None
+        n, (t, difference) = self.n, self._from
+        left = np.exp((t - times) / REJOIN_S)[:, None] * difference
+        rate = left / -REJOIN_S
+        rows[:, :n] += left[:, :n]
+        rows[:, n : 2 * n] += rate[:, :n]
+        rows[:, 2 * n : 3 * n] += left[:, n:]
+        rows[:, 3 * n + 6 :] += rate[:, n : self.count - 2 * n - 6]
+        beta_rate += rate[-1, n:]
 
     def _at(self, times: Floats) -> tuple[Floats, Floats]:
         n, t0_ns, joints, load = self.n, self.inputs.t0_ns, self.inputs.joints, self.inputs.load

@@ -262,7 +262,7 @@ class Estimator:
         # fused for the time being, and counted when they are fused again.
         behind, before = self._behind, len(self.runs.innovations)
         counters = self.health.of_samples() if behind > SAME_COURSE else None
-        result = self.runs.step(k, fuse=behind == 0 or behind > SAME_COURSE)
+        result = self.runs.step(k, fuse=behind == 0 or behind > SAME_COURSE, uncorrected=behind > 0)
         if counters is not None:
             self._recount(counters, before, [])
         self.health.sweeps += result.sweeps

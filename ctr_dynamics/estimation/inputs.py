@@ -192,6 +192,7 @@ class InputBuffer:
                 f"load came {late:.3f} s after its stamp and after newer ones, limit {self.window_ns * 1e-9:g} s",
             )
             return None
+        known = load.at(stamp_ns)[0] if load.stamps else np.zeros(6)
         if load.stamps[:1] == [self._opening] and stamp_ns < load.stamps[0]:
             del load.stamps[0], load.values[0]  # it opened before a load that was taken for the first
             first = True
@@ -217,7 +218,7 @@ class InputBuffer:
             from_ns = load.stamps[i - 1]
         else:
             return None
-        return from_ns, bool(np.any(np.abs(value - before) > self.model.load_kink))
+        return from_ns, bool(np.any(np.abs(value - known) > self.model.load_kink))
 
     def _open_load(self, t0_ns: int) -> None:
         """Before the first load there is none, or that one if it comes soon enough after the first joints."""

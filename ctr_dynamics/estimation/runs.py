@@ -128,12 +128,23 @@ class Runs:
         self.keep(k, always=True)
         return ""
 
-    def step(self, k: int, track: Kept | None = None, *, keep: bool = True, fuse: bool = True) -> StepResult:
+    def step(
+        self,
+        k: int,
+        track: Kept | None = None,
+        *,
+        keep: bool = True,
+        fuse: bool = True,
+        uncorrected: bool = False,
+    ) -> StepResult:
         """Both runs from step k - 1 to k, and, unless not to ``fuse``, every sample that has become due; with ``track`` the covariance is taken
-        from there. Without ``keep`` the state is kept at every eighth step only."""
+        from there. Without ``keep`` the state is kept at every eighth step only. ``uncorrected``: the runs were driven by other joints than
+        are known now, and go on from those."""
         assert self.fused is not None and self.alone is not None
         before, t = seconds(k - 1), seconds(k)
         self._signals.clear()
+        if uncorrected:
+            self._signals.go_on_from(before, self.alone.inputs)
         result, alone = self._step_both(before, events=self.inputs.load_bends(k), record=track is None)
         if not alone.ok:
             return alone

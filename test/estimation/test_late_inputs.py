@@ -1,11 +1,12 @@
 """Inputs that come late, out of order or early: roll-back, the window of kept tips, and the two output policies."""
 
 import math
+from collections import Counter
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from estimation_cases import bag_messages, check_outputs, estimator, play
+from estimation_cases import START_NS, bag_messages, check_outputs, estimator, play
 
 STEP = 0.003
 
@@ -138,6 +139,43 @@ def test_corrections_without_time_are_put_off_and_end_the_same(sweep, in_time, s
     # poses are compared with the corrected course, and not with what was published before the correction
     apart = [abs(found[stamp] - expected[stamp]) for stamp in found]
     assert np.mean(apart) < 0.05
+
+
+@pytest.mark.parametrize(("delay", "time_for", "limit"), [(0.002, 3, 0.05e-3), (0.012, 4, 0.2e-3)])
+def test_steps_before_their_correction_do_not_take_it_for_a_jump_of_the_joints(sweep, delay, time_for, limit):
+    """Between two steps there is time for a few of a correction; what is published meanwhile stays near the course that is corrected at once."""
+    late = [m.late(delay) if m.kind == "joints" and m.stamp > 0 else m for m in sweep if m.stamp < 1.5e9]
+    asked = Counter()
+
+    def spare(made):
+        asked[made.k] += 1
+        return math.inf if asked[made.k] <= time_for else 0.0
+
+    run, at_once = (
+        play(late, {"output.policy": "predict"}, tick=0.001, spare=spare_s) for spare_s in (spare, None)
+    )
+    apart = [
+        np.linalg.norm(a.tip_position - b.tip_position)
+        for a, b in zip(run.outputs, at_once.outputs, strict=True)
+        if a.k > 100
+    ]
+    assert np.sqrt(np.mean(np.square(apart))) < limit
+
+
+def test_a_late_load_has_jumped_where_it_is_not_what_was_taken_for_its_time(release):
+    """Between two loads that are known the model has taken the line; a third one there is compared with that."""
+    run = play([m for m in release if m.kind == "joints" and m.stamp <= 0.1e9])
+    inputs, k = run.estimator.inputs, run.estimator.k
+
+    def jumped(t, force):
+        change = inputs.add_load(START_NS + round(t * 1e9), [force, 0.0, 0.0], [0.0] * 3, "", k)
+        assert change is not None
+        return change[1]
+
+    assert jumped(0.05, 1.0)
+    assert jumped(0.15, 0.0)
+    assert not jumped(0.10, 0.5)
+    assert jumped(0.13, 1.0)
 
 
 def test_a_course_without_time_for_its_correction_is_corrected_in_the_end(sweep, in_time):
