@@ -12,6 +12,7 @@ import json
 import math
 import time
 from array import array
+from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import partial
@@ -37,6 +38,7 @@ if TYPE_CHECKING:
 
 MakeEstimator = Callable[[Robot, Settings], "Estimator"]
 Progress = Callable[[float, int], None]
+AGES = 100  # joint states of which the quickest tells the difference of the clocks
 _WARM_UP_NS = 300_000_000
 _MAX_STRETCHES = 100
 
@@ -58,14 +60,16 @@ class StampClock:
     """Time on the clock of the stamps at a message's arrival, from its log time.
 
     Drivers may stamp by another clock than the recorder's. The smallest difference between a joint state's
-    log time and its stamp so far is taken as that of the clocks. A single stamp that is wildly off does not
-    count; three in a row do. The time given runs backwards only then.
+    log time and its stamp among the last ones is taken as that of the clocks: clocks drift, and a stamp may be
+    ahead of its time. A single stamp that is wildly off does not count; three in a row do. The time given runs
+    backwards only then.
     """
 
     LIMIT_NS = 1_000_000_000
 
     def __init__(self) -> None:
         self._offset_ns: int | None = None
+        self._offsets: deque[int] = deque(maxlen=AGES)
         self._now_ns: int | None = None
         self._streak = 0
 
@@ -80,17 +84,15 @@ class StampClock:
         return self._now_ns
 
     def _update(self, offset_ns: int) -> None:
-        if self._offset_ns is None:
-            self._offset_ns = offset_ns
-        elif abs(offset_ns - self._offset_ns) <= self.LIMIT_NS:
-            self._offset_ns = min(self._offset_ns, offset_ns)
-            self._streak = 0
-        else:
+        if self._offset_ns is not None and abs(offset_ns - self._offset_ns) > self.LIMIT_NS:
             self._streak += 1
-            if self._streak >= 3:
-                self._offset_ns = offset_ns
-                self._streak = 0
-                self._now_ns = None
+            if self._streak < 3:
+                return
+            self._offsets.clear()
+            self._now_ns = None
+        self._streak = 0
+        self._offsets.append(offset_ns)
+        self._offset_ns = min(self._offsets)
 
 
 def arrivals(messages: Iterator[InputMessage]) -> Iterator[list[InputMessage]]:

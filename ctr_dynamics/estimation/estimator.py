@@ -256,6 +256,7 @@ class Estimator:
             self._no_start = (k, reason) if reason else None
             if reason:
                 self.health.failed("no static equilibrium")
+                self.inputs.forget(k)
                 return self._invalid(k, reason)
             return self._output(k, StepResult(True, "at rest", 0, 0, 0))
         # A course that is known to be wrong says nothing of the robot: samples wait for its correction, or, where that is not soon, are
@@ -389,7 +390,7 @@ class Estimator:
         if age > limit:
             return f"joint states are missing: the last is {age:.3f} s old, limit {limit:g} s"
         if self.health.fusing and self.health.rejecting:
-            return "the tracker contradicts the model: most samples of the last second are outside the gate"
+            return "the tracker contradicts the model: most of its last samples are outside the gate"
         return ""
 
     def _output(self, k: int, result: StepResult) -> StepOutput:
@@ -413,11 +414,11 @@ class Estimator:
                 f"the tracker has led the estimate astray: deviation of the tip {math.sqrt(variance):.2g} m, limit {LOST:g} m; "
                 "the filter starts anew from the model alone",
             )
+        since = self.runs.sampled_ns if self.runs.sampled_ns is not None else self.t0_ns
+        self.health.tracker_age_s = max(0.0, (stamp - (since or stamp)) * 1e-9)
         problem = self._problem(k)
         self.health.problem = problem
         self._watch_due |= k % STABILITY_EVERY == 0
-        since = self.runs.sampled_ns if self.runs.sampled_ns is not None else self.t0_ns
-        self.health.tracker_age_s = max(0.0, (stamp - (since or stamp)) * 1e-9)
         return StepOutput(
             stamp, k, not problem, problem, tip.position, tip.quaternion, tip.covariance[:6, :6], tip.twist, tip.covariance[6:, 6:],
             predicted[:3], predicted[3:], self._backbone.rows(self.runs.fused), self._modes.measure(self.runs.fused), self.fusion.force,

@@ -22,6 +22,7 @@ from ctr_dynamics.model.simulator import Inputs, Simulator, State, StepResult
 
 from .columns import Columns
 from .kernels import fade, move_unknowns, outside
+from .outputs import FUSION_OFF
 from .reduction import APPENDED, reduced
 from .tip import TipWindow
 from .tracker import DELAY, DRIFT, STATES, TrackerModel, innovation
@@ -288,7 +289,11 @@ class Fusion:
     def compare(self, stamp: float, position: Floats, quaternion: Floats) -> Update:
         """The innovation of a reading that is not fused."""
         found = self._innovation(stamp, position, quaternion)
-        return found if isinstance(found, Update) else found[3]._replace(reason="fusion is off")
+        if isinstance(found, Update):
+            return found
+        compared = found[3]
+        within = compared.nis <= self._gate[compared.dof]
+        return compared._replace(reason=FUSION_OFF if within else "outside the gate")
 
     def _innovation(
         self, stamp: float, position: Floats, quaternion: Floats

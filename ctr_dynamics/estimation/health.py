@@ -14,7 +14,7 @@ from scipy.stats import chi2
 from ctr_dynamics.snap.stability import Stability
 
 from .misfit import MisfitMonitor
-from .outputs import ERROR, OK, WARN, Innovation, Status
+from .outputs import ERROR, FUSION_OFF, OK, WARN, Innovation, Status
 
 Floats = NDArray[np.float64]
 SNAP_WARNING_S = 1.0  # a snap that is nearer than this is warned of
@@ -103,7 +103,8 @@ class Health:
         self.nis_count += 1
         self.nis_sum += sample.nis
         self.nis_dof += sample.dof
-        self.recent.append((sample.nis / sample.dof, sample.accepted and not sample.reason))
+        within = sample.reason == FUSION_OFF or (sample.accepted and not sample.reason)
+        self.recent.append((sample.nis / sample.dof, within))
         self._within = sum(inside for _, inside in self.recent)
         if sample.accepted:
             self.accepted += 1
@@ -126,6 +127,7 @@ class Health:
             setattr(self, name, value)
         self.recent.clear()
         self.recent.extend(recent)
+        self._within = sum(inside for _, inside in self.recent)
 
     def begin_anew(self) -> None:
         """Wait for joints and watch afresh; counters of what was odd stay."""
@@ -135,9 +137,18 @@ class Health:
         self._squares, self._compared = (0.0, 0.0), 0
 
     @property
+    def _sampled(self) -> bool:
+        return self.tracker_age_s <= TRACKER_LIMIT_S
+
+    @property
+    def misfitting(self) -> bool:
+        """Whether the misfit monitor's alarm stands and samples still come."""
+        return self.misfit.alarm and self._sampled
+
+    @property
     def rejecting(self) -> bool:
-        """Whether most recent samples lay outside the gate: the tracker and the model do not describe the same robot."""
-        return self._within < 0.5 * len(self.recent) and len(self.recent) >= 20
+        """Whether samples come and most of the last lay outside the gate: the tracker and the model do not describe the same robot."""
+        return self._sampled and self._within < 0.5 * len(self.recent) and len(self.recent) >= 20
 
     def nis_summary(self) -> dict[str, float | int | bool | None]:
         """Mean NIS per degree of freedom with the 95 % band of that mean for a consistent filter."""
@@ -211,7 +222,7 @@ class Health:
                 "check the tracker's frame, units, stamps and the robot file"
             )
             return Status("tracker", ERROR, message, values)
-        if self.tracker_age_s > TRACKER_LIMIT_S:
+        if not self._sampled:
             message = (
                 f"no usable sample for {self.tracker_age_s:.1f} s, limit {TRACKER_LIMIT_S:g} s: "
                 "the pose is the model's prediction since then"

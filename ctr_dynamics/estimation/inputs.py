@@ -276,6 +276,11 @@ class InputBuffer:
                 first = min(first, sample.fused_k)
         return first
 
+    def forget(self, k: int) -> None:
+        """Drop what no start at step ``k`` or later needs."""
+        self.forget_signals(k - self.window_ns // DT_NS)
+        self.forget_samples(k)
+
     def forget_signals(self, k: int) -> None:
         """Drop joints and loads that no step from ``k`` on needs."""
         assert self.t0_ns is not None
@@ -288,4 +293,5 @@ class InputBuffer:
         assert self.t0_ns is not None
         limit = self.t0_ns + k * DT_NS - 2 * self.window_ns - 300_000_000
         while self.samples and self.samples[0].stamp_ns < limit:
-            self.samples.pop(0)
+            if self.samples.pop(0).fused_k is None:
+                self._drop("never compared", "no estimate reached the pose's time within the window")

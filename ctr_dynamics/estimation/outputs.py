@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 
 OK, WARN, ERROR = 0, 1, 2
+FUSION_OFF = "fusion is off"
 
 
 class Modes(NamedTuple):

@@ -186,6 +186,9 @@ class EstimatorNode(Node):
         except CdrError as error:
             self._note_undecodable(topics.JOINT_STATES, error)
             return
+        if arrival_ns <= 0:  # before the first /clock: the arrival tells nothing of the stamps' clock
+            self._estimator.add_joint_state(message.stamp_ns, message.names, message.positions)
+            return
         clock = self.loop.stamp_clock
         if not clock.sample(message.stamp_ns, arrival_ns):
             ahead_s = (message.stamp_ns - clock.at(arrival_ns)) * 1e-9
@@ -228,7 +231,7 @@ class EstimatorNode(Node):
         """Diagnostics, at once when validity or the warning of a snap has changed and else at 2 Hz of the wall clock."""
         monotonic_ns = time.monotonic_ns()
         if self.rolling is not None:
-            self.rolling.alarm(self._estimator.health.misfit.alarm, monotonic_ns)
+            self.rolling.alarm(self._estimator.health.misfitting, monotonic_ns)
         before, now = self._shown, (self.outputs.valid, self._estimator.health.snap_ahead)
         due_ns = self._next_diagnostics_ns + (0 if pause else DIAGNOSTICS_WAIT_NS)
         if now == before and monotonic_ns < due_ns:
@@ -359,7 +362,7 @@ class EstimatorNode(Node):
         if self.recorder is not None:
             self.recorder.close()
         if self.rolling is not None:
-            self.rolling.close(self._estimator.health.misfit.alarm)
+            self.rolling.close(self._estimator.health.misfitting)
         path = self.settings["timing_report"]
         try:
             if path:

@@ -79,7 +79,7 @@ class StampClock:
     """Time on the clock of the joint stamps, from the node's clock.
 
     The two are one clock as long as stamps arrive within `limit_ns` of their own time. Otherwise the smallest
-    difference so far is taken as that of the clocks, so that steps still follow real time. One stamp that is
+    difference of the last joint states is taken as that of the clocks, so that steps still follow real time. One stamp that is
     wildly off changes nothing, three in a row do.
     """
 
@@ -98,14 +98,11 @@ class StampClock:
             self._streak += 1
             if self._streak < 3:
                 return offset > self.offset_ns
+            self._ages.clear()
         self._streak = 0
         self._ages.append(offset)
         self.agrees = abs(offset) <= self.limit_ns
-        if self.agrees:
-            offset = 0
-        elif self._known and abs(offset - self.offset_ns) <= self.limit_ns:
-            offset = min(offset, self.offset_ns)
-        self.offset_ns = offset
+        self.offset_ns = 0 if self.agrees else self.age_ns
         self._known = True
         return True
 

@@ -450,6 +450,20 @@ def test_stamp_clock_survives_one_wild_stamp_and_follows_a_lasting_change():
     assert back[-1] == 90_000_000, "and back again, or steps would be due up to a time that never comes"
 
 
+def test_stamp_clock_forgets_a_stamp_ahead_of_its_time_and_follows_a_drift():
+    clock = StampClock()
+    period = 10_000_000
+    for i in range(300):
+        ahead = 500_000_000 * (i == 20)
+        now = clock.now_ns(joint_at(i * period + ahead, i * period))
+    assert now == 299 * period
+    drift = 1.001  # the log's clock is the faster one
+    for i in range(300, 3000):
+        now = clock.now_ns(joint_at(i * period, round(i * period * drift)))
+    assert now is not None
+    assert 0 <= now - 2999 * period < 2 * 100 * period * (drift - 1.0)
+
+
 def test_arrivals_are_grouped_by_log_time():
     items = [joint_at(1, 10), pose_at(2, 10), joint_at(3, 20), joint_at(4, 30), pose_at(5, 30)]
     assert [len(group) for group in arrivals(iter(items))] == [2, 1, 2]

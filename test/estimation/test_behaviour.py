@@ -105,6 +105,41 @@ def test_lasting_contradiction_is_said(release):
     assert "limit half" in status.message
 
 
+def test_a_contradiction_ends_with_the_samples_that_showed_it():
+    """A tracker that is unplugged leaves the model's prediction, as one does that has never been there."""
+    rng = np.random.default_rng(0)
+    kept = [m for m in bag_messages("clean_release", 2.2) if m.kind != "pose" or m.stamp < 0.7e9]
+    run = play(reshaped(kept, lambda p, q, m: (p + rng.uniform(-0.3, 0.3, 3), q)))
+    assert any("tracker contradicts the model" in out.reason for out in run.outputs)
+    since = [out for out in run.outputs if out.k * 0.003 > 1.75]
+    assert since
+    assert all(out.valid for out in since), {out.reason for out in since}
+    assert not run.estimator.health.rejecting
+    status = next(s for s in run.estimator.health.statuses() if s.name == "tracker")
+    assert "no usable sample" in status.message
+
+
+def test_samples_that_are_not_fused_contradict_nothing(release):
+    run = play([m for m in release if m.stamp < 2e9], {"filter.enabled": False})
+    status = next(s for s in run.estimator.health.statuses() if s.name == "tracker")
+    assert status.level == 0
+    run.estimator.set_fusion(True)
+    assert not run.estimator.health.rejecting
+
+
+def test_without_an_equilibrium_nothing_piles_up(release):
+    """A load in other units: no start is found, and what came long ago is let go of."""
+    joints = next(m for m in release if m.kind == "joints")
+    load = [replace(joints, kind="load", content=((5e4, 0.0, 0.0), (0.0, 0.0, 0.0), ""))]
+    run = play([m for m in release if m.kind != "load"] + load)
+    assert not any(out.valid for out in run.outputs)
+    inputs = run.estimator.inputs
+    assert len(inputs.joints.stamps) < 100
+    assert len(inputs.samples) < 100
+    assert run.estimator.health.tracker["never compared"].count > 20
+    assert run.estimator.health.dropped > 20
+
+
 def test_fusion_off_is_the_model_alone(release):
     run = play(release, {"filter.enabled": False})
     assert np.abs(run.column("tip_position") - run.column("predicted_position")).max() < 1e-6
