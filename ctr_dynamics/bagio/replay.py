@@ -23,7 +23,7 @@ import numpy as np
 
 from ctr_dynamics import __version__
 from ctr_dynamics.bagio.reader import Bag, InputMessage, open_bag
-from ctr_dynamics.bagio.writer import BagWriter, atomic_file, write_bag
+from ctr_dynamics.bagio.writer import BagWriter, atomic_file, check_targets, write_bag
 from ctr_dynamics.collector import seldom_collected
 from ctr_dynamics.errors import InputError
 from ctr_dynamics.messages.cdr import JointStateIn, PoseIn
@@ -239,7 +239,10 @@ def replay(
     if not isinstance(robot, Robot):
         robot = load_robot(robot)
     settings = settings.replace({"robot": robot.source or robot.name})
-    _check_targets(opened, {"output": output, "summary": summary, "report": report})
+    read = {"bag" if i == 0 else f"bag's part {i + 1}": file.path for i, file in enumerate(opened.files)}
+    check_targets(
+        {"output": output, "summary": summary, "report": report}, {**read, "robot file": robot.source}
+    )
     inputs = opened.sha256()
     provenance = {
         "version": __version__,
@@ -353,18 +356,6 @@ def _metadata(provenance: dict[str, Any]) -> dict[str, str]:
         key: value if isinstance(value, str) else json.dumps(plain(value), sort_keys=True)
         for key, value in provenance.items()
     }
-
-
-def _check_targets(bag: Bag, targets: dict[str, str | Path | None]) -> None:
-    """No output may be an input, nor another output: said before the work, not after it."""
-    taken = {file.path.resolve(): "the bag that is read" for file in bag.files}
-    for what, path in targets.items():
-        if path is None:
-            continue
-        target = Path(path).resolve()
-        if target in taken:
-            raise InputError(f"{what} is {taken[target]}", where=str(path), do="give another name")
-        taken[target] = f"the same file as the {what}"
 
 
 def _input_notes(problems: dict[str, dict[str, Any]]) -> list[str]:

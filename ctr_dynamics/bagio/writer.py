@@ -57,6 +57,26 @@ def atomic_file(path: Path) -> Iterator[Path]:
         temporary.unlink(missing_ok=True)
 
 
+def check_targets(targets: Mapping[str, str | Path | None], read: Mapping[str, str | Path | None]) -> None:
+    """No output may be an input, nor another output: said before the work, not after it.
+
+    Args:
+        targets: files to write, by what they are; None for one that is not asked for.
+        read: files that are read, likewise; names that are no path of a file do no harm.
+
+    Raises:
+        InputError: two of them are one file.
+    """
+    taken = {Path(path).resolve(): f"the {what} that is read" for what, path in read.items() if path}
+    for what, path in targets.items():
+        if path is None:
+            continue
+        target = Path(path).resolve()
+        if target in taken:
+            raise InputError(f"{what} is {taken[target]}", where=str(path), do="give another name")
+        taken[target] = f"the same file as the {what}"
+
+
 class _Channels:
     """Registers a topic's definition and channel when its first message comes."""
 

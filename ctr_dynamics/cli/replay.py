@@ -12,6 +12,7 @@ import typer
 
 from ctr_dynamics.bagio.replay import Progress, ReplayResult
 from ctr_dynamics.bagio.replay import replay as run_replay
+from ctr_dynamics.bagio.writer import check_targets
 from ctr_dynamics.parameters import Settings, parse_assignments, read_parameter_file
 
 
@@ -132,6 +133,7 @@ def replay(
     Messages are taken in the order of their log time. Twice the same bag, robot and parameters give the same
     output, byte for byte. Exit code 1 when some steps failed.
     """
+    check_targets({"output": output, "summary": summary, "report": report}, {"parameter file": params})
     settings = settings_for_replay(params, assignments or [], not no_fusion)
     with _progress(bag.name or str(bag)) as progress:
         result = run_replay(

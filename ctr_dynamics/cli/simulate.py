@@ -8,6 +8,7 @@ from typing import Annotated
 
 import typer
 
+from ctr_dynamics.bagio.writer import check_targets
 from ctr_dynamics.robot import load_robot
 from ctr_dynamics.simulation import load_scenario, scenario_names, write_recording
 from ctr_dynamics.simulation import simulate as run_scenario
@@ -40,6 +41,7 @@ def simulate(
     The bag has the input topics /ctr/joint_states, /ctr/tracker/tip and, with known loads, /ctr/tip_load.
     Exit code 1 when the solver could not follow the scenario to its end; the bag then ends there.
     """
+    check_targets({"output": output}, {"scenario": scenario, "robot file": robot})
     loaded, of = load_scenario(scenario), load_robot(robot)
     recording = run_scenario(loaded, of, _progress)
     count = write_recording(output, loaded, of, recording)

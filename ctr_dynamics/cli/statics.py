@@ -10,7 +10,7 @@ from typing import Annotated
 
 import typer
 
-from ctr_dynamics.bagio.writer import atomic_file
+from ctr_dynamics.bagio.writer import atomic_file, check_targets
 from ctr_dynamics.errors import InputError
 from ctr_dynamics.model.model import Model
 from ctr_dynamics.model.pose_table import output_cells, output_header, read_poses, solve_poses
@@ -46,6 +46,7 @@ def statics(
     """
     if not 8 <= nodes <= 1000:
         raise InputError(f"--nodes {nodes} is outside 8 to 1000", do="100 is accurate to a micrometre")
+    check_targets({"output": output}, {"table of poses": poses, "robot file": robot})
     model = Model(load_robot(robot), nodes=nodes)
     table, spare = read_poses(poses, model)
     if spare:
