@@ -12,7 +12,6 @@ import json
 import math
 import time
 from array import array
-from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import partial
@@ -26,11 +25,12 @@ from ctr_dynamics.bagio.reader import Bag, InputMessage, open_bag
 from ctr_dynamics.bagio.writer import BagWriter, atomic_file, check_targets, write_bag
 from ctr_dynamics.collector import seldom_collected
 from ctr_dynamics.errors import InputError
-from ctr_dynamics.messages.cdr import JointStateIn, PoseIn
+from ctr_dynamics.messages.cdr import CdrError, JointStateIn, PoseIn, decode_stamp
 from ctr_dynamics.messages.encode import StepEncoder
-from ctr_dynamics.messages.topics import JOINT_STATES
+from ctr_dynamics.messages.topics import JOINT_STATES, STEP_NS
 from ctr_dynamics.parameters import Settings
 from ctr_dynamics.robot import Robot, load_robot
+from ctr_dynamics.stamps import EachOnce, StampClock
 
 if TYPE_CHECKING:
     from ctr_dynamics.estimation.estimator import Estimator, StepOutput
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 
 MakeEstimator = Callable[[Robot, Settings], "Estimator"]
 Progress = Callable[[float, int], None]
-AGES = 100  # joint states of which the quickest tells the difference of the clocks
+AFTER_NS = 1_000_000_000  # what arrives later than this after the last joint state changes no step
 _WARM_UP_NS = 300_000_000
 _MAX_STRETCHES = 100
 
@@ -56,43 +56,16 @@ class ReplayResult:
         return int(self.summary["solver"]["failures"])
 
 
-class StampClock:
-    """Time on the clock of the stamps at a message's arrival, from its log time.
-
-    Drivers may stamp by another clock than the recorder's. The smallest difference between a joint state's
-    log time and its stamp among the last ones is taken as that of the clocks: clocks drift, and a stamp may be
-    ahead of its time. A single stamp that is wildly off does not count; three in a row do. The time given runs
-    backwards only then.
-    """
-
-    LIMIT_NS = 1_000_000_000
-
-    def __init__(self) -> None:
-        self._offset_ns: int | None = None
-        self._offsets: deque[int] = deque(maxlen=AGES)
-        self._now_ns: int | None = None
-        self._streak = 0
-
-    def now_ns(self, item: InputMessage) -> int | None:
-        """None before the first joint state."""
-        if isinstance(item.message, JointStateIn):
-            self._update(item.log_ns - item.message.stamp_ns)
-        if self._offset_ns is None:
-            return None
-        now = item.log_ns - self._offset_ns
-        self._now_ns = now if self._now_ns is None else max(now, self._now_ns)
-        return self._now_ns
-
-    def _update(self, offset_ns: int) -> None:
-        if self._offset_ns is not None and abs(offset_ns - self._offset_ns) > self.LIMIT_NS:
-            self._streak += 1
-            if self._streak < 3:
-                return
-            self._offsets.clear()
-            self._now_ns = None
-        self._streak = 0
-        self._offsets.append(offset_ns)
-        self._offset_ns = min(self._offsets)
+def last_joints(bag: Bag) -> tuple[int, int]:
+    """The last stamp of a joint state, ns, stamps of one that is wildly ahead left out, and the last log time of one."""
+    clock = StampClock(own=False)
+    last_ns = last_log_ns = 0
+    for _, log_ns, data in bag.messages({JOINT_STATES}):
+        with contextlib.suppress(CdrError):
+            stamp_ns = decode_stamp(data)
+            if clock.sample(stamp_ns, log_ns):
+                last_ns, last_log_ns = max(last_ns, stamp_ns), log_ns
+    return last_ns, last_log_ns
 
 
 def arrivals(messages: Iterator[InputMessage]) -> Iterator[list[InputMessage]]:
@@ -114,7 +87,10 @@ class Player:
         self.estimator = estimator
         estimator.step_times_s = array("d")
         self.joint_names: set[str] = set()
-        self._clock = StampClock()
+        self.unused = 0  # messages that came too long after the last joints
+        self._clock = StampClock(own=False)
+        self._now_ns: int | None = None
+        self._last_ns = 0  # the last joint stamp
         self._call_times_s = array("d")
 
     def times_s(self) -> Sequence[float]:
@@ -132,18 +108,19 @@ class Player:
         Args:
             until_ns: log time at which to stop early; no closing steps then.
         """
-        now_ns: int | None = None
+        self._last_ns, last_log_ns = last_joints(bag)
         for group in arrivals(bag.inputs()):
-            if until_ns is not None and group[0].log_ns > until_ns:
+            log_ns = group[0].log_ns
+            if until_ns is not None and log_ns > until_ns:
                 return
-            arrivals_ns = [self._clock.now_ns(item) for item in group]
-            if arrivals_ns[0] is not None and now_ns is not None and arrivals_ns[0] - 1 > now_ns:
-                # What a live node would have done by itself before these messages came.
-                yield from self._advance(arrivals_ns[0] - 1)
+            if log_ns > last_log_ns + AFTER_NS:
+                self.unused += len(group)
+                continue
+            # what a live node would have done by itself before these messages came
+            yield from self._advance(log_ns - 1)
             for item in group:
                 self._add(item)
-            now_ns = arrivals_ns[-1]
-            yield from self._advance(now_ns)
+            yield from self._advance(log_ns)
         if until_ns is None:
             yield from self._timed(self.estimator.finish)
 
@@ -152,7 +129,11 @@ class Player:
         if isinstance(message, JointStateIn):
             if len(self.joint_names) < 100:
                 self.joint_names.update(message.names[:100])
-            self.estimator.add_joint_state(message.stamp_ns, message.names, message.positions)
+            if self._clock.sample(message.stamp_ns, item.log_ns):
+                self.estimator.add_joint_state(message.stamp_ns, message.names, message.positions)
+            else:
+                refusal = self._clock.refusal(message.stamp_ns, item.log_ns)
+                self.estimator.health.note("joints", "far ahead", refusal)
         elif isinstance(message, PoseIn):
             self.estimator.add_tracker_pose(
                 message.stamp_ns, message.position, message.quaternion_xyzw, message.frame_id
@@ -160,9 +141,14 @@ class Player:
         else:
             self.estimator.add_tip_load(message.stamp_ns, message.force, message.torque, message.frame_id)
 
-    def _advance(self, now_ns: int | None) -> Iterator[StepOutput]:
-        if now_ns is not None:
-            yield from self._timed(partial(self.estimator.advance, now_ns))
+    def _advance(self, log_ns: int) -> Iterator[StepOutput]:
+        """Take what is due at that log time; the stamps' time goes back only where their clock has been set back."""
+        if self._clock.known:
+            now_ns = self._clock.at(log_ns)
+            if self._now_ns is not None and 0 < self._now_ns - now_ns <= self._clock.limit_ns:
+                now_ns = self._now_ns
+            self._now_ns = now_ns
+            yield from self._timed(partial(self.estimator.advance, min(now_ns, self._last_ns)))
 
     def _timed(self, call: Callable[[], list[StepOutput]]) -> Iterator[StepOutput]:
         begin = time.perf_counter()
@@ -262,7 +248,7 @@ def replay(
         log = _report_log(estimator, opened) if report_part is not None else None
         stack.enter_context(seldom_collected())
         numbers, times_s = _run(opened, estimator, robot, settings, writer, progress, log)
-        notes = [*opened.notes, *_input_notes(numbers["input_problems"])]
+        notes = [*opened.notes, *_input_notes(numbers["input_problems"]), *_left_out(numbers)]
         content = plain({**numbers, **provenance, "notes": notes})
         if summary_part is not None:
             text = json.dumps(content, indent=1, allow_nan=False, ensure_ascii=False)
@@ -305,12 +291,16 @@ def _run(
     encoder = StepEncoder(settings["output.frame_id"], robot.name, settings["output.backbone_every"])
     player = Player(estimator)
     invalid = _Invalid()
-    steps = 0
+    steps = withheld = 0
+    stamps = EachOnce()
     first_ns = last_ns = 0
     blocks = [block for file in bag.files for block in file.blocks]
     span_ns = max((b.end_ns for b in blocks), default=0) - min((b.start_ns for b in blocks), default=0)
     begin = time.perf_counter()
     for out in player.play(bag):
+        if not stamps.passes(out.stamp_ns):
+            withheld += 1
+            continue
         if steps == 0:
             first_ns = out.stamp_ns
         last_ns = out.stamp_ns
@@ -331,6 +321,8 @@ def _run(
     numbers = {
         **estimator.summary(),
         "steps": steps,
+        "withheld": withheld,
+        "unused": player.unused,
         "duration_s": duration_s,
         "wall_s": wall_s,
         "realtime_ratio": duration_s / wall_s,
@@ -365,6 +357,22 @@ def _input_notes(problems: dict[str, dict[str, Any]]) -> list[str]:
         for group, kinds in problems.items()
         for kind, found in kinds.items()
     ]
+
+
+def _left_out(numbers: dict[str, Any]) -> list[str]:
+    """What of the bag, and of the steps, is in no output."""
+    withheld, unused = numbers["withheld"], numbers["unused"]
+    notes = []
+    if withheld:
+        notes.append(
+            f"joints: their clock was set back; {withheld} steps of {STEP_NS * 1e-6:g} ms lie before what was out already "
+            "and are left out, as no stamp is published twice: cut it off with `mcap filter` and replay it by itself"
+        )
+    if unused:
+        notes.append(
+            f"{unused} messages came more than {AFTER_NS * 1e-9:g} s after the last joint state and are not used: a replay ends with the joints"
+        )
+    return notes
 
 
 def no_step(bag: Bag, robot: Robot, names: set[str], problems: dict[str, Any]) -> InputError:

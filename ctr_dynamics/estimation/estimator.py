@@ -202,7 +202,7 @@ class Estimator:
         return outputs
 
     def reset(self) -> None:
-        """Forget everything and wait for the next complete joint state. Counters stay."""
+        """Forget everything but the last known load, and wait for the next complete joint state. Counters stay."""
         self._clear()
         self.inputs.clear()
         self.runs.clear()

@@ -71,7 +71,6 @@ class Health:
     tracker_age_s: float = 0.0
     misfit: MisfitMonitor = field(default_factory=MisfitMonitor)
     stability: Stability | None = None
-    _within: int = 0
     _squares: tuple[float, float] = (0.0, 0.0)  # m^2, of the model alone and fused
     _compared: int = 0
 
@@ -105,7 +104,6 @@ class Health:
         self.nis_dof += sample.dof
         within = sample.reason == FUSION_OFF or (sample.accepted and not sample.reason)
         self.recent.append((sample.nis / sample.dof, within))
-        self._within = sum(inside for _, inside in self.recent)
         if sample.accepted:
             self.accepted += 1
         elif self.fusing:
@@ -127,14 +125,12 @@ class Health:
             setattr(self, name, value)
         self.recent.clear()
         self.recent.extend(recent)
-        self._within = sum(inside for _, inside in self.recent)
 
     def begin_anew(self) -> None:
         """Wait for joints and watch afresh; counters of what was odd stay."""
         self.problem = WAITING
         self.recent.clear()
         self.misfit.clear()
-        self._squares, self._compared = (0.0, 0.0), 0
 
     @property
     def _sampled(self) -> bool:
@@ -146,9 +142,13 @@ class Health:
         return self.misfit.alarm and self._sampled
 
     @property
+    def _outside(self) -> int:
+        return sum(not within for _, within in self.recent)
+
+    @property
     def rejecting(self) -> bool:
         """Whether samples come and most of the last lay outside the gate: the tracker and the model do not describe the same robot."""
-        return self._sampled and self._within < 0.5 * len(self.recent) and len(self.recent) >= 20
+        return self._sampled and len(self.recent) >= 20 and self._outside > 0.5 * len(self.recent)
 
     def nis_summary(self) -> dict[str, float | int | bool | None]:
         """Mean NIS per degree of freedom with the 95 % band of that mean for a consistent filter."""
@@ -216,9 +216,8 @@ class Health:
             "fusion": "on" if self.fusing else "off",
         }
         if self.rejecting:
-            refused = sum(not within for _, within in self.recent)
             message = (
-                f"{refused} of the last {len(self.recent)} samples are outside the gate (limit half): "
+                f"{self._outside} of the last {len(self.recent)} samples are outside the gate (limit half): "
                 "check the tracker's frame, units, stamps and the robot file"
             )
             return Status("tracker", ERROR, message, values)

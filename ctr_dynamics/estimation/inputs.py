@@ -61,17 +61,26 @@ class InputBuffer:
         self.predicting = settings["output.policy"] == "predict"
         self._load_delay_ns = round(model.setup.load_shift * 1e9)
         self._load_bend = model.load_kink / (DT_NS * 1e-9)
+        self.load = Signal(6)
         self.clear()
 
     def clear(self) -> None:
-        """Forget everything."""
+        """Forget everything but the last known load, which goes on acting."""
         setup = self.model.setup
         self.t0_ns: int | None = None
         self.joints = Drives(setup.n, setup.backlash, round(setup.actuator_delay * 1e9))
-        self.load = Signal(6)
+        self.carry_load(self.load)
         self._opening: int | None = None  # ns of the sample without load that was put before the first load
         self.samples: list[Sample] = []
         self.backwards = 0
+
+    def carry_load(self, load: Signal) -> None:
+        """Have of loads the last one of ``load`` alone: what hangs on the robot does so whatever the estimator is told. It is forgotten where
+        joints then come from before its time: the clock, and with it the world, began anew."""
+        self.load = Signal(6)
+        self._carried = load.stamps[-1] if load.stamps else None
+        if self._carried is not None:
+            self.load.add(self._carried, load.values[-1])
 
     def stamp(self, k: int) -> int | None:
         """ns of step ``k``; None before the first."""
@@ -117,6 +126,8 @@ class InputBuffer:
             return None
         if self.t0_ns is None:
             self.t0_ns = stamp_ns
+            if self._carried is not None and self._carried > stamp_ns + LOAD_GRACE_NS:
+                self.load.drop(self._carried)
             if self.load.stamps:
                 self._open_load(stamp_ns)
             return None

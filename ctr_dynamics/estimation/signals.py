@@ -42,6 +42,12 @@ class Signal:
         self.values.insert(i, value)
         return "late"
 
+    def drop(self, stamp_ns: int) -> None:
+        """Take the sample of that stamp away, if there is one."""
+        if stamp_ns in self.stamps:
+            i = self.stamps.index(stamp_ns)
+            del self.stamps[i], self.values[i]
+
     def forget(self, before_ns: int) -> None:
         """Drop samples that no time from ``before_ns`` on needs; two are left, for what comes after the last is on their line."""
         i = min(bisect.bisect_right(self.stamps, before_ns) - 1, len(self.stamps) - 2)

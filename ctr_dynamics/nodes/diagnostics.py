@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from ctr_dynamics.estimation.outputs import ERROR, OK, WARN, Status
-from ctr_dynamics.nodes.stepping import INBOX_LIMIT, StampClock
-from ctr_dynamics.nodes.timing import GOES_BACK_NS, LATE_NS, VERY_LATE_NS, StepTiming
+from ctr_dynamics.nodes.stepping import INBOX_LIMIT
+from ctr_dynamics.nodes.timing import LATE_NS, VERY_LATE_NS, StepTiming
+from ctr_dynamics.stamps import LIMIT_NS, StampClock
 
 
 def timing_status(timing: StepTiming, faults: int, last_fault: str, withheld_behind_ns: int = 0) -> Status:
@@ -28,12 +29,12 @@ def timing_status(timing: StepTiming, faults: int, last_fault: str, withheld_beh
         "step p50 / p99 / max (ms)": spread("step_ms"),
         "correction p50 / p99 / max (ms)": spread("correction_ms"),
     }
-    if withheld_behind_ns > GOES_BACK_NS:
+    if withheld_behind_ns > LIMIT_NS:
         return Status(
             "timing",
             ERROR,
             f"nothing is published: steps are {withheld_behind_ns * 1e-9:.3f} s before the last published "
-            f"stamp, limit {GOES_BACK_NS * 1e-9:g} s; mend the clock that stamps the joints or call ~/reset",
+            f"stamp, limit {LIMIT_NS * 1e-9:g} s; mend the clock that stamps the joints or call ~/reset",
             values,
         )
     if faults:

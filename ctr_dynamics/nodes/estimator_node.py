@@ -191,12 +191,8 @@ class EstimatorNode(Node):
             return
         clock = self.loop.stamp_clock
         if not clock.sample(message.stamp_ns, arrival_ns):
-            ahead_s = (message.stamp_ns - clock.at(arrival_ns)) * 1e-9
-            self._estimator.health.note(
-                "joints",
-                "far ahead",
-                f"stamp {ahead_s:.3f} s ahead, limit {clock.limit_ns * 1e-9:g} s; left out unless others follow",
-            )
+            refusal = clock.refusal(message.stamp_ns, arrival_ns)
+            self._estimator.health.note("joints", "far ahead", refusal)
             return
         self.timing.arrived(message.stamp_ns, clock.at(arrival_ns))
         self._estimator.add_joint_state(message.stamp_ns, message.names, message.positions)
@@ -252,7 +248,7 @@ class EstimatorNode(Node):
         return [
             *health,
             diagnostics.timing_status(
-                self.timing, self.loop.faults, self.loop.last_fault, self.outputs.withheld_behind_ns
+                self.timing, self.loop.faults, self.loop.last_fault, self.outputs.stamps.behind_ns
             ),
             diagnostics.clock_status(
                 self.loop.stamp_clock,
@@ -273,11 +269,11 @@ class EstimatorNode(Node):
 
     def _reset(self) -> None:
         self.loop.reset()
-        self.outputs.let_go_back()
+        self.outputs.stamps.let_go_back()
 
     def _clock_went_back(self) -> None:
         self.loop.reset()
-        self.outputs.forget_stamps()
+        self.outputs.stamps.forget()
 
     def _on_reset(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         return self._answer(
@@ -348,6 +344,7 @@ class EstimatorNode(Node):
             self.loop.put(lambda: self._estimator.set_fusion(settings["filter.enabled"]))
 
     def _swap(self, estimator: Estimator, settings: Settings) -> None:
+        estimator.inputs.carry_load(self._estimator.inputs.load)
         self._estimator = estimator
         self.timing.policy = settings["output.policy"]
         self.timing.input_timeout_ns = round(settings["input_timeout_s"] * 1e9)

@@ -13,7 +13,7 @@ from ctr_dynamics.messages import topics
 from ctr_dynamics.messages.encode import StepEncoder, encode_diagnostics
 from ctr_dynamics.nodes.naming import message_class, node_topic
 from ctr_dynamics.nodes.qos import QosFaults
-from ctr_dynamics.nodes.timing import GOES_BACK_NS
+from ctr_dynamics.stamps import EachOnce
 
 
 class Outputs:
@@ -35,11 +35,7 @@ class Outputs:
         encoder: StepEncoder,
         record: Callable[[str, int, bytes], None] | None = None,
     ) -> None:
-        self.last_stamp_ns: int | None = None
-        self.withheld_behind_ns = (
-            0  # how far the last step lay before what was published; 0: it was published
-        )
-        self._may_go_back = False
+        self.stamps = EachOnce()
         self._last: Any = None  # the last step that was published
         self._encoder = encoder
         self._record = record
@@ -55,17 +51,10 @@ class Outputs:
 
     def step(self, out: Any) -> bool:
         """Publish one step; False when its stamp is not later than all that were published."""
-        if self.last_stamp_ns is not None and out.stamp_ns <= self.last_stamp_ns:
-            behind_ns = self.last_stamp_ns - out.stamp_ns
-            if not (self._may_go_back and behind_ns > GOES_BACK_NS):
-                self.withheld_behind_ns = max(behind_ns, 1)
-                return False
-        self._may_go_back = False
-        self.withheld_behind_ns = 0
-        messages = self._encoder.encode(out)
+        if not self.stamps.passes(out.stamp_ns):
+            return False
         self._last = out
-        self.last_stamp_ns = out.stamp_ns
-        for message in messages:
+        for message in self._encoder.encode(out):
             self._send(*message)
         return True
 
@@ -85,14 +74,6 @@ class Outputs:
         """Make the last step's messages again, for nobody, so that the next ones are made sooner."""
         if self._last is not None:
             self._encoder.encode(self._last)
-
-    def forget_stamps(self) -> None:
-        """The node's clock itself has gone back (a simulation starts again): earlier stamps are new."""
-        self.last_stamp_ns = None
-
-    def let_go_back(self) -> None:
-        """After a reset: if the stamps have gone back by more than a second, start from there."""
-        self._may_go_back = True
 
     def diagnostics(self, stamp_ns: int, statuses: list[Any]) -> None:
         """Publish /diagnostics."""

@@ -18,7 +18,7 @@ def load(bag: Path, start_s: float = 0.0, duration_s: float = 0.0) -> list[RawMe
 
     Args:
         bag: an .mcap file or a folder with one.
-        start_s: left out at the beginning.
+        start_s: left out at the beginning, but for the load that acts on there.
         duration_s: taken from there on; 0 takes all.
 
     Raises:
@@ -30,7 +30,10 @@ def load(bag: Path, start_s: float = 0.0, duration_s: float = 0.0) -> list[RawMe
     if messages:
         begin = messages[0].log_ns + round(start_s * 1e9)
         end = begin + round(duration_s * 1e9) if duration_s > 0 else messages[-1].log_ns
-        messages = [m for m in messages if begin <= m.log_ns <= end]
+        before = [m for m in messages if m.log_ns < begin and m.topic == topics.TIP_LOAD]
+        # a load is held after its stamp: the last one before the beginning is the load there
+        held = [m._replace(log_ns=begin) for m in before[-1:]]
+        messages = held + [m for m in messages if begin <= m.log_ns <= end]
     if not any(m.topic == topics.JOINT_STATES for m in messages):
         raise InputError(
             f"no message on {topics.JOINT_STATES} in {duration_s or 'all'} s from {start_s:g} s on",

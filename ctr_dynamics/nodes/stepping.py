@@ -17,10 +17,9 @@ from collections.abc import Callable, Sequence
 from typing import Any, Protocol
 
 from ctr_dynamics.nodes.timing import StepTiming
+from ctr_dynamics.stamps import StampClock
 
 STEP_NS = 3_000_000
-CLOCK_LIMIT_NS = 1_000_000_000
-"""Stamps farther than this from the node's clock are of another clock."""
 CATCH_UP_NS = 5_000_000_000
 """A backlog longer than this is given up: the estimator starts anew."""
 SLICE_STEPS = 8
@@ -70,50 +69,6 @@ class Call:
         except Exception as error:
             self.error = error
         self.done.set()
-
-
-AGES = 100  # joint states of which the quickest tells how old stamps are at arrival
-
-
-class StampClock:
-    """Time on the clock of the joint stamps, from the node's clock.
-
-    The two are one clock as long as stamps arrive within `limit_ns` of their own time. Otherwise the smallest
-    difference of the last joint states is taken as that of the clocks, so that steps still follow real time. One stamp that is
-    wildly off changes nothing, three in a row do.
-    """
-
-    def __init__(self, limit_ns: int = CLOCK_LIMIT_NS) -> None:
-        self.limit_ns = limit_ns
-        self.offset_ns = 0
-        self.agrees = True
-        self._known = False
-        self._streak = 0
-        self._ages: deque[int] = deque(maxlen=AGES)
-
-    def sample(self, stamp_ns: int, arrival_ns: int) -> bool:
-        """A joint state with that stamp arrived at that time of the node's clock; False where it is wildly ahead, and nothing follows it yet."""
-        offset = arrival_ns - stamp_ns
-        if self._known and abs(offset - self.offset_ns) > self.limit_ns:
-            self._streak += 1
-            if self._streak < 3:
-                return offset > self.offset_ns
-            self._ages.clear()
-        self._streak = 0
-        self._ages.append(offset)
-        self.agrees = abs(offset) <= self.limit_ns
-        self.offset_ns = 0 if self.agrees else self.age_ns
-        self._known = True
-        return True
-
-    @property
-    def age_ns(self) -> int:
-        """How old, by the node's clock, the stamp of the quickest of the last joint states was at its arrival."""
-        return min(self._ages, default=0)
-
-    def at(self, now_ns: int) -> int:
-        """The stamps' time at a time of the node's clock."""
-        return now_ns - self.offset_ns
 
 
 class StepLoop(threading.Thread):

@@ -10,8 +10,6 @@ from typing import Any
 LATE_NS = 3_000_000
 """A step published later than one step after it was due is late."""
 VERY_LATE_NS = 20_000_000
-GOES_BACK_NS = 1_000_000_000
-"""Steps that lie farther than this before the last published stamp are of a clock that has been set back."""
 
 
 class Histogram:

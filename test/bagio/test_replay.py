@@ -16,12 +16,13 @@ import pytest
 
 from ctr_dynamics import __version__
 from ctr_dynamics.bagio.reader import InputMessage, open_bag, sha256_of
-from ctr_dynamics.bagio.replay import Player, StampClock, arrivals, plain, replay
+from ctr_dynamics.bagio.replay import Player, arrivals, plain, replay
 from ctr_dynamics.bagio.writer import write_bag
 from ctr_dynamics.cli.replay import settings_for_replay
 from ctr_dynamics.errors import InputError
 from ctr_dynamics.messages import cdr, topics
 from ctr_dynamics.messages.encode import encode_joint_state, encode_pose_stamped
+from ctr_dynamics.nodes.playback import load, shifted
 from ctr_dynamics.parameters import Settings
 from ctr_dynamics.robot import load_robot
 
@@ -43,8 +44,10 @@ class StandIn:
         self.k = 0
         self.innovations: list = []
         self.invalid = range(0)
+        self.noted: list[tuple[str, str, str]] = []
         self.health = SimpleNamespace(
             snap_ahead=False,
+            note=lambda *what: self.noted.append(what),
             statuses=lambda: [
                 SimpleNamespace(name="solver", level=0, message="ok", values={"steps": str(self.k)})
             ],
@@ -413,7 +416,7 @@ def test_joints_in_millimetres_are_refused_with_value_and_limit(bags, tmp_path):
     assert "give metres" in done.stderr
 
 
-# Clocks.
+# Arrivals and clocks.
 
 
 def joint_at(stamp_ns: int, log_ns: int) -> InputMessage:
@@ -426,48 +429,78 @@ def pose_at(stamp_ns: int, log_ns: int) -> InputMessage:
     )
 
 
-def test_stamp_clock_removes_the_offset_of_the_clocks():
-    clock = StampClock()
-    assert clock.now_ns(pose_at(5, 100)) is None
-    offset = 7_000_000_000
-    delays = [4_000_000, 1_000_000, 3_000_000, 2_000_000]
-    now = [clock.now_ns(joint_at(i * 10_000_000, i * 10_000_000 + offset + d)) for i, d in enumerate(delays)]
-    # The first arrival defines now; once a quicker one is known, slower ones are seen to be late.
-    assert now == [0, 10_000_000, 22_000_000, 31_000_000]
-    assert clock.now_ns(pose_at(0, 50_000_000 + offset + 1_000_000)) == 50_000_000
-
-
-def test_stamp_clock_survives_one_wild_stamp_and_follows_a_lasting_change():
-    clock = StampClock()
-    clock.now_ns(joint_at(0, 0))
-    assert clock.now_ns(joint_at(10**18, 10_000_000)) == 10_000_000
-    assert clock.now_ns(joint_at(20_000_000, 20_000_000)) == 20_000_000
-    jump = 5_000_000_000
-    seen = [clock.now_ns(joint_at(t + jump, t)) for t in (30_000_000, 40_000_000, 50_000_000)]
-    assert seen == [30_000_000, 40_000_000, 50_000_000 + jump]
-    assert clock.now_ns(joint_at(0, 60_000_000)) >= seen[-1]
-    back = [clock.now_ns(joint_at(t, t)) for t in (70_000_000, 80_000_000, 90_000_000)]
-    assert back[-1] == 90_000_000, "and back again, or steps would be due up to a time that never comes"
-
-
-def test_stamp_clock_forgets_a_stamp_ahead_of_its_time_and_follows_a_drift():
-    clock = StampClock()
-    period = 10_000_000
-    for i in range(300):
-        ahead = 500_000_000 * (i == 20)
-        now = clock.now_ns(joint_at(i * period + ahead, i * period))
-    assert now == 299 * period
-    drift = 1.001  # the log's clock is the faster one
-    for i in range(300, 3000):
-        now = clock.now_ns(joint_at(i * period, round(i * period * drift)))
-    assert now is not None
-    assert 0 <= now - 2999 * period < 2 * 100 * period * (drift - 1.0)
-
-
 def test_arrivals_are_grouped_by_log_time():
     items = [joint_at(1, 10), pose_at(2, 10), joint_at(3, 20), joint_at(4, 30), pose_at(5, 30)]
     assert [len(group) for group in arrivals(iter(items))] == [2, 1, 2]
     assert list(arrivals(iter([]))) == []
+
+
+def bag_of(folder, items: list[InputMessage]):
+    """A bag of joint states and poses with those stamps and log times."""
+    with write_bag(folder / "in.mcap", {}) as writer:
+        for topic, log_ns, message in items:
+            if topic == topics.JOINT_STATES:
+                data = encode_joint_state(message.stamp_ns, JOINTS, message.positions)
+            else:
+                data = encode_pose_stamped(message.stamp_ns, "ctr_base", (0, 0, 0), (0, 0, 0, 1))
+            writer.write(topic, log_ns, data)
+    return folder / "in.mcap"
+
+
+def valid_stamps(folder) -> list[int]:
+    return [m.log_ns - T0 for m in open_bag(folder / "out.mcap").messages({topics.VALID})]
+
+
+MS = 1_000_000
+
+
+def test_a_joint_state_far_ahead_is_left_out_as_a_node_leaves_it_out(stand_in, tmp_path):
+    stamps = [T0 + i * 10 * MS for i in range(40)]
+    items = [joint_at(t + (1500 * MS if i == 20 else 0), t) for i, t in enumerate(stamps)]
+    result = run(bag_of(tmp_path, items), stand_in, tmp_path)
+    estimator = stand_in.made[-1]
+    assert T0 + 200 * MS + 1500 * MS not in [stamp for kind, stamp in estimator.calls if kind == "joint"]
+    assert [(group, kind) for group, kind, _ in estimator.noted] == [("joints", "far ahead")]
+    assert "stamp 1.500 s ahead, limit 1 s" in estimator.noted[0][2]
+    assert valid_stamps(tmp_path) == list(range(0, 391 * MS, 3 * MS))
+    assert result.summary["withheld"] == 0
+
+
+def test_a_replay_ends_with_the_joints_and_says_what_came_after_them(stand_in, tmp_path):
+    joints = [joint_at(T0 + i * 10 * MS, T0 + i * 10 * MS + 2 * MS) for i in range(40)]
+    poses = [pose_at(T0 + i * 25 * MS, T0 + i * 25 * MS + 5 * MS) for i in range(200)]
+    items = sorted(joints + poses, key=lambda item: item.log_ns)
+    result = run(bag_of(tmp_path, items), stand_in, tmp_path)
+    assert valid_stamps(tmp_path) == list(range(0, 391 * MS, 3 * MS))
+    fed = [stamp for kind, stamp in stand_in.made[-1].calls if kind == "tracker"]
+    assert T0 + 390 * MS + 900 * MS < max(fed) <= T0 + 392 * MS + 1000 * MS, "a late one may be of a step"
+    assert result.summary["unused"] == 200 - len(fed)
+    assert f"{200 - len(fed)} messages came more than 1 s after the last joint state" in result.notes[-1]
+
+
+def test_no_stamp_is_replayed_twice_where_the_clock_is_set_back(bags, tmp_path):
+    """With the estimator itself: after 1.5 s, the clock that stamps goes back by 2 s."""
+    messages = load(bags / "clean_release.mcap", duration_s=2.9)
+    back_ns = messages[0].log_ns + 1500 * MS
+    with write_bag(tmp_path / "in.mcap", {}) as writer:
+        for raw in messages:
+            data = shifted(raw.data, -2000 * MS) if raw.log_ns > back_ns else raw.data
+            writer.write(raw.topic, raw.log_ns, data)
+    result = replay(
+        tmp_path / "in.mcap",
+        "till2020_tissue",
+        settings_for_replay(None, [], True),
+        tmp_path / "out.mcap",
+    )
+    stamps = valid_stamps(tmp_path)
+    assert stamps == sorted(set(stamps))
+    assert result.summary["duration_s"] > 0.0
+    assert result.summary["withheld"] > 300
+    assert result.summary["steps"] == len(stamps)
+    assert "clock was set back" in "; ".join(result.notes)
+    compared = result.summary["residual_rms_m"]
+    assert compared["fused"] is not None
+    assert compared["fused"] < compared["predicted"]
 
 
 def test_every_step_has_a_time(bags, step):

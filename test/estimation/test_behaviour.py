@@ -349,6 +349,23 @@ def test_reset_waits_for_joints_and_starts_anew(release):
     assert all(out.valid for out in outputs)
 
 
+@pytest.mark.parametrize("again_s", [0.4, -2.0])
+def test_a_known_load_goes_on_acting_after_a_reset_unless_time_begins_anew(release, again_s):
+    """The bag's load hangs on the tip until 1 s; no further message of it comes."""
+    made = play([m for m in release if m.stamp < 0.3e9]).estimator
+    made.reset()
+    outputs = []
+    for m in [m for m in release if m.kind == "joints" and 0.4e9 <= m.stamp < 0.6e9]:
+        m.shifted(again_s - 0.4).give(made)
+        outputs += made.advance()
+    loaded = play([m for m in release if m.kind != "tracker" and m.stamp < 0.6e9]).last.predicted_position
+    bare = play([m for m in release if m.kind == "joints" and m.stamp < 0.6e9]).last.predicted_position
+    assert np.abs(loaded - bare).max() > 1e-3
+    expected, other = (loaded, bare) if again_s > 0 else (bare, loaded)
+    assert np.abs(outputs[-1].predicted_position - expected).max() < 1e-4
+    assert np.abs(outputs[-1].predicted_position - other).max() > 1e-3
+
+
 def test_snapshot_is_plain_data_with_named_parameters(plain):
     import json
 

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from ctr_dynamics.bagio.reader import open_bag
+from ctr_dynamics.bagio.writer import write_bag
 from ctr_dynamics.errors import InputError
 from ctr_dynamics.messages import topics
 from ctr_dynamics.messages.cdr import CdrError, decode_joint_state, decode_stamp
@@ -38,6 +39,21 @@ def test_a_part_of_a_bag_in_order_of_arrival(bags):
     assert 0 < len(part) < len(whole)
     assert part[0].log_ns - whole[0].log_ns >= 1_000_000_000
     assert part[-1].log_ns - whole[0].log_ns <= 1_500_000_000
+
+
+def test_a_part_begins_with_the_load_that_acts_there(bags, tmp_path):
+    whole = load(bags / "clean_release.mcap")
+    begin = whole[0].log_ns
+    loads = [m for m in whole if m.topic == topics.TIP_LOAD]
+    first = loads[0]
+    with write_bag(tmp_path / "in.mcap", {}) as writer:
+        for m in whole:
+            if m.topic != topics.TIP_LOAD or m is first:
+                writer.write(m.topic, m.log_ns, m.data)
+    part = load(tmp_path / "in.mcap", start_s=0.5, duration_s=0.2)
+    assert (part[0].topic, part[0].data) == (first.topic, first.data), "it is held after its stamp"
+    assert part[0].log_ns == begin + 500_000_000
+    assert sum(m.topic == topics.TIP_LOAD for m in part) == 1
 
 
 def test_a_bag_without_joints_in_that_part_is_refused(bags, tmp_path):

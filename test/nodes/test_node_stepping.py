@@ -16,10 +16,10 @@ from ctr_dynamics.nodes.stepping import (
     REHEARSAL_NS,
     REHEARSALS,
     STEP_NS,
-    StampClock,
     StepLoop,
 )
 from ctr_dynamics.nodes.timing import Histogram, StepTiming
+from ctr_dynamics.stamps import StampClock
 
 MS = 1_000_000
 
@@ -317,24 +317,6 @@ def test_calls_run_in_the_thread_and_hand_back_result_or_error(clock):
     assert not loop.is_alive()
     with pytest.raises(TimeoutError, match="did not answer"):
         loop.call(lambda: None, timeout_s=0.01)
-
-
-def test_stamp_clock_follows_a_foreign_clock_after_three_stamps():
-    clock = StampClock()
-    clock.sample(1000 * MS, 1004 * MS)
-    assert clock.agrees
-    assert clock.at(7) == 7
-    for count in range(3):
-        assert clock.agrees, count
-        clock.sample(10 * MS + count, 90_000 * MS + 5 - count)
-    assert not clock.agrees
-    assert clock.at(90_000 * MS) == 90_000 * MS - (89_990 * MS + 1)
-    clock.sample(20 * MS, 90_005 * MS)  # arrives sooner after its stamp: a better estimate
-    assert clock.offset_ns == 89_985 * MS
-    for _ in range(3):
-        clock.sample(90_100 * MS, 90_101 * MS)
-    assert clock.agrees
-    assert clock.offset_ns == 0
 
 
 def test_joints_that_are_old_at_arrival_are_said_where_steps_are_without_them():
