@@ -62,7 +62,7 @@ PARAMETERS: tuple[Parameter, ...] = (
         0.9999,
         "",
         "Chi-square probability beyond which a tracker sample is rejected.",
-        0.5,
+        0.9,
         0.999999,
     ),
     Parameter(
@@ -70,8 +70,8 @@ PARAMETERS: tuple[Parameter, ...] = (
         "float",
         0.0006,
         "N",
-        "Least deviation per axis of the unknown tip force.",
-        0.0,
+        "Least deviation per axis of the unknown tip force; next to none at the low end.",
+        1e-6,
         10.0,
     ),
     Parameter(
@@ -80,7 +80,7 @@ PARAMETERS: tuple[Parameter, ...] = (
         0.2,
         "N",
         "Largest deviation to which unexpectedly large innovations raise that of the tip force.",
-        0.0,
+        1e-6,
         10.0,
     ),
     Parameter(
@@ -305,6 +305,12 @@ class Settings(Mapping[str, Value]):
         for name, value in (values or {}).items():
             checked[name] = parameter(name).check(value)
         self._values = checked
+        least, most = self["filter.tip_force_sigma_N"], self["filter.tip_force_sigma_max_N"]
+        if least > most:
+            raise InputError(
+                f"filter.tip_force_sigma_N is {least:g} N, limit filter.tip_force_sigma_max_N, {most:g} N",
+                do="lower the one or raise the other",
+            )
 
     @classmethod
     def from_sources(cls, file: Path | None = None, overrides: Mapping[str, Any] | None = None) -> Settings:

@@ -198,6 +198,14 @@ def test_estimator_yaml_is_read_back(tmp_path):
     assert Settings.from_sources(file) == Settings()
 
 
+def test_a_least_deviation_above_the_largest_is_refused():
+    with pytest.raises(
+        InputError, match=r"tip_force_sigma_N is 0\.3 N, limit filter\.tip_force_sigma_max_N, 0\.2 N"
+    ):
+        Settings({"filter.tip_force_sigma_N": 0.3})
+    Settings({"filter.tip_force_sigma_N": 0.3, "filter.tip_force_sigma_max_N": 0.3})
+
+
 def test_outdated_readme_is_found_and_mended(tmp_path, capsys):
     (tmp_path / tables.ESTIMATOR_YAML).parent.mkdir(parents=True)
     readme = (ROOT / "README.md").read_text().replace("`model.nodes`", "`model.knots`")

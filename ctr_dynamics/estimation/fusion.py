@@ -32,6 +32,9 @@ from .uncertainty import bias_sigma, model_uncertainty
 Floats = NDArray[np.float64]
 
 VAGUE = 1.0  # m^2 and rad^2: a covariance is not widened beyond
+MOST_DOUBLINGS = 40  # of the covariance, in one widening: a deviation grows a millionfold
+FAR = 10.0  # times the gate: a reading that is farther than that from all that a widened covariance holds is not fused
+LONGEST_REFUSAL = 32  # readings outside the gate in a row after which it is widened again
 SKIP = 2  # steps that the columns may skip
 APART = 4  # steps between a correction and a reduction where samples leave that room: of those that one joint state covers, none does both
 DRIVEN = 4.0  # times its least: with a stronger drive of the tip force columns follow every step and are reduced twice as often
@@ -76,6 +79,12 @@ class TipEstimate(NamedTuple):
     finite: bool
 
 
+def widens(refused: int) -> bool:
+    """Whether the covariance is widened for the last of so many readings in a row outside the gate: for the second, fourth, eighth ..., as
+    a tracker that contradicts the model for good would lead the runs astray with every reading that is fused."""
+    return refused % LONGEST_REFUSAL == 0 or (refused > 1 and refused & (refused - 1) == 0)
+
+
 class Fusion:
     """Filter of one simulated robot.
 
@@ -100,7 +109,7 @@ class Fusion:
         self.unreduced = 0  # steps since the columns were reduced
         self.inserted = 0.0  # share of beta's rate that the model's velocities hold already
         self.force_sigma = options.force_sigma
-        self._refused = False
+        self.refused = 0  # readings in a row outside the gate, widened for or not
         self._rest = 0  # steps since the last correction; more than `unreduced` where none has come since the columns were reduced
         self._skipped = 0  # steps that the columns have not followed yet
         self._unsettled = False  # whether the columns are to be reduced before the next step
@@ -131,7 +140,6 @@ class Fusion:
         for axis, size in enumerate(scale):
             i = force.start + axis
             self.pi[i, i] = (self.options.force_sigma / size) ** 2
-        self._refused = False
         self._rest, self._skipped, self._unsettled = 1, 0, False
         self._followed = state.key
         self.force_sigma = self.options.force_sigma
@@ -268,14 +276,17 @@ class Fusion:
         dof = compared.dof
         self._adapt(compared.nis / dof)
         if compared.nis > self._gate[dof]:
-            if not self._refused:
-                self._refused = True
+            self.refused += 1
+            if not widens(self.refused):
                 return compared._replace(reason="outside the gate")
-            self._inflate(nu, H, R, self._gate[dof])
+            if not self._inflate(nu, H, R, self._gate[dof]):
+                return compared._replace(reason="outside the gate, farther than any covariance reaches")
             compared = compared._replace(
-                reason="outside the gate twice in a row: fused with a widened covariance"
+                reason=f"outside the gate {self.refused} times in a row: fused with a widened covariance"
             )
-        self._refused, self._rest = False, 0
+        else:
+            self.refused = 0
+        self._rest = 0
         size = len(self.pi)
         if (size, dof) not in self._filters:
             self._filters[size, dof] = ExtendedKalmanFilter(dim_x=size, dim_z=dof)
@@ -321,17 +332,25 @@ class Fusion:
         """(3,) estimated tip force, N, ``ctr_base`` axes; the caller's own, as the filter goes on writing."""
         return self.theta[self._force].copy()
 
-    def _inflate(self, nu: Floats, H: Floats, R: Floats, limit: float) -> None:
-        """Two readings in a row outside the gate are no outliers: the model has lost the robot. Widen the fields' part of the covariance until
-        the reading is plausible (a fading memory)."""
+    def _inflate(self, nu: Floats, H: Floats, R: Floats, limit: float) -> bool:
+        """Several readings in a row outside the gate are no outliers: the model has lost the robot. Widen the fields' part of the covariance until
+        the reading is plausible (a fading memory), or it is as wide as a robot is large. False where the reading is far from plausible even
+        then; the covariance stays as it is."""
         r = self.columns.theta.shape[1]
-        for _ in range(20):
-            self.pi[:r, :r] *= 2.0
-            self.pi[:r, r:] *= math.sqrt(2.0)
-            self.pi[r:, :r] *= math.sqrt(2.0)
-            S = H @ self.pi @ H.T + R
-            if S.diagonal().max() > VAGUE or nu @ np.linalg.solve(S, nu) < 0.5 * limit:
-                return
+        plausible = min(limit, max(0.5 * limit, float(len(nu))))
+        pi = self.pi.copy()
+        for _ in range(MOST_DOUBLINGS):
+            pi[:r, :r] *= 2.0
+            pi[:r, r:] *= math.sqrt(2.0)
+            pi[r:, :r] *= math.sqrt(2.0)
+            S = H @ pi @ H.T + R
+            nis = float(nu @ np.linalg.solve(S, nu))
+            if nis < plausible or S.diagonal().max() > VAGUE:
+                break
+        if nis > FAR * limit:
+            return False
+        self.pi = pi
+        return True
 
     def _adapt(self, ratio: float) -> None:
         """Raise the drive of the tip force while innovations are larger than predicted, lower it while they are smaller."""
@@ -394,7 +413,7 @@ class Fusion:
         """The filter's part of a state to which :meth:`restore` can return."""
         return (
             self.theta.copy(), self.bias.copy(), self.pi.copy(), self.unreduced, self.force_sigma,
-            (self._refused, self._rest, self._skipped, self._followed, self._unsettled), self.columns.snapshot(), self.tips.snapshot(),
+            (self.refused, self._rest, self._skipped, self._followed, self._unsettled), self.columns.snapshot(), self.tips.snapshot(),
         )  # fmt: skip
 
     def restore(self, snapshot: tuple) -> None:
@@ -405,7 +424,7 @@ class Fusion:
     def _restore(self, snapshot: tuple) -> None:
         """All but the tips."""
         theta, bias, pi, self.unreduced, self.force_sigma, course, columns, _ = snapshot
-        self._refused, self._rest, self._skipped, self._followed, self._unsettled = course
+        self.refused, self._rest, self._skipped, self._followed, self._unsettled = course
         self.theta, self.bias, self.pi = theta.copy(), bias.copy(), pi.copy()
         self.columns.restore(columns)
         self._apply_theta()

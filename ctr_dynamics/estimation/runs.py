@@ -110,6 +110,7 @@ class Runs:
         t = seconds(k)
         self._signals.clear()
         self.fusion.forget_parameters()
+        self.fusion.refused = 0
         try:
             self.fused = self.simulator.rest(self._bare(t))
         except InputError as error:
