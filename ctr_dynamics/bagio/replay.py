@@ -40,6 +40,7 @@ MakeEstimator = Callable[[Robot, Settings], "Estimator"]
 Progress = Callable[[float, int], None]
 AFTER_NS = 1_000_000_000  # what arrives later than this after the last joint state changes no step
 _WARM_UP_NS = 300_000_000
+_NEVER_NS = 2**63 - 1
 _MAX_STRETCHES = 100
 
 
@@ -108,7 +109,8 @@ class Player:
         Args:
             until_ns: log time at which to stop early; no closing steps then.
         """
-        self._last_ns, last_log_ns = last_joints(bag)
+        # the end is looked for in the whole bag, which one that stops early does not reach
+        self._last_ns, last_log_ns = last_joints(bag) if until_ns is None else (_NEVER_NS, _NEVER_NS)
         for group in arrivals(bag.inputs()):
             log_ns = group[0].log_ns
             if until_ns is not None and log_ns > until_ns:
