@@ -430,16 +430,3 @@ def _flat(data: Mapping[Any, Any], prefix: str) -> dict[str, Any]:
         else:
             flat[name] = value
     return flat
-
-
-def check_folder(name: str, path: str) -> None:
-    """Refuse the file ``path`` of the parameter ``name`` where it could not be written at the end; empty is none.
-
-    Raises:
-        InputError: its folder does not exist, or it is one itself.
-    """
-    if path and (Path(path).is_dir() or not Path(path).absolute().parent.is_dir()):
-        raise InputError(
-            f"{name} '{path}' is not a file in a folder that exists",
-            do="create the folder or name another file",
-        )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ast
 import importlib
 import inspect
 import re
@@ -13,6 +12,7 @@ from typing import Any
 import typer.main
 
 from ctr_dynamics.cli.main import available, build_app
+from ctr_dynamics.nodes.tables import NODES
 
 PAGE = Path("docs/reference.md")
 
@@ -32,8 +32,6 @@ API: dict[str, tuple[str, ...]] = {
     "ctr_dynamics.report": ("Page", "Panel", "figure_svg"),
     "ctr_dynamics.errors": ("InputError",),
 }
-# Nodes whose parameters stand in a table of their own file; read as text, since rclpy may be absent.
-NODES = {"/ctr/driver": "nodes/driver_node.py", "/ctr/view": "nodes/view_node.py"}
 SERVICES = {
     "/ctr/estimator/reset": (
         "std_srvs/srv/Trigger",
@@ -161,20 +159,6 @@ def commands() -> Iterator[tuple[str, Any]]:
                 yield f"{name} {part}", sub
 
 
-def node_parameters(node: str) -> dict[str, tuple[Any, str]]:
-    """Name -> (default, meaning) of a node's own table `PARAMETERS`."""
-    text = (Path(__file__).parent / NODES[node]).read_text(encoding="utf-8")
-    for statement in ast.parse(text).body:
-        target = getattr(statement, "target", None)
-        if (
-            isinstance(statement, ast.AnnAssign)
-            and getattr(target, "id", "") == "PARAMETERS"
-            and statement.value
-        ):
-            return dict(ast.literal_eval(statement.value))
-    raise LookupError(f"{NODES[node]} holds no table PARAMETERS")
-
-
 def public() -> Iterator[tuple[str, Any]]:
     """Full name and object of everything in `API`, with the public methods of its classes behind them."""
     for module, names in API.items():
@@ -246,12 +230,10 @@ def render() -> str:
             lines += ["| option | default | |", "| --- | --- | --- |", *rows, ""]
     lines += ["## Nodes", "", "### /ctr/estimator", "", "| service | type | |", "| --- | --- | --- |"]
     lines += [f"| `{name}` | {kind} | {text} |" for name, (kind, text) in SERVICES.items()]
-    for node in NODES:
-        lines += ["", f"### {node}", "", "| parameter | default | |", "| --- | --- | --- |"]
-        lines += [
-            f"| `{name}` | `{default!r}` | {text} |"
-            for name, (default, text) in node_parameters(node).items()
-        ]
+    for node, table in NODES.items():
+        lines += ["", f"### {node}", "", "| parameter | default | unit | range | |"]
+        lines += ["| --- | --- | --- | --- | --- |"]
+        lines += [f"| `{p.name}` | `{p.default!r}` | {p.unit} | {p.range} | {p.text} |" for p in table]
     lines += [
         "",
         "## Python",

@@ -13,6 +13,7 @@ from ctr_dynamics import reference
 from ctr_dynamics.cli import main as cli
 from ctr_dynamics.messages.pages import undocumented
 from ctr_dynamics.messages.topics import TOPICS
+from ctr_dynamics.nodes.tables import NODES
 from ctr_dynamics.parameters import PARAMETERS
 from ctr_dynamics.view.markers import TUBES_TOPIC
 
@@ -52,12 +53,10 @@ def test_every_parameter_is_documented():
     for parameter in PARAMETERS:
         assert f"`{parameter.name}`" in readme
         assert parameter.text
-    for node in reference.NODES:
-        found = reference.node_parameters(node)
-        assert found
-        for name, (_, text) in found.items():
-            assert text
-            assert f"| `{name}` |" in page
+    for table in NODES.values():
+        for parameter in table:
+            assert parameter.text
+            assert f"| `{parameter.name}` |" in page
 
 
 def test_every_topic_and_field_is_documented():

@@ -1,7 +1,7 @@
 """Bags: finding and reading MCAP recordings (also cut ones), writing them, what is in them, and replay."""
 
 from ctr_dynamics.bagio.reader import Bag, InputMessage, RawMessage, open_bag, sha256_of
-from ctr_dynamics.bagio.writer import BagWriter, LiveRecorder, atomic_file, write_bag
+from ctr_dynamics.bagio.writer import BagWriter, LiveRecorder, write_bag
 
 __all__ = [
     "Bag",
@@ -9,7 +9,6 @@ __all__ = [
     "InputMessage",
     "LiveRecorder",
     "RawMessage",
-    "atomic_file",
     "open_bag",
     "sha256_of",
     "write_bag",

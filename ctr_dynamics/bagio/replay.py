@@ -22,7 +22,7 @@ import numpy as np
 
 from ctr_dynamics import __version__
 from ctr_dynamics.bagio.reader import Bag, InputMessage, open_bag
-from ctr_dynamics.bagio.writer import BagWriter, atomic_file, check_targets, write_bag
+from ctr_dynamics.bagio.writer import BagWriter, write_bag
 from ctr_dynamics.collector import seldom_collected
 from ctr_dynamics.errors import InputError
 from ctr_dynamics.messages.cdr import CdrError, JointStateIn, PoseIn, decode_stamp
@@ -31,6 +31,7 @@ from ctr_dynamics.messages.topics import JOINT_STATES, STEP_NS
 from ctr_dynamics.parameters import Settings
 from ctr_dynamics.robot import Robot, load_robot
 from ctr_dynamics.stamps import EachOnce, StampClock
+from ctr_dynamics.targets import atomic_file, check_targets
 
 if TYPE_CHECKING:
     from ctr_dynamics.estimation.estimator import Estimator, StepOutput

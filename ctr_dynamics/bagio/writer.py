@@ -8,7 +8,6 @@ gives every block to the operating system at once, so that a killed process lose
 from __future__ import annotations
 
 import contextlib
-import os
 import threading
 import time
 from collections.abc import Iterator, Mapping
@@ -21,6 +20,7 @@ from mcap.writer import CompressionType, Writer
 from ctr_dynamics.errors import InputError
 from ctr_dynamics.messages.schemas import schema
 from ctr_dynamics.messages.topics import TOPIC
+from ctr_dynamics.targets import atomic_file
 
 LIBRARY = "ctr_dynamics"
 METADATA_NAME = "ctr_dynamics"
@@ -29,52 +29,6 @@ _LIVE_CHUNK_BYTES = 2**16
 _LIVE_FLUSH_S = 0.5
 _COMPRESSION = CompressionType.LZ4
 """Digits of numbers hardly compress: zstd makes 15 % less of them, in five times the time."""
-
-
-@contextlib.contextmanager
-def atomic_file(path: Path) -> Iterator[Path]:
-    """A temporary name beside `path`, renamed to it on success and removed on any failure.
-
-    Raises:
-        InputError: the folder does not exist or cannot be written, or `path` is a folder.
-    """
-    path = Path(path)
-    if path.is_dir():
-        raise InputError("is a folder, a file name is expected", where=str(path))
-    if not path.parent.is_dir():
-        raise InputError(f"the folder {path.parent} does not exist", where=str(path), do="create it first")
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
-        temporary.open("wb").close()
-    except OSError as error:
-        raise InputError(f"cannot be written ({error.strerror})", where=str(path)) from None
-    try:
-        yield temporary
-        os.replace(temporary, path)
-    except OSError as error:
-        raise InputError(f"cannot be written ({error.strerror})", where=str(path)) from None
-    finally:
-        temporary.unlink(missing_ok=True)
-
-
-def check_targets(targets: Mapping[str, str | Path | None], read: Mapping[str, str | Path | None]) -> None:
-    """No output may be an input, nor another output: said before the work, not after it.
-
-    Args:
-        targets: files to write, by what they are; None for one that is not asked for.
-        read: files that are read, likewise; names that are no path of a file do no harm.
-
-    Raises:
-        InputError: two of them are one file.
-    """
-    taken = {Path(path).resolve(): f"the {what} that is read" for what, path in read.items() if path}
-    for what, path in targets.items():
-        if path is None:
-            continue
-        target = Path(path).resolve()
-        if target in taken:
-            raise InputError(f"{what} is {taken[target]}", where=str(path), do="give another name")
-        taken[target] = f"the same file as the {what}"
 
 
 class _Channels:

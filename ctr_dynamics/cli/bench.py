@@ -9,8 +9,8 @@ from typing import Annotated
 
 import typer
 
-from ctr_dynamics.bagio.writer import atomic_file
 from ctr_dynamics.cli.demo import SHIPPED, shipped_file
+from ctr_dynamics.targets import atomic_file
 
 
 def bench(

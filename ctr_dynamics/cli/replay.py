@@ -12,8 +12,8 @@ import typer
 
 from ctr_dynamics.bagio.replay import Progress, ReplayResult
 from ctr_dynamics.bagio.replay import replay as run_replay
-from ctr_dynamics.bagio.writer import check_targets
 from ctr_dynamics.parameters import Settings, parse_assignments, read_parameter_file
+from ctr_dynamics.targets import check_targets
 
 
 def settings_for_replay(params: Path | None, assignments: list[str], fusion: bool) -> Settings:

@@ -9,11 +9,11 @@ from typing import Annotated, Any
 
 import typer
 
-from ctr_dynamics.bagio.writer import atomic_file
 from ctr_dynamics.errors import InputError
 from ctr_dynamics.robot import Robot, load_robot, robot_names
 from ctr_dynamics.robot import datasheet as sheets
 from ctr_dynamics.robot.summary import doubts, tube_rows
+from ctr_dynamics.targets import atomic_file
 
 # Option -> (SI unit, several values, what is asked, answer that is offered).
 _ASKED: dict[str, tuple[str, bool, str, str]] = {

@@ -8,10 +8,10 @@ from typing import Annotated
 
 import typer
 
-from ctr_dynamics.bagio.writer import check_targets
 from ctr_dynamics.robot import load_robot
 from ctr_dynamics.simulation import load_scenario, scenario_names, write_recording
 from ctr_dynamics.simulation import simulate as run_scenario
+from ctr_dynamics.targets import check_targets
 
 
 def _progress(fraction: float) -> None:

@@ -9,9 +9,9 @@ from typing import Any
 
 import yaml
 
-from ctr_dynamics.bagio.writer import atomic_file
 from ctr_dynamics.robot import Robot
 from ctr_dynamics.simulation.scenario import Scenario
+from ctr_dynamics.targets import atomic_file
 
 from .diagnose import diagnose
 from .findings import findings, write

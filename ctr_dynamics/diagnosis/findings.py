@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from ctr_dynamics import __version__
 from ctr_dynamics.bagio.replay import plain
-from ctr_dynamics.bagio.writer import atomic_file
 from ctr_dynamics.effects import EFFECTS, Quantity
 from ctr_dynamics.robot import robot_to_yaml
+from ctr_dynamics.targets import atomic_file
 
 from .checks import rms
 from .diagnose import Diagnosis, Member

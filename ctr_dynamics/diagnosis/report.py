@@ -10,10 +10,10 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from scipy.signal import periodogram
 
-from ctr_dynamics.bagio.writer import atomic_file
 from ctr_dynamics.effects import EFFECTS
 from ctr_dynamics.report.figures import Panel, figure_svg, to_svg
 from ctr_dynamics.report.page import Page
+from ctr_dynamics.targets import atomic_file
 
 from .checks import by_axis
 from .diagnose import Diagnosis

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Callable, Sequence
-from typing import Any
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from typing import Any, TypeVar
 
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
 from rclpy.node import Node
@@ -16,11 +17,21 @@ from ctr_dynamics.parameters import PARAMETERS, Parameter, Settings
 # Every rclpy node has these besides its own.
 _ROS_NAMES = ("use_sim_time", "start_type_description_service")
 _ROS_PREFIXES = ("qos_overrides.",)
+Checked = TypeVar("Checked", bound=Mapping[str, Any])
 _TABLE = {parameter.name: parameter for parameter in PARAMETERS}
 
 
 def declare(node: Node) -> Settings:
-    """Declare every parameter of the table with type, text, range and read-only mark.
+    """Declare every parameter of the estimator with type, text, range and read-only mark.
+
+    Raises:
+        InputError: as :func:`declare_table`.
+    """
+    return _declare(node, PARAMETERS, Settings)
+
+
+def declare_table(node: Node, table: Sequence[Parameter]) -> dict[str, Any]:
+    """Declare the parameters of a ``table``, fixed from then on; returns their values by name.
 
     The node must have been made with `automatically_declare_parameters_from_overrides=True`, so that a name
     that no parameter has is seen at all; ROS otherwise passes over it in silence.
@@ -28,20 +39,29 @@ def declare(node: Node) -> Settings:
     Raises:
         InputError: an unknown name, or a value of the wrong type or out of its range.
     """
+    return _declare(
+        node,
+        [replace(p, read_only=True) for p in table],
+        lambda given: {p.name: p.check(given.get(p.name, p.default)) for p in table},
+    )
+
+
+def _declare(node: Node, table: Sequence[Parameter], check: Callable[[dict[str, Any]], Checked]) -> Checked:
+    names = [p.name for p in table]
     given: dict[str, Any] = {}
     for name, parameter in node.get_parameters_by_prefix("").items():
-        if name in _TABLE:
+        if name in names:
             given[name] = _plain(parameter.value)
         elif name not in _ROS_NAMES and not name.startswith(_ROS_PREFIXES):
-            raise InputError(f"parameter {name} is unknown", do=_advice(name))
-    settings = Settings(given)
-    for name, entry in _TABLE.items():
-        value = _ros_value(settings[name])
-        if name in given:
-            node.undeclare_parameter(name)
+            raise InputError(f"parameter {name} is unknown", do=_advice(name, names))
+    values = check(given)
+    for entry in table:
+        value = _ros_value(values[entry.name])
+        if entry.name in given:
+            node.undeclare_parameter(entry.name)
         # The value has been checked: a whole number given for a float is a float by now.
-        node.declare_parameter(name, value, _descriptor(entry, value), ignore_override=True)
-    return settings
+        node.declare_parameter(entry.name, value, _descriptor(entry, value), ignore_override=True)
+    return values
 
 
 def watch(
@@ -103,6 +123,6 @@ def _descriptor(entry: Parameter, value: Any) -> ParameterDescriptor:
     return descriptor
 
 
-def _advice(name: str) -> str:
-    near = difflib.get_close_matches(name, list(_TABLE), 1)
-    return f"did you mean {near[0]}?" if near else "see the parameter table in the README"
+def _advice(name: str, names: Sequence[str]) -> str:
+    near = difflib.get_close_matches(name, names, 1)
+    return f"did you mean {near[0]}?" if near else f"the node has {', '.join(names)}"

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import rclpy
-from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.duration import Duration
 from rclpy.exceptions import ParameterException
 from rclpy.node import Node
@@ -20,29 +19,21 @@ from rclpy.signals import SignalHandlerOptions
 from rclpy.subscription import RCLError
 from rosgraph_msgs.msg import Clock
 
+from ctr_dynamics.bagio.locate import locate
 from ctr_dynamics.bagio.reader import RawMessage
 from ctr_dynamics.errors import InputError
 from ctr_dynamics.messages import topics
 from ctr_dynamics.messages.cdr import CdrError, split_stamp
 from ctr_dynamics.nodes import qos
+from ctr_dynamics.nodes.declaration import declare_table
 from ctr_dynamics.nodes.naming import NAMESPACE, message_class, node_topic
 from ctr_dynamics.nodes.playback import load, pace, shifted
 from ctr_dynamics.nodes.spinning import stop_on_signals
-from ctr_dynamics.parameters import check_folder
+from ctr_dynamics.nodes.tables import DRIVER
+from ctr_dynamics.targets import atomic_file, check_targets
 
 LEAD_NS = 500_000_000
 """From the match of the topics, as the publishers see it, to the first message: on a busy machine subscribers see it that much later."""
-
-PARAMETERS: dict[str, tuple[Any, str]] = {
-    "bag": ("", "Bag to play: an .mcap file or a folder with one."),
-    "start_s": (0.0, "Left out at the beginning of the bag [s]."),
-    "duration_s": (0.0, "Played from there on; 0: to the end [s]."),
-    "reliability": ("best_effort", "Reliability offered: best_effort or reliable."),
-    "depth": (50, "Messages kept, each topic."),
-    "wait_s": (120.0, "Longest wait for a subscriber of the joint states [s]."),
-    "clock_hz": (0.0, "Above 0: publish /clock at this rate with the bag's own time, stamps unchanged [Hz]."),
-    "report": ("", "JSON file for what was played, written at the end; empty: none."),
-}
 
 
 class DriverNode(Node):
@@ -53,23 +44,14 @@ class DriverNode(Node):
     """
 
     def __init__(self) -> None:
-        super().__init__("driver", namespace=NAMESPACE)
-        values = {
-            name: self.declare_parameter(
-                name, default, ParameterDescriptor(description=text, read_only=True)
-            ).value
-            for name, (default, text) in PARAMETERS.items()
-        }
-        self.values: dict[str, Any] = values
+        super().__init__("driver", namespace=NAMESPACE, automatically_declare_parameters_from_overrides=True)
+        self.values = declare_table(self, DRIVER)
+        values = self.values
         if not values["bag"]:
             raise InputError("no bag is given", do="set the parameter bag, e.g. -p bag:=FILE.mcap")
-        if values["reliability"] not in qos.RELIABILITY:
-            raise InputError(
-                f"reliability '{values['reliability']}' is unknown",
-                do=f"write {' or '.join(qos.RELIABILITY)}",
-            )
-        check_folder("report", values["report"])
-        self.messages = load(Path(values["bag"]), values["start_s"], values["duration_s"])
+        bag = Path(values["bag"])
+        check_targets({"report": values["report"]}, {f"bag {file.name}": file for file in locate(bag).files})
+        self.messages = load(bag, values["start_s"], values["duration_s"])
         profile = qos.profile(values["reliability"], values["depth"])
         present = {message.topic for message in self.messages}
         self.outputs: dict[str, Publisher[Any]] = {
@@ -163,7 +145,8 @@ def main(args: list[str] | None = None) -> int:
             if report["left_out"]:
                 node.get_logger().warning(f"{report['left_out']} messages have no usable stamp: left out")
             if node.values["report"]:
-                Path(node.values["report"]).write_text(json.dumps(report), encoding="utf-8")
+                with atomic_file(Path(node.values["report"])) as part:
+                    part.write_text(json.dumps(report), encoding="utf-8")
             node.destroy_node()
         except KeyboardInterrupt:
             return 0

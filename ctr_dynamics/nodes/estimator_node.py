@@ -36,8 +36,9 @@ from ctr_dynamics.nodes.rolling import RollingRecording
 from ctr_dynamics.nodes.spinning import run_node
 from ctr_dynamics.nodes.stepping import StepLoop
 from ctr_dynamics.nodes.timing import StepTiming
-from ctr_dynamics.parameters import Settings, check_folder
+from ctr_dynamics.parameters import Settings
 from ctr_dynamics.robot import load_robot
+from ctr_dynamics.targets import atomic_file, check_targets
 
 DIAGNOSTICS_NS = 500_000_000
 DIAGNOSTICS_WAIT_NS = 100_000_000  # how long they wait for a pause between steps
@@ -55,8 +56,9 @@ class EstimatorNode(Node):
     def __init__(self) -> None:
         super().__init__(NAME, namespace=NAMESPACE, automatically_declare_parameters_from_overrides=True)
         self.settings = declare(self)
-        check_folder("timing_report", self.settings["timing_report"])
         self._robot = load_robot(self.settings["robot"])
+        written = ("timing_report", "record.rolling_path", "record.path")
+        check_targets({name: self.settings[name] for name in written}, {"robot file": self._robot.source})
         self._estimator = Estimator(self._robot, self.settings)
         self._prepared: tuple[Settings, set[str], Estimator | None] | None = None
         self._use_sim_time = bool(self.get_parameter("use_sim_time").value)
@@ -363,8 +365,9 @@ class EstimatorNode(Node):
         path = self.settings["timing_report"]
         try:
             if path:
-                Path(path).write_text(json.dumps(self.timing.report(), indent=1), encoding="utf-8")
-        except OSError as error:
+                with atomic_file(Path(path)) as part:
+                    part.write_text(json.dumps(self.timing.report(), indent=1), encoding="utf-8")
+        except InputError as error:
             self.get_logger().error(f"the timing report could not be written: {error}")
         self.destroy_node()
 

@@ -15,7 +15,7 @@ from ctr_dynamics.bagio.writer import write_bag
 from ctr_dynamics.errors import InputError
 from ctr_dynamics.estimation.outputs import Status
 from ctr_dynamics.messages.topics import TIP_LOAD
-from ctr_dynamics.parameters import check_folder
+from ctr_dynamics.targets import check_target
 
 LIMIT_BYTES = 256 * 2**20  # kept in memory, whatever the rates of the inputs
 
@@ -43,7 +43,7 @@ class RollingRecording:
         log: Callable[[str], Any],
     ) -> None:
         self.path = Path(path)
-        check_folder("record.rolling_path", str(self.path))
+        check_target(self.path, "record.rolling_path")
         named = f"{shlex.quote(str(self.path))} --robot {shlex.quote(robot)}"
         self.command = f"ctr-dynamics diagnose {named} --output findings"
         self.written = 0

@@ -5,24 +5,17 @@ from __future__ import annotations
 import sys
 from typing import Any
 
-from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.node import Node
 
-from ctr_dynamics.errors import InputError
 from ctr_dynamics.messages import topics
 from ctr_dynamics.nodes import qos
+from ctr_dynamics.nodes.declaration import declare_table
 from ctr_dynamics.nodes.naming import NAMESPACE, message_class
 from ctr_dynamics.nodes.spinning import run_node
+from ctr_dynamics.nodes.tables import VIEW
 from ctr_dynamics.robot import load_robot
 from ctr_dynamics.view.markers import MARKER_ARRAY, TUBES_TOPIC
 from ctr_dynamics.view.scene import Scene
-
-PARAMETERS: dict[str, tuple[Any, str]] = {
-    "robot": ("till2020_tissue", "Shipped robot or path of a robot file."),
-    "rate_hz": (30.0, "Pictures in a second, at most [Hz]."),
-    "diameter_scale": (1.0, "Magnification of the tubes' diameters."),
-    "ellipsoid_scale": (10.0, "Magnification of the tip's 95 % ellipsoid."),
-}
 
 
 class ViewNode(Node):
@@ -33,16 +26,8 @@ class ViewNode(Node):
     """
 
     def __init__(self) -> None:
-        super().__init__("view", namespace=NAMESPACE)
-        values = {
-            name: self.declare_parameter(
-                name, default, ParameterDescriptor(description=text, read_only=True)
-            ).value
-            for name, (default, text) in PARAMETERS.items()
-        }
-        for name in ("rate_hz", "diameter_scale", "ellipsoid_scale"):
-            if not 0.01 <= values[name] <= 1000.0:
-                raise InputError(f"parameter {name} is {values[name]:g}", do="give 0.01 to 1000")
+        super().__init__("view", namespace=NAMESPACE, automatically_declare_parameters_from_overrides=True)
+        values = declare_table(self, VIEW)
         self.scene = Scene(
             load_robot(values["robot"]),
             values["rate_hz"],

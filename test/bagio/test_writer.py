@@ -13,7 +13,7 @@ from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 
 from ctr_dynamics.bagio.reader import open_bag
-from ctr_dynamics.bagio.writer import LiveRecorder, atomic_file, check_targets, write_bag
+from ctr_dynamics.bagio.writer import LiveRecorder, write_bag
 from ctr_dynamics.errors import InputError
 from ctr_dynamics.messages import topics
 from ctr_dynamics.messages.encode import StepEncoder
@@ -32,17 +32,6 @@ def save(path, messages):
     with write_bag(path, META) as writer:
         for message in messages:
             writer.write(message.topic, message.stamp_ns, message.data)
-
-
-def test_no_output_is_a_file_that_is_read(tmp_path):
-    table, other = tmp_path / "a.csv", tmp_path / "b.csv"
-    check_targets(
-        {"output": other, "summary": None}, {"table": table, "robot file": "till2020_tissue", "none": None}
-    )
-    with pytest.raises(InputError, match="output is the table that is read"):
-        check_targets({"output": tmp_path / "." / "a.csv"}, {"table": table})
-    with pytest.raises(InputError, match="summary is the same file as the output"):
-        check_targets({"output": other, "summary": other}, {})
 
 
 def test_every_reader_opens_it(tmp_path, steps):
@@ -105,13 +94,6 @@ def test_nothing_is_left_after_a_failure(tmp_path, steps, error):
         fail()
     assert [p.name for p in tmp_path.iterdir()] == ["out.mcap"]
     assert (tmp_path / "out.mcap").read_bytes() == b"earlier result"
-
-
-@pytest.mark.parametrize(("name", "text"), [("no/such/out.mcap", "does not exist"), (".", "is a folder")])
-def test_targets_that_cannot_be_written(tmp_path, name, text):
-    with pytest.raises(InputError, match=text), atomic_file(tmp_path / name):
-        pass
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_live_recording(tmp_path, steps):

@@ -2,6 +2,7 @@
 
 import json
 import re
+import shutil
 import signal
 import time
 from pathlib import Path
@@ -16,7 +17,9 @@ from ctr_dynamics.bagio.reader import open_bag
 from ctr_dynamics.messages import topics
 from ctr_dynamics.nodes.processes import DRIVER, ESTIMATOR, NodeProcess
 from ctr_dynamics.nodes.qos import profile
+from ctr_dynamics.robot import load_robot, robot_to_yaml
 
+VIEW = "ctr_dynamics.nodes.view_node"
 pytestmark = pytest.mark.ros
 
 
@@ -146,7 +149,11 @@ def test_parameters_are_checked_when_set(start):
         ("tracker.lever_arm_m: [1.0, 2.5]", r"tracker\.lever_arm_m"),
         ("tracker.lever_arm_m: [0, 2.5, 0]", r"same type"),
         ("robot: nobody", r"'nobody'.*till2020_tissue"),
-        ("timing_report: /no/such/folder/t.json", r"timing_report '/no/such.*create the folder"),
+        (
+            "timing_report: /no/such/folder/t.json",
+            r"timing_report '/no/such.*does not exist; create it first",
+        ),
+        ("record.path: /no/such/folder/t.mcap", r"record\.path '/no/such.*does not exist; create it first"),
     ],
 )
 def test_parameters_of_a_file_are_refused_with_a_clear_line(tmp_path, yaml, wanted):
@@ -156,6 +163,33 @@ def test_parameters_of_a_file_are_refused_with_a_clear_line(tmp_path, yaml, want
     assert process.wait(120) == 2, process.output()
     line = process.output().splitlines()[-1]
     assert re.match(f"estimator: .*{wanted}", line), line
+
+
+@pytest.mark.parametrize(
+    ("module", "wrong", "wanted"),
+    [
+        (DRIVER, {"start_s": -1.0}, r"driver: .*start_s.*-1 s.*0 to 1e\+06 s"),
+        (DRIVER, {"depth": 0}, r"driver: .*depth.*1 to 10000"),
+        (DRIVER, {"reliability": "total"}, r"driver: .*'total'.*best_effort or reliable"),
+        (DRIVER, {"star_s": 1.0}, r"driver: .*star_s is unknown; did you mean start_s"),
+        (DRIVER, {"report": "BAG"}, r"driver: BAG: report is the bag in\.mcap that is read"),
+        (VIEW, {"rate_hz": 0.0}, r"view: .*rate_hz.*0\.01 to 1000 Hz"),
+        (ESTIMATOR, {"robot": "ROBOT", "timing_report": "ROBOT"}, r"estimator: ROBOT: timing_report is the robot file"),
+    ],
+)  # fmt: skip
+def test_what_no_node_can_use_ends_it_with_one_line(tmp_path, bags, module, wrong, wanted):
+    files = {"BAG": tmp_path / "in.mcap", "ROBOT": tmp_path / "robot.yaml"}
+    shutil.copyfile(bags / "clean_release.mcap", files["BAG"])
+    files["ROBOT"].write_text(robot_to_yaml(load_robot("till2020_tissue")))
+    before = [file.read_bytes() for file in files.values()]
+    given = {name: str(files[value]) if value in files else value for name, value in wrong.items()}
+    bag = {"bag": str(files["BAG"])} if module == DRIVER else {}
+    process = NodeProcess(module, {**bag, **given}, 1, tmp_path / "log")
+    assert process.wait(120) == 2, process.output()
+    for name, file in files.items():
+        wanted = wanted.replace(name, re.escape(str(file)))
+    assert re.match(wanted, process.output().splitlines()[-1]), process.output()
+    assert [file.read_bytes() for file in files.values()] == before
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

@@ -7,15 +7,14 @@ from types import ModuleType, SimpleNamespace
 
 import pytest
 
-from ctr_dynamics.nodes.driver_node import PARAMETERS as DRIVER_PARAMETERS
-from ctr_dynamics.nodes.view_node import PARAMETERS as VIEW_PARAMETERS
+from ctr_dynamics.nodes.tables import DRIVER, VIEW
 from ctr_dynamics.parameters import PARAMETERS
 
 ROOT = Path(__file__).parents[2]
 KNOWN = {
     "estimator": {p.name for p in PARAMETERS} | {"use_sim_time"},
-    "driver": set(DRIVER_PARAMETERS) | {"use_sim_time"},
-    "tube_markers": set(VIEW_PARAMETERS) | {"use_sim_time"},
+    "driver": {p.name for p in DRIVER} | {"use_sim_time"},
+    "tube_markers": {p.name for p in VIEW} | {"use_sim_time"},
 }
 MODULES = {
     "launch": ["LaunchDescription"],
