@@ -189,7 +189,10 @@ class Fusion:
         )
         ok = True
         if follow:
-            ok = self.columns.propagate(result.records, self.simulator.parameters, dt * self._skipped)
+            # a step that is divided where a load bends is one step to them; one that was too hard to be taken at once is not
+            records = result.records if result.substeps > 1 else result.records[-1:]
+            skipped_s = dt * (self._skipped + 1) - sum(record.scheme.dt for record in records)
+            ok = self.columns.propagate(records, self.simulator.parameters, skipped_s)
             self._followed = result.records[-1].key
         self._keep_tip(state, stamp)
         if follow and self._skipped:

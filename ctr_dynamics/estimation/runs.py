@@ -191,9 +191,9 @@ class Runs:
     ) -> tuple[StepResult, StepResult] | None:
         """Both runs from ``t`` (s) on in the same sweeps; None where they cannot go together."""
         assert self.fused is not None and self.alone is not None
-        if len(self.simulator.divisions(t, events)) != 2:
-            return None
-        return self.pair.step(self.fused, self.alone, t, self._corrected(), self._bare, record=record)
+        return self.pair.step(
+            self.fused, self.alone, t, self._corrected(), self._bare, record=record, events=events
+        )
 
     def _step_both(self, t: float, events: Sequence[float], record: bool) -> tuple[StepResult, StepResult]:
         """Both runs from ``t`` (s) on, together where they can go together."""

@@ -6,6 +6,8 @@ Sections, mesh and time scheme are common; parameters, actuators, loads and hist
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from itertools import pairwise
 
 import numpy as np
 from numba import njit
@@ -13,8 +15,8 @@ from numba import njit
 from ctr_dynamics.errors import InputError
 from ctr_dynamics.model.lockstep import solve_lanes
 from ctr_dynamics.model.mesh import Key, Mesh, section_lengths
-from ctr_dynamics.model.scheme import RATE_NOW, RATES, Y_BEFORE, Y_NOW
-from ctr_dynamics.model.simulator import InputsAt, Record, Simulator, State, StepResult, stage_inputs
+from ctr_dynamics.model.scheme import RATE_NOW, RATES, Y_BEFORE, Y_NOW, Scheme, make_scheme
+from ctr_dynamics.model.simulator import InputsAt, Record, Simulator, State, StepResult, divided, stage_inputs
 from ctr_dynamics.model.step import extrapolate, history, remember
 from ctr_dynamics.model.workspace import input_row
 
@@ -134,16 +136,56 @@ class Pair:
         self._buffers: tuple = ()
 
     def step(
-        self, a: State, b: State, t: float, inputs_a: InputsAt, inputs_b: InputsAt, *, record: bool = False
+        self,
+        a: State,
+        b: State,
+        t: float,
+        inputs_a: InputsAt,
+        inputs_b: InputsAt,
+        *,
+        record: bool = False,
+        events: Sequence[float] = (),
     ) -> tuple[StepResult, StepResult] | None:
         """Advance the states ``a`` of the first simulator and ``b`` of the second from t to t + dt (s) in place, as :meth:`Simulator.step` does
-        each. With ``record`` the first result carries what the tangent of its last stage needs, until the state is written to.
+        each, divided at ``events`` (s). With ``record`` the first result carries what the tangent of its last stages needs, until the state is
+        written to.
 
         None where they cannot go together: other sections or translations than each other's, sections that change, inputs that are not finite,
         a hard step. Nothing is done then, but that the next step of a run that has failed begins with a new Jacobian.
         """
-        model, scheme = self.first.model, self.first.scheme
-        times = t + self._times
+        times = self.first.divisions(t, events)
+        if len(times) == 2:
+            return self._part(a, b, t, self.first.scheme, inputs_a, inputs_b, record)
+        trials = a.copy(), b.copy()
+        for trial in trials:
+            trial.forget_course()
+        parts = []
+        for begin, end in pairwise(times):
+            for trial in trials:
+                trial.usable = False  # the Jacobian is of another step length
+            scheme = make_scheme(self.first.scheme.name, end - begin)
+            part = self._part(*trials, begin, scheme, inputs_a, inputs_b, record)
+            if part is None:
+                return None
+            parts.append(part)
+        a.become(trials[0])
+        b.become(trials[1])
+        return divided([first for first, _ in parts]), divided([second for _, second in parts])
+
+    def _part(
+        self,
+        a: State,
+        b: State,
+        t: float,
+        scheme: Scheme,
+        inputs_a: InputsAt,
+        inputs_b: InputsAt,
+        record: bool,
+    ) -> tuple[StepResult, StepResult] | None:
+        """Both from t (s) on by the step of the ``scheme``."""
+        model = self.first.model
+        whole = scheme is self.first.scheme
+        times = t + (self._times if whole else scheme.times * scheme.dt)
         rows_a, last_a = stage_inputs(model, inputs_a, times)
         rows_b, last_b = stage_inputs(model, inputs_b, times)
         if a.key != b.key:
@@ -162,7 +204,7 @@ class Pair:
             self._key, self._buffers = key, self._make(mesh)
         work, found, alive = self._buffers
         # a step may be too short to probe all columns: the next one begins at another
-        column = scheme.stages * round(t / scheme.dt) % len(model.step)
+        column = scheme.stages * round(t / self.first.scheme.dt) % len(model.step)
         sweeps, jacobians = _step(
             model.tubes, model.jacobian_lanes, mesh, scheme.c0, scheme.weights, (self.first.parameters, self.second.parameters), (rows_a, rows_b),
             (a.bank, b.bank), (a.unknowns, b.unknowns), (a.earlier, b.earlier), found, (a.inverse, b.inverse), (a.usable, b.usable),
@@ -176,8 +218,14 @@ class Pair:
         a.inputs, b.inputs = last_a, last_b
         records: tuple[Record, ...] = ()
         if record:
-            rates = a.bank[RATES + scheme.stages - 1 : RATES + scheme.stages]
-            records = (Record(scheme, key, mesh, a.bank[:0], a.bank[Y_NOW], rates, rows_a, found[0], times),)
+            # parts of a step share one bank, so each record of one needs its own copy
+            own = np.asarray if whole else np.copy
+            rates = own(a.bank[RATES + scheme.stages - 1 : RATES + scheme.stages])
+            records = (
+                Record(
+                    scheme, key, mesh, a.bank[:0], own(a.bank[Y_NOW]), rates, rows_a, own(found[0]), times
+                ),
+            )
         iterations = sweeps - scheme.stages
         return (
             StepResult(True, "ok", iterations, sweeps, jacobians, 1, records),

@@ -191,9 +191,9 @@ class Simulator:
         """
         times = self.divisions(t, events)
         if len(times) > 2:
-            divided = self._divided(state, times, inputs_at, record)
-            if divided is not None:
-                return divided
+            in_parts = self._divided(state, times, inputs_at, record)
+            if in_parts is not None:
+                return in_parts
         result = self._attempt(state, self.scheme, t, inputs_at, not state.usable, record)
         if result.ok:
             return result
@@ -247,14 +247,7 @@ class Simulator:
                 return None
             parts.append(part)
         state.become(trial)
-        return StepResult(
-            True,
-            "divided at an event",
-            sum(p.iterations for p in parts),
-            sum(p.sweeps for p in parts),
-            sum(p.jacobians for p in parts),
-            records=tuple(r for p in parts for r in p.records),
-        )
+        return divided(parts)
 
     def _attempt(
         self,
@@ -318,6 +311,18 @@ class Simulator:
                 self.model.buffers(mesh, lanes),
             )
         return self._buffers[key]
+
+
+def divided(parts: Sequence[StepResult]) -> StepResult:
+    """What a step in ``parts`` that have all succeeded comes to."""
+    return StepResult(
+        True,
+        "divided at an event",
+        sum(p.iterations for p in parts),
+        sum(p.sweeps for p in parts),
+        sum(p.jacobians for p in parts),
+        records=tuple(r for p in parts for r in p.records),
+    )
 
 
 def stage_inputs(model: Model, inputs_at: InputsAt, times: np.ndarray) -> tuple[np.ndarray, Inputs]:

@@ -92,6 +92,40 @@ def test_the_record_is_that_of_a_step_alone(model):
             assert np.abs(one - other).max() <= 1e-5 * np.abs(other).max()
 
 
+def test_a_step_that_is_divided_is_that_of_each_alone(model):
+    first, second = simulators(model)
+
+    def letting_go(t):
+        return turning(0.02 * min(1.0, max(0.0, 1.0 - (t - 4.4 * DT) / (0.3 * DT))))(t)
+
+    states = [at_rest(first, letting_go), at_rest(second, letting_go)]
+    alone, whole = [state.copy() for state in states], states[0].copy()
+    pair = Pair(first, second)
+    for k in range(8):
+        events = (4.4 * DT, 4.7 * DT) if k == 4 else ()
+        results = pair.step(*states, k * DT, letting_go, letting_go, record=True, events=events)
+        each = [
+            simulator.step(state, k * DT, letting_go, record="end", events=events)
+            for simulator, state in zip((first, second), alone, strict=True)
+        ]
+        first.step(whole, k * DT, letting_go)
+        if results is None:  # the jump of the rates at the start
+            assert k == 0
+            results = [
+                s.step(x, 0.0, letting_go, record="end") for s, x in zip((first, second), states, strict=True)
+            ]
+        assert [r.reason for r in results] == [r.reason for r in each]
+        assert len(results[0].records) == len(each[0].records) == len(events) + 1
+        for record, expected in zip(results[0].records, each[0].records, strict=True):
+            assert record.scheme.dt == expected.scheme.dt
+            for one, other in zip(record, expected, strict=True):
+                if isinstance(one, np.ndarray) and one.size:
+                    assert np.abs(one - other).max() <= 1e-4 * np.abs(other).max()
+    for together, apart in zip(states, alone, strict=True):
+        assert np.abs(together.nodes[:, :7] - apart.nodes[:, :7]).max() < 1e-7
+    assert np.abs(states[0].nodes[:, :3] - whole.nodes[:, :3]).max() > 1e-6, "it is another step undivided"
+
+
 @pytest.mark.parametrize(
     "case",
     [
