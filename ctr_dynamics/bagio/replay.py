@@ -151,7 +151,8 @@ class Player:
             if self._now_ns is not None and 0 < self._now_ns - now_ns <= self._clock.limit_ns:
                 now_ns = self._now_ns
             self._now_ns = now_ns
-            yield from self._timed(partial(self.estimator.advance, min(now_ns, self._last_ns)))
+            until_ns = min(now_ns + self.estimator.lead_ns, self._last_ns)
+            yield from self._timed(partial(self.estimator.advance, until_ns))
 
     def _timed(self, call: Callable[[], list[StepOutput]]) -> Iterator[StepOutput]:
         begin = time.perf_counter()

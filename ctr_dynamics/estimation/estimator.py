@@ -41,6 +41,7 @@ MOST_BEFORE_REDONE = 32  # steps: a course that waits for its correction is not 
 MARGIN = 1.0  # times the mean cost of a step: so much time must be left for taking one again
 LOST = 1.0  # m: a tip that is known no better than that is not estimated any more
 MAX_BEHIND = 1000  # steps to catch up at once; beyond, the model starts anew
+LEAD_NS = 1_000_000  # what a live step takes, from waking to its messages
 BACKWARDS = 3  # joint states in a row whose time ran backwards: the clock or the bag began anew
 
 
@@ -158,6 +159,11 @@ class Estimator:
             if self._unpaused >= MOST_UNPAUSED:
                 self.use_pause()
         return outputs
+
+    @property
+    def lead_ns(self) -> int:
+        """How long before its stamp a step is to be begun, so that it is out when it is due; 0 where steps wait for their joints."""
+        return LEAD_NS if self.inputs.predicting else 0
 
     @property
     def correcting(self) -> bool:

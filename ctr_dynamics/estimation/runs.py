@@ -146,7 +146,8 @@ class Runs:
         self._signals.clear()
         if uncorrected:
             self._signals.go_on_from(before, self.alone.inputs)
-        result, alone = self._step_both(before, events=self.inputs.load_bends(k), record=track is None)
+        events, record = self.inputs.load_bends(k), track is None
+        result, alone = self._together(before, events, record) or self.apart(before, events, record)
         if not alone.ok:
             return alone
         self._keep_alone_tip(t)
@@ -195,10 +196,10 @@ class Runs:
             self.fused, self.alone, t, self._corrected(), self._bare, record=record, events=events
         )
 
-    def _step_both(self, t: float, events: Sequence[float], record: bool) -> tuple[StepResult, StepResult]:
-        """Both runs from ``t`` (s) on, together where they can go together."""
+    def apart(self, t: float, events: Sequence[float], record: bool) -> tuple[StepResult, StepResult]:
+        """Each run by itself from ``t`` (s) on: a hard step, or sections that change."""
         assert self.fused is not None and self.alone is not None
-        return self._together(t, events, record) or (
+        return (
             self.simulator.step(
                 self.fused, t, self._corrected(), record="end" if record else False, events=events
             ),

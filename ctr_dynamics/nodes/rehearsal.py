@@ -26,9 +26,9 @@ def _no_time() -> float:
 def rehearse(robot: Robot, settings: Settings) -> int:
     """Run another estimator near the robot's rest position with every kind of input; returns how many steps.
 
-    The actuators turn and slide a little, a load comes and goes, and jumps once, so that each run takes a step by itself, and the tracker
-    reports the predicted tip, now and then late enough to be fused by roll-back. For a while it contradicts the model, and corrections are put off
-    for as long as they may be: memory is then nearly what it will be at most.
+    The actuators turn and slide a little, a load comes and goes, and jumps once, so that a step is divided, and the tracker reports the predicted
+    tip, now and then late enough to be fused by roll-back. For a while it contradicts the model, and corrections are put off for as long as they
+    may be: memory is then nearly what it will be at most. In the end each run takes a step by itself.
     """
     estimator = Estimator(robot, settings)
     encoder = StepEncoder(settings["output.frame_id"], robot.name)
@@ -56,4 +56,6 @@ def rehearse(robot: Robot, settings: Settings) -> int:
             x, y, z = out.predicted_position.tolist()
             beside = PUSH * (-1) ** tick if tick in PUSHED else 0.0
             estimator.add_tracker_pose(out.stamp_ns - age_ns, (x + beside, y, z), (*xyz, w))
+    if estimator.runs.fused is not None:
+        estimator.runs.apart(estimator.k * estimator.settings["model.dt_s"], [], record=True)
     return steps

@@ -46,6 +46,8 @@ class Steps(Protocol):
     @property
     def t0_ns(self) -> int | None: ...
     @property
+    def lead_ns(self) -> int: ...
+    @property
     def correcting(self) -> bool: ...
     def advance(
         self, now_ns: int | None = None, spare_s: Callable[[], float] | None = None, most: int | None = None
@@ -247,7 +249,7 @@ class StepLoop(threading.Thread):
     def _spare_s(self) -> float:
         """Time until the next step falls due, s; infinite where nothing tells."""
         due_ns = self._next_due_ns()
-        return math.inf if due_ns is None or not self._wall else (due_ns - self._now_ns()) * 1e-9
+        return math.inf if due_ns is None or not self._wall else (due_ns - self._begin_ns()) * 1e-9
 
     def _advance(self) -> None:
         """Take what is due, and correct what inputs have changed while there is time."""
@@ -255,7 +257,7 @@ class StepLoop(threading.Thread):
             return
         predicting = self.timing.policy == "predict"
         for _ in range(SLICE_STEPS):
-            until_ns, more = self._until(self._now_ns())
+            until_ns, more = self._until(self._begin_ns())
             corrects = self.estimator.correcting
             due_ns = self._next_due_ns()
             begin = time.perf_counter_ns()
@@ -293,6 +295,11 @@ class StepLoop(threading.Thread):
         now_ns = self._clock_ns()
         return self.stamp_clock.at(now_ns) if now_ns > 0 else 0
 
+    def _begin_ns(self) -> int:
+        """The stamp whose step is to be begun now, so that it is out when it is due; 0 while there is no clock."""
+        now_ns = self._now_ns()
+        return now_ns + self.estimator.lead_ns if now_ns > 0 and self._wall else now_ns
+
     def _until(self, now_ns: int) -> tuple[int | None, bool]:
         """The time up to which to advance, and whether more steps are due behind it."""
         if now_ns <= 0:
@@ -317,7 +324,7 @@ class StepLoop(threading.Thread):
         wait_ns = self._gathering_ns() or IDLE_NS
         due_ns = self._next_due_ns()
         if due_ns is not None and self._wall:
-            wait_ns = min(due_ns - self._now_ns(), IDLE_NS)
+            wait_ns = min(due_ns - self._begin_ns(), IDLE_NS)
             if wait_ns <= 0 and self._starved:
                 wait_ns = RETRY_NS  # do not spin
         rehearsal_ns = self._rehearsal_ns()
@@ -338,7 +345,7 @@ class StepLoop(threading.Thread):
         if now < self._next_collection_ns:
             return
         due_ns = self._next_due_ns()
-        tight = self._wall and due_ns is not None and due_ns - self._now_ns() < COLLECT_SLACK_NS
+        tight = self._wall and due_ns is not None and due_ns - self._begin_ns() < COLLECT_SLACK_NS
         if tight and now < self._next_collection_ns + COLLECT_NS:
             return  # a longer pause may come, but do not wait for it for ever
         gc.collect()

@@ -41,7 +41,7 @@ class StandIn:
         self.calls: list[tuple] = []
         self.t0_ns = None
         self.last_joint_ns = None
-        self.k = 0
+        self.k = self.lead_ns = 0
         self.innovations: list = []
         self.invalid = range(0)
         self.noted: list[tuple[str, str, str]] = []

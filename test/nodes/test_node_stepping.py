@@ -34,6 +34,7 @@ class Scripted:
         self.resets = self.pauses = 0
         self.fault = None
         self.correcting = False
+        self.lead_ns = 0
         self.spare_s = None
 
     def use_pause(self):
@@ -103,6 +104,33 @@ def test_inputs_are_taken_in_together_before_the_step(clock):
     loop._round()
     assert order == ["joints", "tracker"]
     assert published == [clock.now]
+
+
+def test_a_step_is_begun_as_long_before_its_stamp_as_the_estimator_asks(clock):
+    estimator = Scripted(clock.now)
+    estimator.lead_ns = MS
+    loop, published, _ = make_loop(estimator, clock)
+    t0 = clock.now
+    loop._round()
+    assert published == [t0]
+    waits = noted_waits(loop)
+    loop._sleep()
+    assert waits == [pytest.approx(2e-3)]
+    clock.now += 2 * MS - 1
+    loop._round()
+    assert published == [t0]
+    clock.now += 1
+    loop._round()
+    assert published == [t0, t0 + STEP_NS]
+    assert loop._spare_s() == pytest.approx(3e-3)  # until the next one is to be begun
+    assert loop.timing.lateness.max_ns == 0
+    loop._wall = False  # a clock of a simulation: it may stand still before the stamp
+    clock.now += 2 * MS
+    loop._round()
+    assert len(published) == 2
+    clock.now += 2 * MS
+    loop._round()
+    assert published == [t0, t0 + STEP_NS, t0 + 2 * STEP_NS]
 
 
 def test_the_first_inputs_are_gathered_before_the_model_starts(clock, monkeypatch):
