@@ -38,6 +38,23 @@ def check_target(path: Path, what: str = "") -> None:
         raise InputError("cannot be written (no permission)", where=where, do="name another file")
 
 
+def output_folder(path: Path) -> Path:
+    """The folder ``path``, made where it does not exist.
+
+    Raises:
+        InputError: it is a file, or cannot be made or written to.
+    """
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except FileExistsError:
+        raise InputError("is a file, a folder is expected", where=str(path), do="name another") from None
+    except OSError as error:
+        raise InputError(f"cannot be made ({error.strerror})", where=str(path), do="name another") from None
+    if not os.access(path, os.W_OK):
+        raise InputError("cannot be written to (no permission)", where=str(path), do="name another folder")
+    return path
+
+
 @contextlib.contextmanager
 def atomic_file(path: Path) -> Iterator[Path]:
     """A temporary name beside `path`, renamed to it on success and removed on any failure.

@@ -10,7 +10,7 @@ from typing import Annotated
 import typer
 
 from ctr_dynamics.cli.demo import SHIPPED, shipped_file
-from ctr_dynamics.targets import atomic_file
+from ctr_dynamics.targets import atomic_file, check_targets, output_folder
 
 
 def bench(
@@ -39,12 +39,14 @@ def bench(
     def say(part: str) -> None:
         print(f"bench: {part}", file=sys.stderr, flush=True)
 
-    output.mkdir(parents=True, exist_ok=True)
+    check_targets({"page": page}, {"bag": bag})
+    output_folder(output)
     result = measure(bag or shipped_file(f"{SHIPPED}.mcap"), quick, say)
     with atomic_file(output / "bench.json") as part:
         part.write_text(json.dumps(result, indent=1, allow_nan=False) + "\n", encoding="utf-8")
     if page is not None:
-        page.write_text(as_page(result), encoding="utf-8")
+        with atomic_file(page) as part:
+            part.write_text(as_page(result), encoding="utf-8")
     files = plots(result, output)
     print(text(result))
     print()

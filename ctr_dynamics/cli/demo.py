@@ -23,6 +23,7 @@ from ctr_dynamics.nodes import live_report
 from ctr_dynamics.nodes.playback import load
 from ctr_dynamics.parameters import Settings
 from ctr_dynamics.robot import load_robot
+from ctr_dynamics.targets import output_folder
 
 if TYPE_CHECKING:
     from ctr_dynamics.nodes.listener import Listener
@@ -58,7 +59,7 @@ def demo(
         bag, truth = shipped_file(f"{SHIPPED}.mcap"), truth or shipped_truth()
     messages = load(bag, 0.0, duration)
     span_s = (messages[-1].log_ns - messages[0].log_ns) * 1e-9
-    output.mkdir(parents=True, exist_ok=True)
+    output_folder(output)
     domain = free_domain()
     with tempfile.TemporaryDirectory(prefix="ctr_demo_") as name:
         folder = Path(name)

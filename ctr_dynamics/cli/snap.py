@@ -13,6 +13,7 @@ import typer
 from ctr_dynamics import __version__
 from ctr_dynamics.errors import InputError
 from ctr_dynamics.robot import Robot, load_robot
+from ctr_dynamics.targets import output_folder
 
 if TYPE_CHECKING:
     from ctr_dynamics.snap.experiment import Plan, Trajectory
@@ -196,7 +197,7 @@ def snap(
         "equations": equations,
     }
     Plan(start or 0.0, adaptive=adaptive, **options).check()  # type: ignore[arg-type]
-    output.mkdir(parents=True, exist_ok=True)
+    output_folder(output)
     curve = s_curve(of, np.array(of.rest.beta.value), of.rest.alpha.value[1], points)
     plan = Plan(_start(of, start, "beta1" in given, curve), adaptive=adaptive, **options)  # type: ignore[arg-type]
     trajectory = run(of, plan, _progress())

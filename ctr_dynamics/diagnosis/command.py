@@ -9,14 +9,15 @@ from typing import Any
 
 import yaml
 
+from ctr_dynamics.errors import InputError
 from ctr_dynamics.robot import Robot
 from ctr_dynamics.simulation.scenario import Scenario
-from ctr_dynamics.targets import atomic_file
+from ctr_dynamics.targets import atomic_file, output_folder
 
 from .diagnose import diagnose
 from .findings import findings, write
 from .planning import Plan, plan
-from .recording import read_recording
+from .recording import Recording, read_recording
 from .rehearsal import rehearse
 from .report import write_report
 
@@ -44,11 +45,13 @@ def run(request: Request, note: Callable[[str], None] = _quiet) -> dict[str, Any
     """Read, diagnose, write; returns the content of findings.json.
 
     Raises:
-        InputError: a bag that cannot be used.
+        InputError: a bag that cannot be used, or that is given twice; a folder that cannot be written to.
     """
+    directory = output_folder(Path(request.output))
     note("reading")
     recordings = [read_recording(path, request.robot) for path in request.bags]
     others = [read_recording(path, request.robot) for path in request.validation]
+    _all_different([*recordings, *others])
     note("kernels: compiled at the first use")
     rehearse(request.robot)
     diagnosis = diagnose(request.robot, recordings, others, note=note, workers=request.workers)
@@ -58,14 +61,30 @@ def run(request: Request, note: Callable[[str], None] = _quiet) -> dict[str, Any
         )
     note("next experiment")
     planned = plan(diagnosis)
-    directory = Path(request.output)
-    directory.mkdir(parents=True, exist_ok=True)
     content = findings(diagnosis, request.command, _experiment(planned, directory))
     write(directory, diagnosis, content)
     if request.report:
         note("report")
         write_report(directory / "report.html", diagnosis, content)
     return content
+
+
+def _all_different(recordings: list[Recording]) -> None:
+    """A bag that is fitted predicts itself, and one that is fitted twice counts twice.
+
+    Raises:
+        InputError: two of them have the same content.
+    """
+    seen: dict[frozenset[str], str] = {}
+    for recording in recordings:
+        content = frozenset(recording.sha256.values())
+        if content in seen:
+            raise InputError(
+                f"is the same bag as {seen[content]}",
+                where=recording.path,
+                do="give each bag once, and validate with others than are fitted",
+            )
+        seen[content] = recording.path
 
 
 def _experiment(planned: Plan | None, directory: Path) -> dict[str, Any] | None:

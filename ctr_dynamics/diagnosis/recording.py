@@ -18,6 +18,11 @@ Floats = NDArray[np.float64]
 SHORTEST = 2.0  # s of joints and tracker together, below which nothing can be said
 GAP = 0.1  # s without joints in which the robot may have gone anywhere
 SETTLING = 0.5  # s after it that the tip still swings from what was not seen
+PAUSE = 10.0  # s without joints, or by which their clock was set, beyond which it is another recording
+LONGEST = 1000.0  # s of joints that fit into memory with all that a diagnosis keeps of them
+BEGINNING = 0.1  # s of joints that tell whether the robot stands at the start
+STANDING = (0.01, 2e-4)  # rad and m by which it may move in them, beside the encoders' noise
+UNSETTLED = 2.0  # s until a start in motion, which the model does not know, has died away (1 s leaves 0.3 mm)
 LOAD_GRACE = 0.1  # s; a first load that comes this soon after the joints is there from the start
 
 
@@ -64,7 +69,8 @@ def read_recording(path: str | Path, robot: Robot) -> Recording:
     """Read a bag for ``robot``.
 
     Raises:
-        InputError: not a bag, no complete joint state of this robot, no tracker, or less than ``SHORTEST`` seconds of both.
+        InputError: not a bag, no complete joint state of this robot, no tracker, less than ``SHORTEST`` seconds of both, or more than
+            ``LONGEST``.
     """
     bag = open_bag(path)
     bag.check_inputs()
@@ -81,12 +87,20 @@ def read_recording(path: str | Path, robot: Robot) -> Recording:
         raise InputError(
             "no usable tracker pose", do="diagnosis needs the tracker on /ctr/tracker/tip", where=where
         )
+    joints, loads, parted = _longest_part(_once(joints), _once(loads))
+    notes += [parted] if parted else []
     t0 = joints[0][0]
-    table = np.array([[(stamp - t0) * 1e-9, *value] for stamp, value in _once(joints)])
+    table = np.array([[(stamp - t0) * 1e-9, *value] for stamp, value in joints])
     reason = robot.actuator_problem(table[0, 1 + robot.n_tubes :], table[0, 1 : 1 + robot.n_tubes])
     if reason:
         raise InputError(
             f"{reason}; is it a bag of this robot?", do="check the robot file and the units", where=where
+        )
+    if table[-1, 0] > LONGEST:
+        raise InputError(
+            f"joints of {table[-1, 0]:.0f} s, limit {LONGEST:g} s",
+            do="cut the bag; ten seconds with motion are enough",
+            where=where,
         )
     tracker = np.array([[(stamp - t0) * 1e-9, *value] for stamp, value in _once(poses)])
     inside = (tracker[:, 0] >= 0.0) & (tracker[:, 0] <= table[-1, 0])
@@ -97,6 +111,12 @@ def read_recording(path: str | Path, robot: Robot) -> Recording:
     tracker = tracker[inside]
     unseen, note = _unseen(table[:, 0], tracker[:, 0])
     notes += [note] if note else []
+    moving = _moving(table, robot)
+    if moving:
+        notes.append(
+            f"the recording begins in motion ({moving}), which the model does not know: tracker poses of the first {UNSETTLED:g} s were left out"
+        )
+        unseen |= tracker[:, 0] < UNSETTLED
     span = float(np.ptp(tracker[:, 0]) * np.mean(~unseen)) if len(tracker) else 0.0
     tracker = tracker[~unseen]
     if span < SHORTEST:
@@ -105,12 +125,50 @@ def read_recording(path: str | Path, robot: Robot) -> Recording:
             do="record for longer; ten seconds with motion are enough",
             where=where,
         )
-    load = np.array([[(stamp - t0) * 1e-9, *value] for stamp, value in _once(loads)]).reshape(-1, 7)
+    load = np.array([[(stamp - t0) * 1e-9, *value] for stamp, value in loads]).reshape(-1, 7)
     if len(load) and load[0, 0] > LOAD_GRACE:
         load = np.vstack([np.r_[load[0, 0] - 1e-9, np.zeros(6)], load])
     return Recording(
         bag.path.name, where, bag.sha256(), table, load, tracker[:, 0], tracker[:, 1:4], _continuous(tracker[:, 4:8]), tuple(notes)
     )  # fmt: skip
+
+
+def _longest_part(joints: Samples, loads: Samples) -> tuple[Samples, Samples, str]:
+    """The longest stretch of ``joints`` without a pause, the ``loads`` in it with the one that acts at its beginning, and a note on what was left
+    out."""
+    stamps = np.array([stamp for stamp, _ in joints])
+    ends = np.flatnonzero(np.diff(stamps) > PAUSE * 1e9)
+    if not len(ends):
+        return joints, loads, ""
+    parts = list(zip([0, *(ends + 1)], [*ends, len(stamps) - 1], strict=True))
+    first, last = max(parts, key=lambda part: stamps[part[1]] - stamps[part[0]])
+    begin, end = stamps[first], stamps[last]
+    acting = [(int(begin), value) for stamp, value in loads if stamp <= begin][-1:]
+    longest = float(np.diff(stamps).max()) * 1e-9
+    return (
+        joints[first : last + 1],
+        acting + [load for load in loads if begin < load[0] <= end],
+        f"joints are missing for up to {longest:.0f} s (limit {PAUSE:g} s): of {len(parts)} parts, only the longest was used, "
+        f"{(end - begin) * 1e-9:.1f} s from {(begin - stamps[0]) * 1e-9:.0f} s on",
+    )
+
+
+def _moving(joints: Floats, robot: Robot) -> str:
+    """Which actuator moves most at the beginning of ``joints`` (k, 1 + 2N), in words; empty where all stand."""
+    n = robot.n_tubes
+    rows = joints[joints[:, 0] <= BEGINNING]
+    least = np.repeat([STANDING[0] + 6.0 * robot.encoders.noise.value, STANDING[1]], n)
+    travel = np.ptp(rows[:, 1:], axis=0)
+    most = int(np.argmax(travel / least))
+    if travel[most] <= least[most]:
+        return ""
+    span = max(float(rows[-1, 0]), 1e-3)
+    kind = (
+        f"turns at {travel[most] / span:.2g} rad/s"
+        if most < n
+        else f"slides at {1e3 * travel[most] / span:.2g} mm/s"
+    )
+    return f"tube {most % n + 1} {kind}"
 
 
 def _unseen(joints: Floats, poses: Floats) -> tuple[NDArray[np.bool_], str]:

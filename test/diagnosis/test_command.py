@@ -69,6 +69,7 @@ def test_next_experiment_can_be_simulated(resting, tmp_path, capsys):
             "no Dask scheduler answers",
         ),
         (["README.md", "--robot", "till2020_tissue"], "README.md"),
+        (["BAG", "--validate", "BAG", "--robot", "till2020_tissue"], "is the same bag as"),
     ],
 )
 def test_bad_input_is_one_line_and_code_2(resting, tmp_path, capsys, arguments, words):
@@ -77,3 +78,12 @@ def test_bad_input_is_one_line_and_code_2(resting, tmp_path, capsys, arguments, 
     lines = [line for line in capsys.readouterr().err.splitlines() if line.startswith("ctr-dynamics: error")]
     assert len(lines) == 1
     assert words in lines[0]
+
+
+def test_a_folder_that_cannot_be_is_said_before_the_work(resting, tmp_path, capsys):
+    (tmp_path / "taken").write_text("")
+    arguments = ["diagnose", str(resting.protocol), "--robot", "till2020_tissue", "--output"]
+    assert main([*arguments, str(tmp_path / "taken")]) == 2
+    error = capsys.readouterr().err
+    assert "is a file, a folder is expected" in error
+    assert "reading" not in error

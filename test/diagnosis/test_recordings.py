@@ -7,10 +7,10 @@ import pytest
 
 from ctr_dynamics.bagio.writer import write_bag
 from ctr_dynamics.diagnosis.diagnose import measured_axes
-from ctr_dynamics.diagnosis.recording import GAP, SETTLING, SHORTEST, read_recording
+from ctr_dynamics.diagnosis.recording import GAP, SETTLING, SHORTEST, UNSETTLED, read_recording
 from ctr_dynamics.errors import InputError
 from ctr_dynamics.messages import topics
-from ctr_dynamics.messages.encode import encode_joint_state, encode_pose_stamped
+from ctr_dynamics.messages.encode import encode_joint_state, encode_pose_stamped, encode_wrench_stamped
 from ctr_dynamics.robot import load_robot
 
 START_NS = 1_700_000_000_000_000_000
@@ -27,12 +27,18 @@ def bag(tmp_path, robot):
     names = [f"tube{n}_{kind}" for n in (1, 2) for kind in ("rotation", "translation")]
     rest = [x for pair in zip(robot.rest.alpha.value, robot.rest.beta.value, strict=True) for x in pair]
 
-    def make(joints, poses, quaternions=lambda k: (0.0, 0.0, 0.0, 1.0)):
+    def make(joints, poses, quaternions=lambda k: (0.0, 0.0, 0.0, 1.0), rate=0.0, loads=()):
+        """The first tube turns at ``rate`` (rad/s); ``loads``: (s, N) in y."""
         path = tmp_path / "bag.mcap"
         with write_bag(path, {}) as writer:
             for t in joints:
                 stamp = START_NS + round(1e9 * t)
-                writer.write(topics.JOINT_STATES, stamp, encode_joint_state(stamp, names, rest))
+                now = [rest[0] + rate * t, *rest[1:]]
+                writer.write(topics.JOINT_STATES, stamp, encode_joint_state(stamp, names, now))
+            for t, force in loads:
+                stamp = START_NS + round(1e9 * t)
+                load = encode_wrench_stamped(stamp, "ctr_base", (0.0, force, 0.0), (0.0, 0.0, 0.0))
+                writer.write(topics.TIP_LOAD, stamp, load)
             for k, t in enumerate(poses):
                 stamp = START_NS + round(1e9 * t)
                 pose = encode_pose_stamped(stamp, "ctr_base", (0.01, 0.0, 0.2), quaternions(k))
@@ -51,6 +57,33 @@ def test_poses_in_gaps_of_the_joints_and_soon_after_are_left_out(robot, bag):
     assert len(found.notes) == 1
     assert "joints are missing once, for up to 0.70 s" in found.notes[0]
     assert f"{int((~kept).sum())} of {len(poses)} tracker poses" in found.notes[0]
+
+
+def test_a_clock_that_jumps_makes_two_recordings_of_which_the_longer_is_used(robot, bag):
+    first, second = np.arange(0.0, 3.0, 0.01), 1e6 + np.arange(0.0, 5.0, 0.01)
+    poses = np.concatenate([first[::4], second[::4]])
+    loads = [(0.0, 0.001), (1.0, 0.002), (1e6 + 2.0, 0.003), (1e6 + 9.0, 0.004)]
+    found = read_recording(bag(np.concatenate([first, second]), poses, loads=loads), robot)
+    assert found.duration == pytest.approx(4.99)
+    assert len(found.stamps) == len(second[::4])
+    np.testing.assert_allclose(found.load[:, 0], [0.0, 2.0], atol=1e-6)
+    np.testing.assert_allclose(found.load[:, 2], [0.002, 0.003])
+    assert "limit 10 s" in found.notes[0]
+    assert "of 2 parts, only the longest was used, 5.0 s from 1000000 s on" in found.notes[0]
+
+
+def test_a_recording_that_no_memory_holds_is_refused(robot, bag):
+    with pytest.raises(InputError, match=r"joints of 1005 s, limit 1000 s; cut the bag"):
+        read_recording(bag(np.arange(0.0, 1006.0, 5.0), np.arange(0.0, 9.0, 0.025)), robot)
+
+
+def test_a_recording_that_begins_in_motion_says_so_and_its_start_is_left_out(robot, bag):
+    joints, poses = np.arange(0.0, 10.0, 0.01), np.arange(0.0, 9.9, 0.025)
+    found = read_recording(bag(joints, poses, rate=0.5), robot)
+    np.testing.assert_allclose(found.stamps, poses[poses >= UNSETTLED], atol=1e-8)
+    assert len(found.notes) == 1
+    assert "begins in motion (tube 1 turns at 0.5 rad/s)" in found.notes[0]
+    assert not read_recording(bag(joints, poses, rate=1e-3), robot).notes
 
 
 def test_joints_at_half_the_rate_are_no_gap(robot, bag):
