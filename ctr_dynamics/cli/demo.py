@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import tempfile
 import time
 from collections.abc import Sequence
@@ -23,13 +24,15 @@ from ctr_dynamics.nodes import live_report
 from ctr_dynamics.nodes.playback import load
 from ctr_dynamics.parameters import Settings
 from ctr_dynamics.robot import load_robot
-from ctr_dynamics.targets import output_folder
+from ctr_dynamics.targets import atomic_file, output_folder
 
 if TYPE_CHECKING:
     from ctr_dynamics.nodes.listener import Listener
     from ctr_dynamics.nodes.processes import NodeProcess
 
 SHIPPED = "clean_release"
+SHORTEST_S = 2.0
+"""Of a run, below which its errors say nothing: the start is left out."""
 START_S = 900.0
 """Longest wait for the estimator: the first start compiles every kernel."""
 
@@ -53,12 +56,19 @@ def demo(
         raise InputError(
             f"the demo needs rclpy ({error})", do="source ROS 2 or pip install 'ctr_dynamics[ros]'"
         ) from None
-    load_robot(robot)
+    nominal = live_report.nominal_tracker(load_robot(robot))
     Settings({"output.policy": policy})
+    if not (duration == 0.0 or SHORTEST_S <= duration < math.inf):
+        raise InputError(f"--duration is {duration:g} s", do=f"write {SHORTEST_S:g} s or more, or 0 for all")
     if bag is None:
         bag, truth = shipped_file(f"{SHIPPED}.mcap"), truth or shipped_truth()
+    candidates = live_report.truth_of(truth) if truth is not None else []
     messages = load(bag, 0.0, duration)
     span_s = (messages[-1].log_ns - messages[0].log_ns) * 1e-9
+    if span_s < 0.9 * SHORTEST_S:
+        raise InputError(
+            f"holds {span_s:.2f} s, {SHORTEST_S:g} s are needed", do="give a longer bag", where=str(bag)
+        )
     output_folder(output)
     domain = free_domain()
     with tempfile.TemporaryDirectory(prefix="ctr_demo_") as name:
@@ -97,15 +107,16 @@ def demo(
     start_ns = bag_start_ns + shift["shift_ns"]
     alone = live_report.trace_of(heard[topics.TIP_POSE_PREDICTED], start_ns)
     fused = live_report.trace_of(heard[topics.TIP_POSE], start_ns)
-    tracker = live_report.tracker_of(bag, bag_start_ns)
-    comparisons = [live_report.compare("tracker", tracker, alone, fused)] if len(tracker.t) else []
-    if truth is not None:
-        comparisons.append(live_report.compare_truth(live_report.truth_of(truth), alone, fused))
+    tracker = live_report.tracker_of(bag, bag_start_ns, nominal)
+    comparisons = live_report.comparisons(tracker, candidates, alone, fused)
+    if not comparisons:
+        console.print("neither tracker poses nor a truth fall into the run: nothing to compare it with")
     show(console, comparisons, timing, len(fused.t))
     shapes = live_report.backbones(heard[topics.BACKBONE_STATE], start_ns, 8)
     live_report.draw(output / "demo.png", shapes, alone, fused, tracker, f"{bag.name}, robot {robot}, live")
     figures = {"comparisons": [vars(c) for c in comparisons], "timing": timing, "driver": shift}
-    (output / "demo.json").write_text(json.dumps(figures, indent=1), encoding="utf-8")
+    with atomic_file(output / "demo.json") as part:
+        part.write_text(json.dumps(figures, indent=1), encoding="utf-8")
     console.print(f"picture, figures and recorded outputs are in {output}")
     return 0
 
@@ -168,15 +179,16 @@ def show(
     console: Console, comparisons: Sequence[live_report.Comparison], timing: dict[str, Any], published: int
 ) -> None:
     """The final tables: tip errors in mm, then punctuality."""
-    errors = Table(title="tip error, 3-D (mm)")
-    errors.add_column("run")
-    for c in comparisons:
-        errors.add_column(f"{c.reference}: rms", justify="right")
-        errors.add_column("max", justify="right")
-    for run in ("alone", "fused"):
-        values = [getattr(c, f"{run}_{kind}") for c in comparisons for kind in ("rms", "max")]
-        errors.add_row("model alone" if run == "alone" else "fused", *(f"{1e3 * v:.2f}" for v in values))
-    console.print(errors)
+    if comparisons:
+        errors = Table(title="tip error, 3-D (mm)")
+        errors.add_column("run")
+        for c in comparisons:
+            errors.add_column(f"{c.reference}: rms", justify="right")
+            errors.add_column("max", justify="right")
+        for run in ("alone", "fused"):
+            values = [getattr(c, f"{run}_{kind}") for c in comparisons for kind in ("rms", "max")]
+            errors.add_row("model alone" if run == "alone" else "fused", *(f"{1e3 * v:.2f}" for v in values))
+        console.print(errors)
     steps = Table(title=f"steps of 3 ms, policy {timing['policy']}")
     for name in ("", "p50 (ms)", "p99 (ms)", "max (ms)"):
         steps.add_column(name, justify="right" if name else "left")

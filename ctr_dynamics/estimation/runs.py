@@ -261,7 +261,7 @@ class Runs:
         earlier = self.alone_tips.at(own_s - 2 * DT, DT, columns=False) or alone
         if fused is None or alone is None or earlier is None:
             return None, None
-        position, _ = self.tracker.to_base(position, quaternion)
+        position, _ = self.tracker.to_base(position, quaternion, fused.quaternion)
         estimate = registered(self.tracker, self.fusion.bias, fused)[:3]
         assert self.inputs.t0_ns is not None
         joints, rates = self.inputs.joints.at(self.inputs.t0_ns + own_s * 1e9)

@@ -65,8 +65,15 @@ class TrackerModel:
         shift = self.translation
         return time_s / (1.0 + self.skew), (position - shift - self.drift * time_s) / self.scale + shift
 
-    def to_base(self, position: Floats, quaternion: Floats) -> tuple[Floats, Floats]:
-        """Reading as a tip pose in ``ctr_base`` with the nominal geometry."""
+    def to_base(
+        self, position: Floats, quaternion: Floats, tip: Floats | None = None
+    ) -> tuple[Floats, Floats]:
+        """Reading as a tip pose in ``ctr_base`` with the nominal geometry.
+
+        Where not all of the rotation is measured, that of the ``tip`` (4,) wxyz turns the lever arm, if it is given.
+        """
+        if tip is not None and not self.mask[3:].all():
+            quaternion = multiply(self.rotation, tip)
         pose = pose_in_base(position, quaternion, self.rotation, self.translation, self.lever)
         return pose[:3], pose[3:]
 

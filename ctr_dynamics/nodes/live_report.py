@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import zipfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,9 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctr_dynamics.bagio.reader import open_bag
+from ctr_dynamics.errors import InputError
+from ctr_dynamics.estimation.tracker import TrackerModel, tracker_model
 from ctr_dynamics.messages import topics
 from ctr_dynamics.messages.cdr import PoseIn, decode_pose_stamped
+from ctr_dynamics.model.model import Model
 from ctr_dynamics.nodes.listener import Heard
+from ctr_dynamics.robot import Robot
 
 SETTLE_S = 0.5
 """Left out at the start of comparisons with the truth."""
@@ -54,21 +60,40 @@ def trace_of(messages: Sequence[Heard], start_ns: int) -> Trace:
     )
 
 
-def tracker_of(bag: Path, start_ns: int) -> Trace:
-    """Finite tracker positions of a bag relative to its own `start_ns`."""
+def nominal_tracker(robot: Robot) -> TrackerModel:
+    """The tracker of a robot file."""
+    return tracker_model(Model(robot, nodes=12).setup)
+
+
+def tracker_of(bag: Path, start_ns: int, tracker: TrackerModel) -> Trace:
+    """The tip in the base frame as the usable poses of a bag show it, relative to its own `start_ns`."""
     poses = [m.message for m in open_bag(bag).inputs() if isinstance(m.message, PoseIn)]
-    finite = sorted(pose for pose in poses if np.all(np.isfinite(pose.position)))
-    return Trace(
-        np.array([(pose.stamp_ns - start_ns) * 1e-9 for pose in finite]),
-        np.array([pose.position for pose in finite]).reshape(-1, 3),
-    )
+    t, p = [], []
+    for pose in sorted(poses):
+        q = np.array(pose.quaternion_xyzw)[[3, 0, 1, 2]]
+        if np.isfinite(pose.position).all() and np.isfinite(q).all() and 0.9 < np.linalg.norm(q) < 1.1:
+            t.append((pose.stamp_ns - start_ns) * 1e-9 - tracker.delay)
+            p.append(tracker.to_base(np.array(pose.position), q)[0])
+    return Trace(np.array(t), np.array(p).reshape(-1, 3))
 
 
 def truth_of(file: Path) -> list[Trace]:
-    """Candidate traces of a truth file: the tip `p`, and `p_trk` where the drawn registration is in it."""
-    with np.load(file) as data:
-        t = np.asarray(data["t"], dtype=float)
-        return [Trace(t, np.asarray(data[name], dtype=float)) for name in ("p", "p_trk") if name in data]
+    """Candidate traces of a truth file: the tip `p`, and `p_trk` where the drawn registration is in it.
+
+    Raises:
+        InputError: not such a file.
+    """
+    try:
+        with np.load(file) as data:
+            t = np.asarray(data["t"], dtype=float)
+            traces = [
+                Trace(t, np.asarray(data[name], dtype=float)) for name in ("p", "p_trk") if name in data
+            ]
+    except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
+        raise InputError(f"cannot be read as a truth file ({error})", where=str(file)) from None
+    if not traces or any(trace.p.shape != (*t.shape, 3) for trace in traces):
+        raise InputError("holds no tip 'p' or 'p_trk' (n, 3) over 't' (n,)", where=str(file))
+    return traces
 
 
 def compare(reference: str, target: Trace, alone: Trace, fused: Trace, since_s: float = 0.0) -> Comparison:
@@ -91,6 +116,18 @@ def compare_truth(candidates: Sequence[Trace], alone: Trace, fused: Trace) -> Co
     """The comparison with whichever candidate the fused tip is nearer to over the run."""
     found = [compare("truth", candidate, alone, fused, SETTLE_S) for candidate in candidates]
     return min(found, key=lambda comparison: comparison.fused_rms)
+
+
+def comparisons(tracker: Trace, truth: Sequence[Trace], alone: Trace, fused: Trace) -> list[Comparison]:
+    """With the tracker and the truth, as far as they have samples in the time of the run."""
+    found = []
+    if len(tracker.t):
+        with contextlib.suppress(ValueError):
+            found.append(compare("tracker", tracker, alone, fused))
+    if truth:
+        with contextlib.suppress(ValueError):
+            found.append(compare_truth(truth, alone, fused))
+    return found
 
 
 def _rms(distances: Floats) -> float:

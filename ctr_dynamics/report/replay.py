@@ -42,7 +42,8 @@ class ReplayLog:
     valid: list[bool] = field(default_factory=list)
     innovations: list[Innovation] = field(default_factory=list)
     shapes: list[tuple[float, Floats]] = field(default_factory=list)
-    samples: list[tuple[int, Floats]] = field(default_factory=list)
+    turned: list[Floats] = field(default_factory=list)
+    poses: list[PoseIn] = field(default_factory=list)
     _next_shape_ns: int = 0
 
     def step(self, out: StepOutput) -> None:
@@ -59,6 +60,7 @@ class ReplayLog:
         variance = np.diag(out.tip_covariance)[:3] if good else nothing
         self.sigma.append(np.sqrt(np.maximum(variance, 0.0)))
         self.alone.append(np.array(out.predicted_position) if good else nothing)
+        self.turned.append(np.array(out.predicted_quaternion_wxyz) if good else np.full(4, np.nan))
         self.force.append(np.array(out.disturbance_force) if good else nothing)
         self.force_sigma.append(np.array(out.disturbance_sigma) if good else nothing)
         if good and out.stamp_ns >= self._next_shape_ns:
@@ -66,11 +68,22 @@ class ReplayLog:
             self.shapes.append((t, out.backbone[:, 1:4].astype(float)))
 
     def pose(self, pose: PoseIn) -> None:
-        """Take in one tracker sample, as a tip in `ctr_base` of the time that it shows."""
-        q = np.array(pose.quaternion_xyzw)[[3, 0, 1, 2]]
-        if np.isfinite(q).all() and np.isfinite(pose.position).all() and 0.9 < np.linalg.norm(q) < 1.1:
-            position, _ = self.tracker.to_base(np.array(pose.position), q)
-            self.samples.append((pose.stamp_ns - round(self.tracker.delay * 1e9), position))
+        """Take in one tracker sample."""
+        self.poses.append(pose)
+
+    def samples(self) -> tuple[Floats, Floats]:
+        """Times (s,) s and positions (s, 3) m of the tip in `ctr_base` that the usable tracker samples show."""
+        whole = self.tracker.mask[3:].all()
+        times, points = [], []
+        for pose in self.poses:
+            t = (pose.stamp_ns - (self.first_ns or 0)) * 1e-9 - self.tracker.delay
+            q = np.array(pose.quaternion_xyzw)[[3, 0, 1, 2]]
+            if not whole:
+                q = self.turned[min(int(np.searchsorted(self.t, t)), len(self.t) - 1)]
+            if np.isfinite(q).all() and np.isfinite(pose.position).all() and 0.9 < np.linalg.norm(q) < 1.1:
+                times.append(t)
+                points.append(self.tracker.to_base(np.array(pose.position), q, q)[0])
+        return np.array(times), np.array(points).reshape(-1, 3)
 
 
 def replay_page(log: ReplayLog, summary: dict[str, Any], step_times_s: Sequence[float]) -> Page:
@@ -89,9 +102,7 @@ def replay_page(log: ReplayLog, summary: dict[str, Any], step_times_s: Sequence[
     _verdict(page, summary)
     page.table(_figures_of(summary))
     t, fused, alone, sigma = np.array(log.t), np.array(log.fused), np.array(log.alone), np.array(log.sigma)
-    first = log.first_ns or 0
-    sample_t = np.array([(stamp - first) * 1e-9 for stamp, _ in log.samples])
-    sample_p = np.array([p for _, p in log.samples]).reshape(-1, 3)
+    sample_t, sample_p = log.samples()
     dark = _stretches(t, np.array(log.valid))
     page.heading("Backbone")
     _animation(page, log, t, alone, sample_t, sample_p)
@@ -115,7 +126,7 @@ def replay_page(log: ReplayLog, summary: dict[str, Any], step_times_s: Sequence[
             figure_svg(_residual_panels(t, fused, alone, sigma, sample_t[inside], sample_p[inside])),
             _RESIDUAL_CAPTION,
         )
-    _innovations(page, log.innovations, first)
+    _innovations(page, log.innovations, log.first_ns or 0)
     page.heading("Unknown tip force")
     force, force_sigma = np.array(log.force), np.array(log.force_sigma)
     panels = [

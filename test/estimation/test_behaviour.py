@@ -376,9 +376,30 @@ def test_parameters_compose_with_the_robot_file():
     carried = plain[0] + matrix(plain[1]) @ lever
     assert np.allclose(position, R @ carried + shift, atol=1e-12)
     assert np.allclose(matrix(quaternion), R @ matrix(plain[1]), atol=1e-12)
+    bare = tracker_model(
+        setup, lever=lever, rotation=turn, translation=shift, mask=(True, True, True, True, True, False)
+    )
+    assert np.allclose(bare.to_base(position, np.array([1.0, 0, 0, 0]), tip.quaternion)[0], tip.position)
+    assert np.allclose(both.to_base(position, quaternion, np.array([1.0, 0, 0, 0]))[0], tip.position)
     back = both.to_base(position, quaternion)
     assert np.allclose(back[0], tip.position, atol=1e-12)
     assert np.allclose(matrix(multiply(conjugate(back[1]), tip.quaternion)), np.eye(3), atol=1e-12)
+
+
+def test_the_lever_arm_of_a_tracker_without_orientation_is_turned_by_the_models_own(release):
+    """The same readings at the end of an arm of 15 mm, with quaternions that mean nothing: residuals are those without the arm."""
+    arm = np.array([0.015, 0.0, 0.0])
+    messages, armed = [m for m in release if m.stamp < 2e9], []
+    for m in messages:
+        if m.kind == "pose":
+            position, (x, y, z, w), frame = m.content
+            moved = np.array(position) + matrix(np.array([w, x, y, z])) @ arm
+            m = replace(m, content=(tuple(moved), (1.0, 0.0, 0.0, 0.0), frame))
+        armed.append(m)
+    plain = play(messages, {"tracker.axes": "xyz"}).estimator.summary()["residual_rms_m"]
+    found = play(armed, {"tracker.axes": "xyz", "tracker.lever_arm_m": arm.tolist()}).estimator.summary()
+    for run in ("predicted", "fused"):
+        assert found["residual_rms_m"][run] == pytest.approx(plain[run], abs=1.5e-4)
 
 
 def test_reset_waits_for_joints_and_starts_anew(release):

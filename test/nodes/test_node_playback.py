@@ -5,13 +5,24 @@ import pytest
 
 from ctr_dynamics.bagio.reader import open_bag
 from ctr_dynamics.bagio.writer import write_bag
+from ctr_dynamics.cli.main import main
 from ctr_dynamics.errors import InputError
 from ctr_dynamics.messages import topics
 from ctr_dynamics.messages.cdr import CdrError, decode_joint_state, decode_stamp
 from ctr_dynamics.messages.encode import encode_joint_state, encode_pose_stamped
 from ctr_dynamics.nodes.listener import Heard
-from ctr_dynamics.nodes.live_report import Trace, compare, compare_truth, trace_of, tracker_of, truth_of
+from ctr_dynamics.nodes.live_report import (
+    Trace,
+    compare,
+    compare_truth,
+    comparisons,
+    nominal_tracker,
+    trace_of,
+    tracker_of,
+    truth_of,
+)
 from ctr_dynamics.nodes.playback import load, pace, shifted
+from ctr_dynamics.robot import load_robot, robot_with
 
 
 def test_shifting_moves_the_stamp_and_nothing_else():
@@ -109,8 +120,64 @@ def test_traces_of_messages_bag_and_truth(bags):
     np.testing.assert_allclose(trace.p[:, 0], [10, 30])
     bag = bags / "clean_release.mcap"
     start = next(iter(open_bag(bag).inputs())).message.stamp_ns
-    tracker = tracker_of(bag, start)
+    tracker = tracker_of(bag, start, nominal_tracker(load_robot("till2020_tissue")))
     truth = truth_of(bags / "truth" / "clean_release.npz")
     assert len(tracker.t) > 200
     near = min(float(np.sqrt(np.mean(np.sum((c.at(tracker.t) - tracker.p) ** 2, axis=1)))) for c in truth)
     assert near < 1.5e-3
+
+
+def test_the_tip_that_poses_show_is_that_of_the_robots_registration_lever_arm_and_delay(bags):
+    turned = robot_with(
+        load_robot("till2020_tissue"),
+        {
+            "tracker.registration_rotation": [0.0, 0.0, np.pi / 2],
+            "tracker.registration_translation": [0.1, 0.2, 0.3],
+            "tracker.delay": 0.025,
+        },
+    )
+    bag = bags / "clean_release.mcap"
+    plain = tracker_of(bag, 0, nominal_tracker(load_robot("till2020_tissue")))
+    moved = tracker_of(bag, 0, nominal_tracker(turned))
+    delay = nominal_tracker(load_robot("till2020_tissue")).delay
+    np.testing.assert_allclose(moved.t - plain.t, delay - 0.025, atol=1e-6)
+    x, y, z = plain.p.T
+    np.testing.assert_allclose(moved.p, np.c_[y - 0.2, 0.1 - x, z - 0.3], atol=1e-12)
+
+
+def test_what_does_not_fall_into_the_run_is_not_compared():
+    t = np.linspace(0.0, 1.0, 11)
+    run = Trace(t, np.zeros((11, 3)))
+    late = Trace(t + 5.0, np.zeros((11, 3)))
+    nothing = Trace(np.zeros(0), np.zeros((0, 3)))
+    assert comparisons(nothing, [], run, run) == []
+    assert comparisons(late, [late], run, run) == []
+    assert [c.reference for c in comparisons(run, [run], run, run)] == ["tracker", "truth"]
+
+
+def test_a_truth_that_is_none_is_one_clear_error(tmp_path):
+    empty, other, wrong = (tmp_path / name for name in ("a.npz", "b.npz", "c.npz"))
+    empty.write_bytes(b"")
+    np.savez(other, t=np.zeros(3))
+    np.savez(wrong, t=np.zeros(3), p=np.zeros((2, 3)))
+    for file in (tmp_path / "none.npz", empty, other, wrong):
+        with pytest.raises(InputError, match=file.name):
+            truth_of(file)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--duration", "0.2"], "--duration is 0.2 s; write 2 s or more"),
+        (["--duration", "nan"], "--duration is nan s"),
+        (["--duration=-1"], "--duration is -1 s"),
+        (["--truth", "none.npz"], "none.npz"),
+        (["--robot", "nobody"], "nobody"),
+        (["--policy", "maybe"], "maybe"),
+    ],
+)
+def test_a_demo_that_cannot_be_shown_is_refused_before_it_starts(capsys, tmp_path, arguments, words):
+    pytest.importorskip("rclpy")
+    assert main(["demo", *arguments, "--output", str(tmp_path / "out")]) == 2
+    assert words in " ".join(capsys.readouterr().err.split())
+    assert not (tmp_path / "out").exists()
