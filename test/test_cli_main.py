@@ -1,5 +1,6 @@
 """The command line's frame: lazy commands, exit codes and one-line errors."""
 
+import os
 import subprocess
 import sys
 import types
@@ -103,3 +104,28 @@ def test_bad_arguments_are_exit_code_2(command, arguments):
 
     command(info)
     assert cli.main(arguments) == 2
+
+
+@pytest.mark.parametrize("name", ["robot", "info"])
+def test_a_terminal_of_few_characters_is_no_error(name):
+    environment = {**os.environ, "PYTHONIOENCODING": "ascii"}
+    arguments = {"robot": ["check", "till2020_tissue"], "info": ["n\u00fcrnberg.mcap"]}[name]
+    command = [sys.executable, "-m", "ctr_dynamics.cli.main", name, *arguments]
+    done = subprocess.run(command, env=environment, capture_output=True, check=False)
+    assert b"Traceback" not in done.stderr
+    assert done.returncode == (2 if name == "info" else 0)
+    assert (name == "robot") or b"n\\xfcrnberg" in done.stderr
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full here")
+@pytest.mark.parametrize("buffered", ["", "1"])
+def test_output_that_cannot_be_written_is_one_line_and_exit_code_2(buffered):
+    command = [sys.executable, "-m", "ctr_dynamics.cli.main", "--version"]
+    environment = {**os.environ, "PYTHONUNBUFFERED": buffered}
+    with open("/dev/full", "w") as full:
+        done = subprocess.run(
+            command, stdout=full, stderr=subprocess.PIPE, text=True, check=False, env=environment
+        )
+    assert done.returncode == 2
+    assert len(done.stderr.splitlines()) == 1
+    assert "standard output cannot be written (No space left on device)" in done.stderr

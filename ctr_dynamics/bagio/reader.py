@@ -103,8 +103,9 @@ class Bag:
                     f"{topic.name} ({topic.ros_type})" for topic in list(self.topics.values())[:6]
                 )
                 state = "no topic" if here is None else "no message on"
+                damage = "".join(f"; {note}" for note in self.notes[:2])
                 raise InputError(
-                    f"{state} {name}; the bag holds {known or 'no topics at all'}",
+                    f"{state} {name}; the bag holds {known or 'no topics at all'}{damage}",
                     where=str(self.path),
                     do="record that topic, or rename it with `ros2 bag convert`",
                 )

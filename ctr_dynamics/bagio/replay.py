@@ -27,8 +27,8 @@ from ctr_dynamics.collector import seldom_collected
 from ctr_dynamics.errors import InputError
 from ctr_dynamics.messages.cdr import CdrError, JointStateIn, PoseIn, decode_stamp
 from ctr_dynamics.messages.encode import StepEncoder
-from ctr_dynamics.messages.topics import JOINT_STATES, STEP_NS
-from ctr_dynamics.parameters import Settings
+from ctr_dynamics.messages.topics import JOINT_STATES, STEP_NS, TRACKER_TIP
+from ctr_dynamics.parameters import PARAMETERS, Settings
 from ctr_dynamics.robot import Robot, load_robot
 from ctr_dynamics.stamps import EachOnce, StampClock
 from ctr_dynamics.targets import atomic_file, check_targets
@@ -40,6 +40,7 @@ if TYPE_CHECKING:
 MakeEstimator = Callable[[Robot, Settings], "Estimator"]
 Progress = Callable[[float, int], None]
 AFTER_NS = 1_000_000_000  # what arrives later than this after the last joint state changes no step
+LIVE_ONLY = ("qos.", "record.", "timing_report")  # parameters of a node
 _WARM_UP_NS = 300_000_000
 _NEVER_NS = 2**63 - 1
 _MAX_STRETCHES = 100
@@ -252,15 +253,22 @@ def replay(
         log = _report_log(estimator, opened) if report_part is not None else None
         stack.enter_context(seldom_collected())
         numbers, times_s = _run(opened, estimator, robot, settings, writer, progress, log)
-        notes = [*opened.notes, *_input_notes(numbers["input_problems"]), *_left_out(numbers)]
+        notes = [
+            *opened.notes,
+            *_without(opened, settings),
+            *_input_notes(numbers["input_problems"]),
+            *_left_out(numbers),
+        ]
         content = plain({**numbers, **provenance, "notes": notes})
         if summary_part is not None:
             text = json.dumps(content, indent=1, allow_nan=False, ensure_ascii=False)
-            summary_part.write_text(text + "\n", encoding="utf-8")
+            # a name that is not UTF-8 is escaped as JSON does it
+            summary_part.write_text(text + "\n", encoding="utf-8", errors="backslashreplace")
         if report_part is not None and log is not None:
             from ctr_dynamics.report.replay import replay_page
 
-            report_part.write_text(replay_page(log, content, times_s).text(), encoding="utf-8")
+            page = replay_page(log, content, times_s).text()
+            report_part.write_text(page, encoding="utf-8", errors="backslashreplace")
     return ReplayResult(content, notes)
 
 
@@ -361,6 +369,20 @@ def _input_notes(problems: dict[str, dict[str, Any]]) -> list[str]:
         for group, kinds in problems.items()
         for kind, found in kinds.items()
     ]
+
+
+def _without(bag: Bag, settings: Settings) -> list[str]:
+    """What a replay does without: a tracker, and the live node's own outputs."""
+    tracker = bag.topics.get(TRACKER_TIP)
+    notes = (
+        []
+        if tracker is not None and tracker.messages
+        else [f"no pose on {TRACKER_TIP}: the model runs alone"]
+    )
+    live = [p.name for p in PARAMETERS if p.name.startswith(LIVE_ONLY) and settings[p.name] != p.default]
+    if live:
+        notes.append(f"parameters of the live node alone, without effect here: {', '.join(live)}")
+    return notes
 
 
 def _left_out(numbers: dict[str, Any]) -> list[str]:

@@ -66,8 +66,7 @@ def _with_exit_code(command: Callable[..., Any]) -> Callable[..., None]:
             fail("interrupted")
             raise typer.Exit(INTERRUPTED) from None
         except BrokenPipeError:
-            # The reader of our output is gone; nothing more can be written, not even at exit.
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            _discard_output()  # its reader is gone
             raise typer.Exit(FINISHED) from None
         except OSError as error:
             fail(f"{error.filename}: {error.strerror}" if error.filename else str(error))
@@ -142,6 +141,17 @@ def spread(arguments: list[str], options: Sequence[str]) -> list[str]:
     return out
 
 
+def _discard_output() -> None:
+    """Nothing more can be written, not even at exit."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+def _unwritable(error: OSError) -> int:
+    fail(f"standard output cannot be written ({error.strerror})")
+    _discard_output()
+    return BAD_INPUT
+
+
 def main(argv: list[str] | None = None) -> int:
     """Run the command line.
 
@@ -151,17 +161,30 @@ def main(argv: list[str] | None = None) -> int:
     Returns:
         0 finished, 1 finished but some rows or steps failed, 2 bad arguments or input, 130 interrupted.
     """
+    for stream in (sys.stdout, sys.stderr):
+        # terminals of few characters, and names of files that are not UTF-8
+        getattr(stream, "reconfigure", lambda **_: None)(errors="backslashreplace")
     arguments = sys.argv[1:] if argv is None else argv
     requested = next((a for a in arguments if not a.startswith("-")), None)
     arguments = spread(arguments, MANY.get(requested or "", ()))
     try:
         build_app(requested)(args=arguments, prog_name="ctr-dynamics")
     except SystemExit as end:
-        return end.code if isinstance(end.code, int) else (FINISHED if end.code is None else BAD_INPUT)
+        code = end.code if isinstance(end.code, int) else (FINISHED if end.code is None else BAD_INPUT)
     except KeyboardInterrupt:
         fail("interrupted")
         return INTERRUPTED
-    return FINISHED
+    except OSError as error:
+        return _unwritable(error)
+    else:
+        code = FINISHED
+    try:
+        sys.stdout.flush()
+    except BrokenPipeError:
+        _discard_output()
+    except OSError as error:
+        return _unwritable(error)
+    return code
 
 
 if __name__ == "__main__":

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 import time
 from pathlib import Path
@@ -56,6 +57,8 @@ def view(
     """
     if not 0 <= port <= 65535:
         raise InputError(f"--port {port} is outside 0 to 65535", do="8765 is Foxglove's own")
+    if not 0.0 <= speed < math.inf:
+        raise InputError(f"--speed is {speed:g}", do="write a number above 0, or 0 for as fast as it goes")
     loaded = load_robot(robot)
     if bag is not None:
         open_bag(bag).check_inputs()

@@ -167,4 +167,4 @@ def write(directory: Path, diagnosis: Diagnosis, content: dict[str, Any]) -> Non
 
 def _text(path: Path, text: str) -> None:
     with atomic_file(path) as part:
-        part.write_text(text, encoding="utf-8")
+        part.write_text(text, encoding="utf-8", errors="backslashreplace")

@@ -46,7 +46,7 @@ def write_report(path: Path, diagnosis: Diagnosis, content: dict[str, Any]) -> N
         _values(page, diagnosis.best)
     _scope(page, content)
     with atomic_file(path) as part:
-        part.write_text(page.text(), encoding="utf-8")
+        part.write_text(page.text(), encoding="utf-8", errors="backslashreplace")
 
 
 def _traces(page: Page, d: Diagnosis) -> None:

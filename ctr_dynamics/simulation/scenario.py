@@ -119,7 +119,8 @@ class Scenario(Block):
 
     description: str = ""
     duration_s: Seconds
-    start_stamp_s: Annotated[int, Field(ge=0, le=4_000_000_000)] = 1_700_000_000
+    # a stamp has 32 bits, and the run goes on from there
+    start_stamp_s: Annotated[int, Field(ge=0, le=2_100_000_000)] = 1_700_000_000
     seed: Annotated[int, Field(ge=0)] = 0
     tubes: list[TubeMotion] = Field(default_factory=list)
     loads: list[Load] = Field(default_factory=list)

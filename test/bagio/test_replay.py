@@ -7,6 +7,8 @@ tested with the estimator.
 from __future__ import annotations
 
 import json
+import os
+import shutil
 import subprocess
 import sys
 from types import SimpleNamespace
@@ -18,6 +20,7 @@ from ctr_dynamics import __version__
 from ctr_dynamics.bagio.reader import InputMessage, open_bag, sha256_of
 from ctr_dynamics.bagio.replay import Player, arrivals, plain, replay
 from ctr_dynamics.bagio.writer import write_bag
+from ctr_dynamics.cli.main import main
 from ctr_dynamics.cli.replay import settings_for_replay
 from ctr_dynamics.errors import InputError
 from ctr_dynamics.messages import cdr, topics
@@ -280,6 +283,46 @@ def test_no_usable_joint_state(stand_in, tmp_path):
         run(tmp_path / "in.mcap", stand_in, tmp_path)
     assert "\n" not in str(error.value)
     assert [p.name for p in tmp_path.iterdir()] == ["in.mcap"]
+
+
+def test_what_a_replay_does_without_is_said(bags, stand_in, tmp_path):
+    messages = list(open_bag(bags / "clean_release.mcap").messages())
+    with write_bag(tmp_path / "in.mcap", {}) as writer:
+        for m in messages:
+            if m.topic != topics.TRACKER_TIP:
+                writer.write(m.topic, m.log_ns, m.data)
+    assert run(tmp_path / "in.mcap", stand_in, tmp_path).notes == [
+        "no pose on /ctr/tracker/tip: the model runs alone"
+    ]
+    settings = Settings({"output.policy": "wait", "record.path": "a.mcap", "qos.publisher_depth": 3})
+    result = replay(bags / "clean_release.mcap", "till2020_tissue", settings, make_estimator=stand_in)
+    assert result.notes == [
+        "parameters of the live node alone, without effect here: qos.publisher_depth, record.path"
+    ]
+
+
+def test_a_bag_that_is_cut_before_its_topics_says_that_it_is_cut(bags, stand_in, tmp_path):
+    whole = (bags / "clean_release.mcap").read_bytes()
+    (tmp_path / "in.mcap").write_bytes(whole[:100])
+    with pytest.raises(InputError, match=r"no topics at all; .*in\.mcap") as error:
+        run(tmp_path / "in.mcap", stand_in, tmp_path)
+    assert "\n" not in str(error.value)
+
+
+def test_names_that_are_not_utf8_are_escaped(bags, tmp_path, capsys):
+    bag = tmp_path / os.fsdecode(b"caf\xe9.mcap")
+    try:
+        shutil.copyfile(bags / "clean_release.mcap", bag)
+    except OSError:
+        pytest.skip("this file system takes UTF-8 only")
+    made = {f"--{name}": tmp_path / f"out.{name}" for name in ("summary", "report", "output")}
+    assert main(["replay", str(bag), *(str(x) for pair in made.items() for x in pair)]) == 0
+    summary = json.loads(made["--summary"].read_text(encoding="utf-8"))
+    assert summary["inputs"][0]["name"] == bag.name
+    assert "caf\\udce9.mcap" in made["--report"].read_text(encoding="utf-8")
+    assert main(["info", str(bag)]) == 0
+    assert main(["replay", str(bag), "--robot", "nobody"]) == 2
+    assert "nobody" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("error", [RuntimeError("solver"), KeyboardInterrupt()])

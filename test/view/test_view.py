@@ -208,6 +208,12 @@ def test_view_of_a_bag_that_gives_no_step_says_so(capsys):
     assert "no step was possible" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("speed", ["-1", "nan", "inf"])
+def test_view_at_a_speed_that_is_none_is_refused(capsys, speed):
+    assert cli.main(["view", str(BAG), f"--speed={speed}", "--port", "0"]) == 2
+    assert f"--speed is {speed}" in capsys.readouterr().err
+
+
 def test_view_listens_on_this_machine_only(capsys):
     pytest.importorskip("foxglove")
     with socket.create_server(("127.0.0.1", 0)) as taken:
