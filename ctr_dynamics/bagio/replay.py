@@ -41,8 +41,6 @@ MakeEstimator = Callable[[Robot, Settings], "Estimator"]
 Progress = Callable[[float, int], None]
 AFTER_NS = 1_000_000_000  # what arrives later than this after the last joint state changes no step
 LIVE_ONLY = ("qos.", "record.", "timing_report")  # parameters of a node
-_WARM_UP_NS = 300_000_000
-_NEVER_NS = 2**63 - 1
 _MAX_STRETCHES = 100
 
 
@@ -105,18 +103,11 @@ class Player:
         own = self.estimator.step_times_s
         return own if own is not None and len(own) == len(self._call_times_s) else self._call_times_s
 
-    def play(self, bag: Bag, until_ns: int | None = None) -> Iterator[StepOutput]:
-        """Steps in order, to the last joint stamp.
-
-        Args:
-            until_ns: log time at which to stop early; no closing steps then.
-        """
-        # the end is looked for in the whole bag, which one that stops early does not reach
-        self._last_ns, last_log_ns = last_joints(bag) if until_ns is None else (_NEVER_NS, _NEVER_NS)
+    def play(self, bag: Bag) -> Iterator[StepOutput]:
+        """Steps in order, to the last joint stamp."""
+        self._last_ns, last_log_ns = last_joints(bag)
         for group in arrivals(bag.inputs()):
             log_ns = group[0].log_ns
-            if until_ns is not None and log_ns > until_ns:
-                return
             if log_ns > last_log_ns + AFTER_NS:
                 self.unused += len(group)
                 continue
@@ -125,8 +116,7 @@ class Player:
             for item in group:
                 self._add(item)
             yield from self._advance(log_ns)
-        if until_ns is None:
-            yield from self._timed(self.estimator.finish)
+        yield from self._timed(self.estimator.finish)
 
     def _add(self, item: InputMessage) -> None:
         message = item.message
@@ -246,8 +236,7 @@ def replay(
         if output is not None:
             writer = stack.enter_context(write_bag(Path(output), _metadata(provenance)))
         summary_part = stack.enter_context(atomic_file(Path(summary))) if summary is not None else None
-        make = make_estimator or _default_estimator()
-        _warm_up(opened, make(robot, settings))
+        make = make_estimator or _rehearsed_estimator(robot, settings)
         report_part = stack.enter_context(atomic_file(Path(report))) if report is not None else None
         estimator = make(robot, settings)
         log = _report_log(estimator, opened) if report_part is not None else None
@@ -272,10 +261,13 @@ def replay(
     return ReplayResult(content, notes)
 
 
-def _default_estimator() -> MakeEstimator:
+def _rehearsed_estimator(robot: Robot, settings: Settings) -> MakeEstimator:
+    """The estimator, with everything compiled and loaded before the clock starts."""
     # Imported late: it brings the compiled model, which reading and checking a bag do not need.
     from ctr_dynamics.estimation.estimator import Estimator
+    from ctr_dynamics.estimation.rehearsal import rehearse
 
+    rehearse(robot, settings)
     return Estimator
 
 
@@ -343,15 +335,6 @@ def _run(
         "malformed": dict(bag.malformed),
     }
     return numbers, player.times_s()
-
-
-def _warm_up(bag: Bag, estimator: Estimator) -> None:
-    """Run the bag's first moments through another estimator: whatever has to be compiled is, before the clock
-    starts."""
-    starts = [block.start_ns for file in bag.files for block in file.blocks]
-    if starts:
-        for _ in Player(estimator).play(bag, until_ns=min(starts) + _WARM_UP_NS):
-            pass
 
 
 def _metadata(provenance: dict[str, Any]) -> dict[str, str]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +14,8 @@ from ctr_dynamics.bagio.replay import Player
 from ctr_dynamics.bench.sweeps import sweep_cost
 from ctr_dynamics.collector import seldom_collected
 from ctr_dynamics.estimation.estimator import DT_NS, Estimator
+from ctr_dynamics.estimation.rehearsal import rehearse
 from ctr_dynamics.model.model import Model
-from ctr_dynamics.nodes.rehearsal import rehearse
 from ctr_dynamics.parameters import Settings
 from ctr_dynamics.robot import load_robot
 
@@ -44,16 +45,15 @@ def fused_replay(
         values["filter.rank"] = rank
     settings, robot = Settings(values), load_robot(robot_name)
     opened = open_bag(bag)
-    start = min(block.start_ns for file in opened.files for block in file.blocks)
     rehearse(robot, settings)  # as the node does before its first message
-    until = None if seconds is None else start + round(seconds * 1e9)
+    most = None if seconds is None else round(seconds * 1e9) // DT_NS
     wall = np.inf
     for _ in range(rounds):
         estimator = Estimator(robot, settings)
         player = Player(estimator)
         with seldom_collected():
             begin = time.perf_counter()
-            steps = sum(1 for _ in player.play(opened, until_ns=until))
+            steps = sum(1 for _ in islice(player.play(opened), most))
             spent = time.perf_counter() - begin
         if spent < wall:
             wall, ticks = spent, 1e3 * np.array(player.times_s())

@@ -10,7 +10,7 @@ import typer
 from joblib import Parallel, delayed
 
 from ctr_dynamics.diagnosis.rehearsal import rehearse as rehearse_diagnosis
-from ctr_dynamics.nodes.rehearsal import rehearse as rehearse_node
+from ctr_dynamics.estimation.rehearsal import rehearse as rehearse_node
 from ctr_dynamics.parameters import Settings
 from ctr_dynamics.robot import load_robot
 

@@ -22,6 +22,7 @@ from ctr_dynamics import __version__
 from ctr_dynamics.bagio.writer import LiveRecorder
 from ctr_dynamics.errors import InputError
 from ctr_dynamics.estimation.estimator import Estimator
+from ctr_dynamics.estimation.rehearsal import rehearse
 from ctr_dynamics.messages import topics
 from ctr_dynamics.messages.cdr import CdrError, decode_joint_state, decode_pose_stamped, decode_wrench_stamped
 from ctr_dynamics.messages.encode import StepEncoder
@@ -31,7 +32,6 @@ from ctr_dynamics.nodes.memory import keep_memory
 from ctr_dynamics.nodes.naming import NAME, NAMESPACE, message_class, node_topic
 from ctr_dynamics.nodes.outputs import Outputs
 from ctr_dynamics.nodes.recorder import Recorder
-from ctr_dynamics.nodes.rehearsal import rehearse
 from ctr_dynamics.nodes.rolling import RollingRecording
 from ctr_dynamics.nodes.spinning import run_node
 from ctr_dynamics.nodes.stepping import StepLoop

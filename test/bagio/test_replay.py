@@ -125,7 +125,7 @@ class StandIn:
 
 @pytest.fixture
 def stand_in(step):
-    """A factory of stand-ins that keeps what it made: the first one only warms up."""
+    """A factory of stand-ins that keeps what it made."""
     made = []
 
     def make(robot, settings):

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import math
 
-from ctr_dynamics.estimation.estimator import Estimator
 from ctr_dynamics.messages.encode import StepEncoder
 from ctr_dynamics.parameters import Settings
 from ctr_dynamics.robot import Robot
+
+from .estimator import Estimator
 
 START_NS = 1_000_000_000_000
 JOINT_PERIOD_NS = 10_000_000
