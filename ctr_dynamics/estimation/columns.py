@@ -118,6 +118,7 @@ class Columns:
         self.beta = np.zeros(model.n)
         self._deviation: tuple[Floats, Floats, Floats] | None = None  # of columns, with their covariance
         self._lent = False  # whether a snapshot holds `stored`
+        self._spare = self._nothing = np.empty((0, 0, 0))  # room for the next `stored`
 
     def start(self, key: tuple, mesh: Mesh, beta: Floats, alpha: Floats, par: Floats, x: Floats) -> Floats:
         """Columns of the static equilibrium's dependence on the uncertain parameters; returns Pi_aa (r, r).
@@ -207,14 +208,17 @@ class Columns:
                     (len(big[8]) // L, columns),
                 )  # fmt: skip
             lanes, big, work, inverse, shape = self._work[work_key]
-            stored = np.empty_like(self.stored) if self._lent else self.stored
+            # not in place: where a stage cannot be linearised, the columns stay as they are
+            stored = self._spare if self._spare.shape == self.stored.shape else np.empty_like(self.stored)
             dx, dnodes = np.empty((m, columns)), np.empty(shape)
             ok = theta_tangent(
                 model.tubes, lanes, mesh, record.scheme.dt + behind, par.copy(), record.inputs[-1], record.found[-1], after,
                 rate, dpar, EPSILON, model.tangent_step, big, work, self.stored, stored, inverse, dx, dnodes,
             )  # fmt: skip
             if not ok:
+                self._spare = stored
                 return False
+            self._spare = self._nothing if self._lent else self.stored
             self.stored, self.dx, self.dnodes, self._lent = stored, dx, dnodes, False
             behind = 0.0
         return True

@@ -225,6 +225,31 @@ def test_snapshot_of_columns_is_not_written_by_later_steps(model):
     assert np.array_equal(columns.fields, after)
 
 
+@pytest.mark.parametrize("lent", [False, True])
+def test_columns_stay_where_a_step_cannot_be_linearised(model, monkeypatch, lent):
+    """A failure shows in a later pack of lanes only, when the first columns have been written."""
+    start, _, records = simulated(model, model.parameters, (0.0, 0.0), 3)
+    columns = Columns(model, model_uncertainty(model), rank=24)
+    columns.start(start.key, start.mesh, BETA, ALPHA, model.parameters, start.unknowns[-1])
+    columns.propagate(records[0], model.parameters)
+    before = [np.copy(x) for x in (columns.stored, columns.dx, columns.dnodes)]
+    if lent:
+        columns.snapshot()
+
+    def failing(*arguments):
+        result = arguments[15]
+        result[:, :, :8] = np.nan
+        return False
+
+    with monkeypatch.context() as patch:
+        patch.setattr(columns_module, "theta_tangent", failing)
+        assert not columns.propagate(records[1], model.parameters)
+    for was, now in zip(before, (columns.stored, columns.dx, columns.dnodes), strict=True):
+        assert np.array_equal(was, now)
+    assert columns.propagate(records[2], model.parameters)
+    assert np.isfinite(columns.stored).all()
+
+
 # -- modes --
 
 
