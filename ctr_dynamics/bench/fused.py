@@ -56,7 +56,7 @@ def fused_replay(
             steps = sum(1 for _ in islice(player.play(opened), most))
             spent = time.perf_counter() - begin
         if spent < wall:
-            wall, ticks = spent, 1e3 * np.array(player.times_s())
+            wall, ticks = spent, 1e3 * np.array(player.times_s())[:steps]
     model = Model(robot, nodes=int(settings["model.nodes"]))
     plain = 1e3 * sweep_cost(model, (), max(3, 4000 // model.nodes))
     counts, _ = np.histogram(np.clip(ticks, EDGES_MS[0], EDGES_MS[-1]), EDGES_MS)

@@ -20,7 +20,7 @@ def run(capfd, **options):
 
 
 def test_the_demo_ends_with_tables_picture_and_recorded_outputs(tmp_path, capfd):
-    code, shown = run(capfd, output=tmp_path / "out", duration=1.5)
+    code, shown = run(capfd, output=tmp_path / "out", duration=2.0)
     assert code == 0, shown
     assert "model alone" in shown
     assert "fused" in shown
@@ -50,7 +50,7 @@ def test_an_estimator_that_does_not_start_fails_the_demo(tmp_path, capfd, monkey
 def test_outputs_that_do_not_come_fail_the_demo(tmp_path, capfd, bags):
     # Joints of two tubes cannot drive three.
     code, shown = run(
-        capfd, output=tmp_path, robot="three_tube", duration=0.5, bag=bags / "clean_release.mcap"
+        capfd, output=tmp_path, robot="three_tube", duration=2.0, bag=bags / "clean_release.mcap"
     )
     assert code == 1
     assert "no tip pose came" in shown
