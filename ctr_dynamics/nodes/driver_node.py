@@ -28,7 +28,7 @@ from ctr_dynamics.nodes import qos
 from ctr_dynamics.nodes.declaration import declare_table
 from ctr_dynamics.nodes.naming import NAMESPACE, message_class, node_topic
 from ctr_dynamics.nodes.playback import load, pace, shifted
-from ctr_dynamics.nodes.spinning import stop_on_signals
+from ctr_dynamics.nodes.spinning import Stopped, apart, leave, stop_on_signals
 from ctr_dynamics.nodes.tables import DRIVER
 from ctr_dynamics.targets import atomic_file, check_targets
 
@@ -41,9 +41,10 @@ class DriverNode(Node):
 
     Raises:
         InputError: a parameter cannot be used.
+        Stopped: `stop` was set before the bag was read.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, stop: threading.Event) -> None:
         super().__init__("driver", namespace=NAMESPACE, automatically_declare_parameters_from_overrides=True)
         self.values = declare_table(self, DRIVER)
         values = self.values
@@ -51,7 +52,7 @@ class DriverNode(Node):
             raise InputError("no bag is given", do="set the parameter bag, e.g. -p bag:=FILE.mcap")
         bag = Path(values["bag"])
         check_targets({"report": values["report"]}, {f"bag {file.name}": file for file in locate(bag).files})
-        self.messages = load(bag, values["start_s"], values["duration_s"])
+        self.messages = apart(lambda: load(bag, values["start_s"], values["duration_s"]), stop)
         profile = qos.profile(values["reliability"], values["depth"])
         present = {message.topic for message in self.messages}
         self.outputs: dict[str, Publisher[Any]] = {
@@ -133,8 +134,7 @@ def main(args: list[str] | None = None) -> int:
     with stop_on_signals() as stop:
         try:
             rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
-            node = DriverNode()
-            stop.starting = False
+            node = DriverNode(stop)
             node.get_logger().info(f"playing {node.values['bag']} once the estimator listens")
             node.wait_for_subscribers(stop)
             report = node.play(stop)
@@ -148,8 +148,8 @@ def main(args: list[str] | None = None) -> int:
                 with atomic_file(Path(node.values["report"])) as part:
                     part.write_text(json.dumps(report), encoding="utf-8")
             node.destroy_node()
-        except KeyboardInterrupt:
-            return 0
+        except Stopped:
+            leave()
         except (InputError, ParameterException, RCLError) as error:
             print(f"driver: {' '.join(str(error).split())}", file=sys.stderr)
             return 2

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+import threading
 import time
 from collections.abc import Callable
 from functools import partial
@@ -33,7 +34,7 @@ from ctr_dynamics.nodes.naming import NAME, NAMESPACE, message_class, node_topic
 from ctr_dynamics.nodes.outputs import Outputs
 from ctr_dynamics.nodes.recorder import Recorder
 from ctr_dynamics.nodes.rolling import RollingRecording
-from ctr_dynamics.nodes.spinning import run_node
+from ctr_dynamics.nodes.spinning import Stopped, apart, run_node
 from ctr_dynamics.nodes.stepping import StepLoop
 from ctr_dynamics.nodes.timing import StepTiming
 from ctr_dynamics.parameters import Settings
@@ -51,18 +52,22 @@ class EstimatorNode(Node):
 
     Raises:
         InputError: a parameter or the robot file cannot be used.
+        Stopped: `stop` was set while the kernels were compiled.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, stop: threading.Event) -> None:
         super().__init__(NAME, namespace=NAMESPACE, automatically_declare_parameters_from_overrides=True)
         self.settings = declare(self)
         self._robot = load_robot(self.settings["robot"])
         written = ("timing_report", "record.rolling_path", "record.path")
         check_targets({name: self.settings[name] for name in written}, {"robot file": self._robot.source})
-        self._estimator = Estimator(self._robot, self.settings)
+        try:
+            self._estimator = apart(self._warm_estimator, stop)
+        except Stopped:
+            self.destroy_node()  # so that others hear of the end
+            raise
         self._prepared: tuple[Settings, set[str], Estimator | None] | None = None
         self._use_sim_time = bool(self.get_parameter("use_sim_time").value)
-        self._warm_up()
 
         self.timing = StepTiming(
             self.settings["output.policy"], round(self.settings["input_timeout_s"] * 1e9)
@@ -109,11 +114,12 @@ class EstimatorNode(Node):
 
     # Start.
 
-    def _warm_up(self) -> None:
+    def _warm_estimator(self) -> Estimator:
         self.get_logger().info("compiling the kernels (seconds with a filled cache, minutes without)")
         begin = time.perf_counter()
         rehearse(self._robot, self.settings)
         self.get_logger().info(f"kernels ready after {time.perf_counter() - begin:.1f} s")
+        return Estimator(self._robot, self.settings)
 
     def _open_recorder(self) -> Recorder | None:
         path = self.settings["record.path"]

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import concurrent.futures
 import contextlib
+import os
 import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator
 from types import FrameType
-from typing import TypeVar
+from typing import NoReturn, TypeVar
 
 import rclpy
 from rclpy.context import Context
@@ -22,6 +24,7 @@ from rclpy.task import Future
 from ctr_dynamics.errors import InputError
 
 AnyNode = TypeVar("AnyNode", bound=Node)
+Result = TypeVar("Result")
 POLL_S = 0.1
 
 
@@ -34,28 +37,22 @@ def make_executor(context: Context) -> Executor:
     return EventsExecutor(context=context)
 
 
-class Stop(threading.Event):
-    """Set by SIGINT and SIGTERM. While `starting`, these also raise KeyboardInterrupt: nothing waits yet."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.starting = True
+class Stopped(Exception):
+    """SIGINT or SIGTERM came before the node was ready."""
 
 
 @contextlib.contextmanager
-def stop_on_signals() -> Iterator[Stop]:
+def stop_on_signals() -> Iterator[threading.Event]:
     """The event that SIGINT and SIGTERM set; the former handlers come back at the end.
 
     rclpy's own handlers shut the context down at once, under the feet of whoever is publishing. For an
     orderly end call `rclpy.init(..., signal_handler_options=SignalHandlerOptions.NO)` and use this.
+    Nothing is raised: an exception in the midst of compiling leaves the compiler's memory in pieces.
     """
-    stop = Stop()
+    stop = threading.Event()
 
     def handler(number: int, frame: FrameType | None) -> None:
         stop.set()
-        if stop.starting:
-            stop.starting = False
-            raise KeyboardInterrupt
 
     former = [(number, signal.signal(number, handler)) for number in (signal.SIGINT, signal.SIGTERM)]
     try:
@@ -63,6 +60,35 @@ def stop_on_signals() -> Iterator[Stop]:
     finally:
         for number, value in former:
             signal.signal(number, value)
+
+
+def apart(work: Callable[[], Result], stop: threading.Event) -> Result:
+    """The result of long work, done in a thread of its own. What the work raises is raised here.
+
+    Raises:
+        Stopped: `stop` was set first. The work goes on: end the process by `leave`.
+    """
+    future: concurrent.futures.Future[Result] = concurrent.futures.Future()
+
+    def run() -> None:
+        try:
+            future.set_result(work())
+        except BaseException as error:
+            future.set_exception(error)
+
+    threading.Thread(target=run, daemon=True).start()
+    while not stop.is_set():
+        if concurrent.futures.wait([future], POLL_S).done:
+            return future.result()
+    raise Stopped
+
+
+def leave() -> NoReturn:
+    """End the process with code 0 at once: taking the interpreter down under work that goes on would crash."""
+    rclpy.try_shutdown()
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(0)
 
 
 def turn(executor: Executor) -> None:
@@ -86,17 +112,21 @@ def spin_until(node: Node, stop: threading.Event) -> None:
 
 
 def run_node(
-    name: str, make: Callable[[], AnyNode], close: Callable[[AnyNode], object], args: list[str] | None
+    name: str,
+    make: Callable[[threading.Event], AnyNode],
+    close: Callable[[AnyNode], object],
+    args: list[str] | None,
 ) -> int:
-    """Make a node, serve it until SIGINT or SIGTERM, close it; returns 0, or 2 when it cannot start with what it was given."""
+    """Make a node, which may end its start by `Stopped`, serve it until SIGINT or SIGTERM, close it.
+
+    Returns 0, or 2 when it cannot start with what it was given.
+    """
     with stop_on_signals() as stop:
         try:
             rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
-            node = make()
-            stop.starting = False
-        except KeyboardInterrupt:
-            rclpy.try_shutdown()
-            return 0
+            node = make(stop)
+        except Stopped:
+            leave()
         except (InputError, ParameterException, RCLError) as error:
             print(f"{name}: {' '.join(str(error).split())}", file=sys.stderr)
             rclpy.try_shutdown()

@@ -59,7 +59,7 @@ class ViewNode(Node):
 
 def main(args: list[str] | None = None) -> int:
     """Run the node; returns 0 after SIGINT or SIGTERM, 2 when it cannot start."""
-    return run_node("view", ViewNode, ViewNode.destroy_node, args)
+    return run_node("view", lambda stop: ViewNode(), ViewNode.destroy_node, args)
 
 
 if __name__ == "__main__":

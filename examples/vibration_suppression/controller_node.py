@@ -163,7 +163,6 @@ def main() -> int:
     with stop_on_signals() as stop:
         rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
         node = ControllerNode()
-        stop.starting = False
         try:
             spin_until(node, stop)
         finally:

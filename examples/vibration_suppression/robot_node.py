@@ -119,7 +119,6 @@ class RobotNode(Node):
 def main() -> int:
     with stop_on_signals() as stop:
         rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
-        stop.starting = False
         node = RobotNode()
         spinner = threading.Thread(target=spin_until, args=(node, stop), daemon=True)
         spinner.start()

@@ -210,12 +210,16 @@ def test_signals_end_the_node_with_code_0(start, tmp_path, number):
     assert bag.topics[topics.JOINT_STATES].messages > 0
 
 
-def test_a_signal_while_starting_ends_with_code_0(tmp_path):
+@pytest.mark.parametrize("into_compiling_s", [0.0, 0.7, 1.7])
+def test_a_signal_while_starting_ends_with_code_0(tmp_path, monkeypatch, into_compiling_s):
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "empty"))  # compiled anew, not loaded
     process = NodeProcess(ESTIMATOR, {}, 1, tmp_path / "log")
     while "compiling" not in process.output() and process.code is None:
         time.sleep(0.01)
+    time.sleep(into_compiling_s)
     process.send(signal.SIGTERM)
     assert process.wait(120) == 0, process.output()
+    assert "kernels ready" not in process.output()
 
 
 @pytest.mark.parametrize("reliability", ["best_effort", "reliable"])
