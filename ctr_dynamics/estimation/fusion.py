@@ -21,6 +21,7 @@ from ctr_dynamics.model.model import Model
 from ctr_dynamics.model.simulator import Inputs, Simulator, State, StepResult
 
 from .columns import Columns
+from .drive import ForceDrive
 from .kernels import fade, move_unknowns, outside
 from .outputs import FUSION_OFF
 from .reduction import APPENDED, reduced
@@ -37,7 +38,7 @@ FAR = 10.0  # times the gate: a reading that is farther than that from all that 
 LONGEST_REFUSAL = 32  # readings outside the gate in a row after which it is widened again
 SKIP = 2  # steps that the columns may skip
 APART = 4  # steps between a correction and a reduction where samples leave that room: of those that one joint state covers, none does both
-DRIVEN = 4.0  # times its least: with a stronger drive of the tip force columns follow every step and are reduced twice as often
+DRIVEN = 0.25  # of an innovation's variance: where the tip force has more, columns follow every step and are reduced twice as often
 
 
 @dataclass(frozen=True)
@@ -46,9 +47,9 @@ class FusionOptions:
 
     rank: int = 24
     gate_probability: float = 0.9999
-    force_sigma: float = 0.0006
+    force_sigma: float = 0.00005
     force_sigma_max: float = 0.2
-    adaptation: float = 0.1
+    force_change: float = 20.0
     force_time: float = 0.3
     window: float = 0.2
     reduce_between: tuple[int, int] = (14, 28)  # steps: fewest behind a correction, most without one
@@ -108,7 +109,7 @@ class Fusion:
         self.pi = np.zeros((0, 0))
         self.unreduced = 0  # steps since the columns were reduced
         self.inserted = 0.0  # share of beta's rate that the model's velocities hold already
-        self.force_sigma = options.force_sigma
+        self.drive = ForceDrive(options.force_sigma, options.force_sigma_max, options.force_change)
         self.refused = 0  # readings in a row outside the gate, widened for or not
         self._rest = 0  # steps since the last correction; more than `unreduced` where none has come since the columns were reduced
         self._skipped = 0  # steps that the columns have not followed yet
@@ -140,9 +141,9 @@ class Fusion:
         for axis, size in enumerate(scale):
             i = force.start + axis
             self.pi[i, i] = (self.options.force_sigma / size) ** 2
+        self.drive.start(self.pi, force)
         self._rest, self._skipped, self._unsettled = 1, 0, False
         self._followed = state.key
-        self.force_sigma = self.options.force_sigma
         self.tips.clear(r)
         self._reduce()
         self._keep_tip(state, stamp)
@@ -170,7 +171,7 @@ class Fusion:
         self.unreduced += 1
         fade(self._force_decay, self.theta[self._force], self.columns.theta[self._force])
         fewest, most = self.options.reduce_between
-        driven = self.force_sigma > DRIVEN * self.options.force_sigma
+        driven = self.drive.share > DRIVEN
         if driven:
             fewest, most = fewest // 2, most // 2
         self._rest += 1
@@ -222,6 +223,7 @@ class Fusion:
         self.pi[rows, :] *= decay
         self.pi[:, rows] *= decay
         self.pi[rows, rows] += np.eye(3) * ((1 - decay**2) * noise.drift.value**2)
+        self.drive.fade(rows, decay)
 
     def _drive_force(self, steps: int) -> None:
         """Append three columns that hold the tip force's new randomness of ``steps`` steps: so far they move nothing but that force."""
@@ -231,13 +233,14 @@ class Fusion:
         wide = r + APPENDED
         theta = np.zeros((len(c.theta), wide))
         theta[:, :r] = c.theta
-        theta[self._force, r:] = self.force_sigma * np.eye(3)
+        theta[self._force, r:] = self.drive.sigma * np.eye(3)
         c.theta = theta
         pi = np.zeros((wide + STATES, wide + STATES))
         pi[:r, :r], pi[:r, wide:] = self.pi[:r, :r], self.pi[:r, r:]
         pi[wide:, :r], pi[wide:, wide:] = self.pi[r:, :r], self.pi[r:, r:]
         np.fill_diagonal(pi[r:wide, r:wide], 1.0 - decay2)
         self.pi = pi
+        self.drive.append(r, APPENDED, 1.0 - decay2)
 
     def _reduce(self) -> None:
         """Step (3): drop the directions that are weakest in the energy norm."""
@@ -249,7 +252,8 @@ class Fusion:
         unit = max(float(energy.trace()) / r, 1e-12)
         scaled = (math.sqrt(unit) * self._of_parameters) * c.theta
         gram += scaled.T @ scaled
-        self.pi, change = reduced(self.pi, gram, c.rank)
+        self.pi, change, kept = reduced(self.pi, gram, c.rank)
+        self.drive.keep(kept)
         c.change(change)
         self.tips.change(change, c.theta.shape[1])
         self.unreduced = 0
@@ -275,20 +279,19 @@ class Fusion:
         found = self._innovation(stamp, position, quaternion)
         if isinstance(found, Update):
             return found
-        nu, H, R, compared = found
-        dof = compared.dof
-        self._adapt(compared.nis / dof)
-        if compared.nis > self._gate[dof]:
-            self.refused += 1
-            if not widens(self.refused):
-                return compared._replace(reason="outside the gate")
+        nu, H, S, compared = found
+        dof, R = compared.dof, self.tracker.noise
+        beyond = compared.nis > self._gate[dof]
+        self.refused = self.refused + 1 if beyond else 0
+        if beyond and not widens(self.refused):
+            return compared._replace(reason="outside the gate")
+        self.pi += self.drive.learn(stamp, nu, H, S)
+        if beyond:
             if not self._inflate(nu, H, R, self._gate[dof]):
                 return compared._replace(reason="outside the gate, farther than any covariance reaches")
             compared = compared._replace(
                 reason=f"outside the gate {self.refused} times in a row: fused with a widened covariance"
             )
-        else:
-            self.refused = 0
         self._rest = 0
         size = len(self.pi)
         if (size, dof) not in self._filters:
@@ -297,6 +300,7 @@ class Fusion:
         ekf.x, ekf.P, ekf.R = np.zeros((size, 1)), self.pi, R
         ekf.update(nu[:, None], HJacobian=lambda x: H, Hx=lambda x: np.zeros((dof, 1)))
         self.pi = 0.5 * (ekf.P + ekf.P.T)
+        self.drive.corrected(ekf.K, H)
         self._correct(state, ekf.x[:, 0])
         return compared._replace(accepted=True)
 
@@ -312,7 +316,7 @@ class Fusion:
     def _innovation(
         self, stamp: float, position: Floats, quaternion: Floats
     ) -> Update | tuple[Floats, Floats, Floats, Update]:
-        """Step (4): masked innovation, H, R and its record; or the record alone where there is nothing to compare with."""
+        """Step (4): masked innovation, H, S and its record; or the record alone where there is nothing to compare with."""
         unknown = np.full(6, np.nan)
         tip = self.tips.at(stamp - self.tracker.delay - self.bias[DELAY], self.simulator.scheme.dt)
         if tip is None:
@@ -326,7 +330,7 @@ class Fusion:
         return (
             nu,
             H,
-            self.tracker.noise,
+            S,
             Update(full, variance, float(whitened @ whitened), len(nu), False, "", white),
         )
 
@@ -336,30 +340,29 @@ class Fusion:
         return self.theta[self._force].copy()
 
     def _inflate(self, nu: Floats, H: Floats, R: Floats, limit: float) -> bool:
-        """Several readings in a row outside the gate are no outliers: the model has lost the robot. Widen the fields' part of the covariance until
-        the reading is plausible (a fading memory), or it is as wide as a robot is large. False where the reading is far from plausible even
-        then; the covariance stays as it is."""
-        r = self.columns.theta.shape[1]
+        """Several readings in a row outside the gate are no outliers: the model has lost the robot. Raise the drive of the tip force, and where that
+        does not do, widen the fields' part of the covariance, until the reading is plausible (a fading memory) or it is as wide as a robot is
+        large. False where the reading is far from plausible even then; the covariance stays as it is."""
         plausible = min(limit, max(0.5 * limit, float(len(nu))))
-        pi = self.pi.copy()
-        for _ in range(MOST_DOUBLINGS):
-            pi[:r, :r] *= 2.0
-            pi[:r, r:] *= math.sqrt(2.0)
-            pi[r:, :r] *= math.sqrt(2.0)
-            S = H @ pi @ H.T + R
-            nis = float(nu @ np.linalg.solve(S, nu))
-            if nis < plausible or S.diagonal().max() > VAGUE:
-                break
-        if nis > FAR * limit:
-            return False
-        self.pi = pi
-        return True
 
-    def _adapt(self, ratio: float) -> None:
-        """Raise the drive of the tip force while innovations are larger than predicted, lower it while they are smaller."""
-        o = self.options
-        size = self.force_sigma * math.exp(o.adaptation * (min(ratio, 10.0) - 1.0))
-        self.force_sigma = min(max(size, o.force_sigma), o.force_sigma_max)
+        def nis(pi: Floats) -> float:
+            return float(nu @ np.linalg.solve(H @ pi @ H.T + R, nu))
+
+        raised, pi = 1.0, self.pi
+        while nis(pi) > plausible and 2.0 * raised <= self.drive.headroom:
+            raised *= 2.0
+            pi = self.pi + (raised - 1.0) * self.drive.part
+        wider = np.ones(len(pi))
+        for _ in range(MOST_DOUBLINGS):
+            widened = pi * np.multiply.outer(wider, wider)
+            if nis(widened) <= plausible or (H @ widened @ H.T).diagonal().max() > VAGUE:
+                break
+            wider[: self.columns.theta.shape[1]] *= math.sqrt(2.0)
+        if nis(widened) > FAR * limit:
+            return False
+        self.drive.scale(raised, wider)
+        self.pi = widened
+        return True
 
     def _confined(self, x: Floats) -> Floats:
         """The correction ``x`` (r + 13,), moved along the covariance where a parameter would leave its range: all else then takes the most likely
@@ -415,7 +418,7 @@ class Fusion:
     def snapshot(self) -> tuple:
         """The filter's part of a state to which :meth:`restore` can return."""
         return (
-            self.theta.copy(), self.bias.copy(), self.pi.copy(), self.unreduced, self.force_sigma,
+            self.theta.copy(), self.bias.copy(), self.pi.copy(), self.unreduced, self.drive.snapshot(),
             (self.refused, self._rest, self._skipped, self._followed, self._unsettled), self.columns.snapshot(), self.tips.snapshot(),
         )  # fmt: skip
 
@@ -426,9 +429,10 @@ class Fusion:
 
     def _restore(self, snapshot: tuple) -> None:
         """All but the tips."""
-        theta, bias, pi, self.unreduced, self.force_sigma, course, columns, _ = snapshot
+        theta, bias, pi, self.unreduced, drive, course, columns, _ = snapshot
         self.refused, self._rest, self._skipped, self._followed, self._unsettled = course
         self.theta, self.bias, self.pi = theta.copy(), bias.copy(), pi.copy()
+        self.drive.restore(drive)
         self.columns.restore(columns)
         self._apply_theta()
 

@@ -33,8 +33,9 @@ def through(T: Floats) -> Change:
     return lambda columns, out=None: np.matmul(columns, T[: columns.shape[1]], out=out)
 
 
-def reduced(pi: Floats, gram: Floats, rank: int) -> tuple[Floats, Change]:
-    """Covariance of ``rank`` coefficients at most and of all that follows them in ``pi`` (r + n, r + n), and how columns change.
+def reduced(pi: Floats, gram: Floats, rank: int) -> tuple[Floats, Change, Floats]:
+    """Covariance of ``rank`` = k coefficients at most and of all that follows them in ``pi`` (r + n, r + n), how columns change, and the (k, r)
+    by which the old coefficients give the new ones.
 
     ``gram`` (r, r): V^T W V.
     """
@@ -46,18 +47,18 @@ def reduced(pi: Floats, gram: Floats, rank: int) -> tuple[Floats, Change]:
     if r == rank + APPENDED and regular and math.isfinite(energy.sum()):
         _, weakest, _, _, failed = dsyevr(energy, range="I", il=1, iu=APPENDED)
         if not failed:
-            after, *parts = without(pi, root, weakest)
+            after, kept, *parts = without(pi, root, weakest)
 
             def change(columns: Floats, out: Floats | None = None) -> Floats:
                 out = np.empty((len(columns), rank)) if out is None else out
                 eliminate(columns, *parts, out)
                 return out
 
-            return after, change
+            return after, change, kept
     return principal(pi, gram, rank)
 
 
-def principal(pi: Floats, gram: Floats, rank: int) -> tuple[Floats, Change]:
+def principal(pi: Floats, gram: Floats, rank: int) -> tuple[Floats, Change, Floats]:
     """As :func:`reduced`, with principal columns: the coefficients are uncorrelated and of deviation 1."""
     r = len(gram)
     lam, E = np.linalg.eigh(0.5 * (pi[:r, :r] + pi[:r, :r].T))
@@ -70,7 +71,8 @@ def principal(pi: Floats, gram: Floats, rank: int) -> tuple[Floats, Change]:
     k = U.shape[1]
     after = np.zeros((k + len(pi) - r,) * 2)
     after[:k, :k] = np.eye(k)
-    after[:k, k:] = U.T @ inverse @ pi[:r, r:]
+    kept = U.T @ inverse
+    after[:k, k:] = kept @ pi[:r, r:]
     after[k:, :k] = after[:k, k:].T
     after[k:, k:] = pi[r:, r:]
-    return after, through(T)
+    return after, through(T), kept

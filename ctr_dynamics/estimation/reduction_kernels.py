@@ -44,7 +44,8 @@ def without(pi, root, weakest):
     root root^T = pi[:r, :r].
 
     Without them the r coefficients have r - d that are free. Returns the covariance of those, each by its deviation, and of all that follows
-    them in ``pi``; and the change of the columns for :func:`eliminate`: sources (r - d,), places (d,), parts (d, r - d) and deviations (r - d,).
+    them in ``pi``; the (r - d, r) by which the r coefficients give them; and the change of the columns for :func:`eliminate`: sources (r - d,),
+    places (d,), parts (d, r - d) and deviations (r - d,).
     """
     r, d = weakest.shape
     size, k = len(pi), r - d
@@ -73,6 +74,7 @@ def without(pi, root, weakest):
     spread = np.empty(r)
     for i in range(r):
         spread[i] = math.sqrt(pi[i, i])
+    shown_by = constraints.copy()
     places = solved_for(constraints, spread)
     sources = np.arange(k)  # coefficients behind the first k go to places that have become free
     behind = k
@@ -82,9 +84,14 @@ def without(pi, root, weakest):
                 behind += 1
             sources[i] = behind
             behind += 1
-    parts, deviation = np.empty((d, k)), np.empty(k)
+    parts, deviation, kept = np.empty((d, k)), np.empty(k), np.zeros((k, r))
     for i in range(k):
         deviation[i] = math.sqrt(left[sources[i], sources[i]])
+        kept[i, sources[i]] = 1.0 / deviation[i]
+        for m in range(d):
+            part = moved[sources[i], m] / deviation[i]
+            for j in range(r):
+                kept[i, j] -= part * shown_by[m, j]
         for m in range(d):
             parts[m, i] = constraints[m, sources[i]] * deviation[i]
     after = np.empty((size - d, size - d))
@@ -95,7 +102,7 @@ def without(pi, root, weakest):
         for j in range(r, size):
             after[i, j - d] = after[j - d, i] = left[sources[i], j] / deviation[i]
     after[k:, k:] = pi[r:, r:]
-    return after, sources, places, parts, deviation
+    return after, kept, sources, places, parts, deviation
 
 
 @compiled

@@ -16,7 +16,7 @@ TICKS = 72
 BUSY = range(40, 66)  # ticks in which there is no time for corrections, until steps have to wait for them
 # ticks in which the tracker shows what the model does not explain, so that the columns follow every step
 PUSHED = range(30, 66)
-PUSH = 2e-3  # m, to and fro
+PUSH, SWING = 2e-3, 0.3  # m; rad per tick: slow enough to be taken for a force
 JUMP_AT, JUMP = 20, 10.0  # tick of the jump, and times the change of a load for which a step is divided
 
 
@@ -55,7 +55,7 @@ def rehearse(robot: Robot, settings: Settings) -> int:
             w, *xyz = out.predicted_quaternion_wxyz.tolist()
             age_ns = JOINT_PERIOD_NS if tick % 3 else 4 * JOINT_PERIOD_NS
             x, y, z = out.predicted_position.tolist()
-            beside = PUSH * (-1) ** tick if tick in PUSHED else 0.0
+            beside = PUSH * math.sin(SWING * tick) if tick in PUSHED else 0.0
             estimator.add_tracker_pose(out.stamp_ns - age_ns, (x + beside, y, z), (*xyz, w))
     if estimator.runs.fused is not None:
         estimator.runs.apart(estimator.k * estimator.settings["model.dt_s"], [], record=True)

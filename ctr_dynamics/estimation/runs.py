@@ -76,7 +76,7 @@ class Runs:
                 gate_probability=float(settings["filter.gate_probability"]),
                 force_sigma=float(settings["filter.tip_force_sigma_N"]),
                 force_sigma_max=float(settings["filter.tip_force_sigma_max_N"]),
-                adaptation=float(settings["filter.adaptation"]),
+                force_change=float(settings["filter.tip_force_change_s"]),
                 force_time=float(settings["filter.tip_force_time_s"]),
                 window=float(settings["filter.window_s"]),
             ),
@@ -248,7 +248,7 @@ class Runs:
             self.health.measured(innovation)
             self.innovations.append(innovation)
         self.inputs.forget_samples(k)
-        self.health.force_sigma = self.fusion.force_sigma
+        self.health.force_sigma = self.fusion.drive.sigma
 
     def _compare(
         self, time_s: float, position: Floats, quaternion: Floats

@@ -522,8 +522,8 @@ def test_a_replay_ends_with_the_joints_and_says_what_came_after_them(stand_in, t
 
 
 def test_no_stamp_is_replayed_twice_where_the_clock_is_set_back(bags, tmp_path):
-    """With the estimator itself: after 1.5 s, the clock that stamps goes back by 2 s."""
-    messages = load(bags / "clean_release.mcap", duration_s=2.9)
+    """With the estimator itself: after 1.5 s, while the robot moves, the clock that stamps goes back by 2 s."""
+    messages = load(bags / "clean_sweep.mcap", duration_s=2.9)
     back_ns = messages[0].log_ns + 1500 * MS
     with write_bag(tmp_path / "in.mcap", {}) as writer:
         for raw in messages:

@@ -39,12 +39,15 @@ def by_hand(V, pi, weights):
 @pytest.mark.parametrize("seed", range(12))
 def test_what_is_left_is_the_covariance_of_the_principal_columns(way, seed):
     V, pi, weights = case(seed, 0.3 * seed)
-    after, change = way(pi, V.T @ (weights[:, None] * V), RANK)
+    after, change, kept = way(pi, V.T @ (weights[:, None] * V), RANK)
     fewer = change(V)
     assert fewer.shape == (ROWS, RANK)
     np.testing.assert_array_equal(after, after.T)
     np.testing.assert_allclose(after.diagonal()[:RANK], 1.0, rtol=1e-9)
     np.testing.assert_array_equal(after[RANK:, RANK:], pi[WIDE:, WIDE:])
+    np.testing.assert_allclose(kept @ change(np.eye(WIDE)), np.eye(RANK), atol=1e-9)
+    np.testing.assert_allclose(kept @ pi[:WIDE, :WIDE] @ kept.T, after[:RANK, :RANK], atol=1e-9)
+    np.testing.assert_allclose(kept @ pi[:WIDE, WIDE:], after[:RANK, RANK:], atol=1e-9 * np.abs(after).max())
     for found, wanted in zip(of_columns(fewer, after), by_hand(V, pi, weights), strict=True):
         np.testing.assert_allclose(found, wanted, rtol=1e-8, atol=1e-9 * np.abs(wanted).max())
 
@@ -59,7 +62,7 @@ def test_columns_are_eliminated_where_the_covariance_is_regular_and_principal_wh
     reduced(pi, gram, RANK)
     assert used == [1]
     pi[2, :] = pi[:, 2] = 0.0  # a coefficient without spread
-    after, change = reduced(pi, gram, RANK)
+    after, change, _ = reduced(pi, gram, RANK)
     assert used == [1]
     assert np.all(np.isfinite(after))
     full, _ = of_columns(V, pi)
@@ -73,7 +76,7 @@ def test_what_is_not_finite_stays_so_and_goes_no_further(bad):
     V, pi, weights = case(3)
     gram = V.T @ (weights[:, None] * V)
     gram[4, 4] = bad
-    after, change = reduced(pi, gram, RANK)
+    after, change, _ = reduced(pi, gram, RANK)
     assert after.shape == (RANK + OTHERS,) * 2
     assert change(V).shape == (ROWS, RANK)
     solved = np.full((APPENDED, WIDE), np.nan)
@@ -83,7 +86,7 @@ def test_what_is_not_finite_stays_so_and_goes_no_further(bad):
 
 def test_nothing_is_dropped_of_columns_that_are_few():
     V, pi, weights = case(5)
-    after, change = reduced(pi, V.T @ (weights[:, None] * V), WIDE)
+    after, change, _ = reduced(pi, V.T @ (weights[:, None] * V), WIDE)
     for found, wanted in zip(of_columns(change(V), after), of_columns(V, pi), strict=True):
         np.testing.assert_allclose(found, wanted, rtol=1e-8, atol=1e-9 * np.abs(wanted).max())
 
@@ -91,7 +94,7 @@ def test_nothing_is_dropped_of_columns_that_are_few():
 @pytest.mark.parametrize("seed", range(8))
 def test_columns_that_are_missing_at_the_end_are_zero(seed):
     V, pi, weights = case(seed, 0.2 * seed)
-    _, change = reduced(pi, V.T @ (weights[:, None] * V), RANK)
+    _, change, _ = reduced(pi, V.T @ (weights[:, None] * V), RANK)
     short = V[:, :RANK]
     out = np.full((ROWS, RANK), np.nan)
     assert change(short, out) is out
@@ -123,7 +126,8 @@ def test_kernels_against_plain_python(seed):
     K = np.eye(WIDE) - (root @ weakest) @ (
         weakest.T @ np.linalg.inv(root)
     )  # of the coefficients that are left
-    after, sources, places, parts, deviation = compiled
+    after, kept, sources, places, parts, deviation = compiled
+    np.testing.assert_allclose(kept, K[sources] / deviation[:, None], rtol=1e-9, atol=1e-11)
     projected = np.block(
         [
             [K @ pi[:WIDE, :WIDE] @ K.T, K @ pi[:WIDE, WIDE:]],
