@@ -19,6 +19,9 @@ Floats = NDArray[np.float64]
 
 MOST = 10.0  # times the variance, at one sample, up or down: what else the model misses looks like a force at its first sample
 RAISED = 1000.0  # times the variance, at one sample, where readings in a row have been outside the gate
+SHORTEST = (
+    1e-3  # s between two samples, or a late one and its predecessor: no size is ever out of the question
+)
 SPACING = 0.5  # of the grid, in the logarithm of the variance: less than one innovation can tell apart
 
 
@@ -90,7 +93,7 @@ class ForceDrive:
         by_size = np.exp(self.grid - 2.0 * math.log(self.sigma))
         size = np.maximum(1.0 + np.multiply.outer(by_size - 1.0, share), 1e-9)
         likelihood = -0.5 * (np.log(size) + squares / size).sum(axis=1)
-        changed = -math.expm1(-max(0.0, stamp - self._stamp) / self.change_s)
+        changed = -math.expm1(-max(SHORTEST, stamp - self._stamp) / self.change_s)
         self._stamp = max(stamp, self._stamp)
         weights = (1.0 - changed) * self.weights + changed * self.prior
         weights *= np.exp(likelihood - likelihood.max())

@@ -342,7 +342,7 @@ class Fusion:
     def _inflate(self, nu: Floats, H: Floats, R: Floats, limit: float) -> bool:
         """Several readings in a row outside the gate are no outliers: the model has lost the robot. Raise the drive of the tip force, and where that
         does not do, widen the fields' part of the covariance, until the reading is plausible (a fading memory) or it is as wide as a robot is
-        large. False where the reading is far from plausible even then; the covariance stays as it is."""
+        large. False where the reading is far from plausible even then: nothing is raised or widened."""
         plausible = min(limit, max(0.5 * limit, float(len(nu))))
 
         def nis(pi: Floats) -> float:

@@ -126,6 +126,16 @@ def test_the_weights_are_those_of_the_likelihoods():
     assert drive.share == pytest.approx(shown)
 
 
+def test_readings_of_one_stamp_that_contradict_all_before_leave_a_distribution():
+    drive = ForceDrive(1e-3, 100.0, 1e6)
+    drive.start(np.diag([1e-6]), slice(0, 1))
+    for reading in [0.0] * 400 + [1e4] * 3:
+        drive.learn(0.0, np.array([reading]), np.eye(1), drive.part + NOISE)
+        assert np.all(np.isfinite(drive.weights))
+        assert 1e-3 <= drive.sigma * (1 + 1e-9) <= 101.0
+    assert drive.sigma > 0.02  # ten times the variance at each
+
+
 def test_one_size_is_kept():
     drive = ForceDrive(0.2, 0.2, 10.0)
     scalar = Scalar(drive)
