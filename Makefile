@@ -37,7 +37,7 @@ lint: install
 format: install
 	$(BIN)/ruff format .
 	$(BIN)/ruff check --fix .
-	$(BIN)/python -m ctr_dynamics.tables --write
+	$(BIN)/python -m tools.tables --write
 
 install: $(VENV)/.package
 

@@ -26,11 +26,11 @@ def consistency(bag: Path, stamps_s: np.ndarray, realised: np.ndarray) -> tuple[
 
     ``realised`` (k, 3) m: the tip as the tracker realises it at ``stamps_s`` (k,) after the bag's start, which is what the fused tip estimates.
     """
-    from ctr_dynamics.bagio.reader import open_bag
-    from ctr_dynamics.bagio.replay import Player
     from ctr_dynamics.estimation.estimator import Estimator
+    from ctr_dynamics.io.bag_reader import open_bag
     from ctr_dynamics.parameters import Settings
     from ctr_dynamics.robot import load_robot
+    from ctr_dynamics.runtime.replay import Player
 
     robot = load_robot("till2020_tissue")
     estimator = Estimator(robot, Settings({"output.policy": "wait"}))

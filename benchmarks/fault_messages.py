@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from ctr_dynamics.bagio.reader import RawMessage
-from ctr_dynamics.messages import cdr, topics
-from ctr_dynamics.messages.encode import encode_joint_state, encode_pose_stamped
-from ctr_dynamics.nodes.playback import shifted
+from ctr_dynamics.io.bag_reader import RawMessage
+from ctr_dynamics.io.messages import cdr, topics
+from ctr_dynamics.io.messages.encode import encode_joint_state, encode_pose_stamped
+from ctr_dynamics.runtime.playback import shifted
 
 BEGIN_S, END_S = 2.0, 3.0
 Messages = list[RawMessage]

@@ -29,13 +29,13 @@ from typing import Any
 
 from mcap.writer import CompressionType, Writer
 
-from ctr_dynamics.bagio.info import inspect
-from ctr_dynamics.bagio.reader import open_bag
+from ctr_dynamics.csv_import.column_layout import Layout, read_layout
+from ctr_dynamics.csv_import.convert import read_log
 from ctr_dynamics.errors import InputError
-from ctr_dynamics.importing.convert import read_log
-from ctr_dynamics.importing.layout import Layout, read_layout
-from ctr_dynamics.messages import cdr, topics
-from ctr_dynamics.messages.schemas import schema
+from ctr_dynamics.io.bag_info import inspect
+from ctr_dynamics.io.bag_reader import open_bag
+from ctr_dynamics.io.messages import cdr, topics
+from ctr_dynamics.io.messages.schemas import schema
 from ctr_dynamics.model.model import Model
 from ctr_dynamics.model.pose_table import read_poses
 from ctr_dynamics.parameters import read_parameter_file

@@ -23,10 +23,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from ctr_dynamics.messages import topics
-from ctr_dynamics.nodes.listener import Listener
-from ctr_dynamics.nodes.playback import load
-from ctr_dynamics.nodes.processes import DRIVER, ESTIMATOR, NodeProcess, free_domain
+from ctr_dynamics.io.messages import topics
+from ctr_dynamics.ros.listener import Listener
+from ctr_dynamics.runtime.playback import load
+from ctr_dynamics.runtime.processes import DRIVER, ESTIMATOR, NodeProcess, free_domain
 
 STEP_NS = 3_000_000
 LIMITS = {"late_fraction": 0.001, "late_over_20ms": 0, "skipped": 0}

@@ -21,14 +21,14 @@ from pathlib import Path
 
 import live_run
 
-from ctr_dynamics.bagio.reader import InputMessage, open_bag
-from ctr_dynamics.bagio.writer import write_bag
-from ctr_dynamics.bench.fused import DT_NS
-from ctr_dynamics.cli.demo import shipped_file
+from ctr_dynamics.benchmarks.fused import DT_NS
+from ctr_dynamics.cli.demo_command import shipped_file
 from ctr_dynamics.estimation.estimator import Estimator
-from ctr_dynamics.messages import topics
-from ctr_dynamics.messages.cdr import JointStateIn, PoseIn, WrenchIn
-from ctr_dynamics.messages.encode import (
+from ctr_dynamics.io.bag_reader import InputMessage, open_bag
+from ctr_dynamics.io.bag_writer import write_bag
+from ctr_dynamics.io.messages import topics
+from ctr_dynamics.io.messages.cdr import JointStateIn, PoseIn, WrenchIn
+from ctr_dynamics.io.messages.encode import (
     StepEncoder,
     encode_joint_state,
     encode_pose_stamped,

@@ -13,7 +13,7 @@ import argparse
 import numpy as np
 from numpy.typing import NDArray
 
-from ctr_dynamics.estimation.misfit import EVERY, LAGS, MisfitLimits
+from ctr_dynamics.estimation.monitoring.consistency import EVERY, LAGS, MisfitLimits
 
 RATE, AXES = 40.0, 6
 TEN_HOURS = 36_000.0  # s

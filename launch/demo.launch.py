@@ -1,6 +1,6 @@
 """A bag as live topics, its stamps moved to now: ros2 launch ctr_dynamics demo.launch.py bag:=FILE.mcap"""
 
-from ctr_dynamics.launching import description
+from ctr_dynamics.ros.launch_files import description
 
 
 def generate_launch_description():

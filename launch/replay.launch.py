@@ -5,7 +5,7 @@ with use_sim_time and takes a step when the joints that cover it are in. For fig
 use `ctr-dynamics replay`, which needs no ROS graph.
 """
 
-from ctr_dynamics.launching import description
+from ctr_dynamics.ros.launch_files import description
 
 
 def generate_launch_description():

@@ -18,10 +18,10 @@ def command(monkeypatch):
     """Put a function in the place of a command; returns a caller of the command line."""
 
     def install(function):
-        module = types.ModuleType("ctr_dynamics.cli.info")
+        module = types.ModuleType("ctr_dynamics.cli.info_command")
         module.info = function
         monkeypatch.setattr(cli, "available", lambda: ["info", "warmup"])
-        monkeypatch.setattr(cli, "import_module", {"ctr_dynamics.cli.info": module}.__getitem__)
+        monkeypatch.setattr(cli, "import_module", {"ctr_dynamics.cli.info_command": module}.__getitem__)
         return lambda *arguments: cli.main(["info", *arguments])
 
     return install

@@ -9,13 +9,13 @@ from pathlib import Path
 import pytest
 import yaml
 
-from ctr_dynamics import reference
 from ctr_dynamics.cli import main as cli
-from ctr_dynamics.messages.pages import undocumented
-from ctr_dynamics.messages.topics import TOPICS
-from ctr_dynamics.nodes.tables import NODES
+from ctr_dynamics.io.messages.topics import TOPICS
 from ctr_dynamics.parameters import PARAMETERS
+from ctr_dynamics.runtime.node_parameters import NODES
 from ctr_dynamics.view.markers import TUBES_TOPIC
+from tools import reference
+from tools.message_pages import undocumented
 
 ROOT = Path(__file__).parents[1]
 PAGES = [
@@ -70,7 +70,7 @@ def test_every_topic_and_field_is_documented():
 
 
 def test_every_service_of_the_node_is_documented():
-    text = (ROOT / "ctr_dynamics" / "nodes" / "estimator_node.py").read_text()
+    text = (ROOT / "ctr_dynamics" / "ros" / "estimator_node.py").read_text()
     offered = set(re.findall(r'create_service\(\w+, "~/(\w+)"', text))
     assert {name.rsplit("/", 1)[1] for name in reference.SERVICES} == offered
 

@@ -9,9 +9,9 @@ import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ctr_dynamics import tables
 from ctr_dynamics.errors import InputError
 from ctr_dynamics.parameters import PARAMETERS, Settings, axes_mask, parameter, parse_assignments
+from tools import tables
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -177,7 +177,7 @@ def test_any_value_is_taken_or_refused_in_one_line(p, value):
 
 def test_readme_and_estimator_yaml_are_up_to_date():
     late = [str(path.relative_to(ROOT)) for path in tables.outdated(ROOT)]
-    assert not late, f"run python -m ctr_dynamics.tables --write: {late}"
+    assert not late, f"run python -m tools.tables --write: {late}"
 
 
 def test_estimator_yaml_holds_every_default_in_its_ros_type():

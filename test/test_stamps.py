@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from ctr_dynamics.stamps import EachOnce, StampClock
+from ctr_dynamics.runtime.clock_offset import EachOnce, StampClock
 
 MS = 1_000_000
 PERIOD = 10 * MS

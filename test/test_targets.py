@@ -6,7 +6,7 @@ import threading
 import pytest
 
 from ctr_dynamics.errors import InputError
-from ctr_dynamics.targets import atomic_file, check_targets
+from ctr_dynamics.io.atomic_files import atomic_file, check_targets
 
 
 def put(path, text="new"):

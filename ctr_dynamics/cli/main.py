@@ -46,7 +46,7 @@ def _attribute(name: str) -> str:
 
 def available() -> list[str]:
     """Commands whose file exists, in the order of COMMANDS."""
-    return [name for name in COMMANDS if find_spec(f"ctr_dynamics.cli.{_attribute(name)}") is not None]
+    return [name for name in COMMANDS if find_spec(f"ctr_dynamics.cli.{name}_command") is not None]
 
 
 def fail(message: str) -> None:
@@ -111,7 +111,7 @@ def build_app(requested: str | None) -> typer.Typer:
 
     for name in available():
         if name == requested:
-            module = import_module(f"ctr_dynamics.cli.{_attribute(name)}")
+            module = import_module(f"ctr_dynamics.cli.{name}_command")
             command = getattr(module, _attribute(name))
             if isinstance(command, dict):  # of subcommands
                 group = typer.Typer(help=COMMANDS[name], no_args_is_help=True)

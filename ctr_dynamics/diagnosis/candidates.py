@@ -9,9 +9,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from ctr_dynamics.diagnosis.fit import Key
 from ctr_dynamics.effects import EFFECTS, Quantity
-
-from .fit import Key
 
 Floats = NDArray[np.float64]
 LOG_PRIOR_CLEAN = math.log(0.5)

@@ -9,17 +9,16 @@ from typing import Any
 
 import yaml
 
+from ctr_dynamics.diagnosis.diagnose import diagnose
+from ctr_dynamics.diagnosis.findings import findings, write
+from ctr_dynamics.diagnosis.planning import Plan, plan
+from ctr_dynamics.diagnosis.recording import Recording, read_recording
+from ctr_dynamics.diagnosis.rehearsal import rehearse
+from ctr_dynamics.diagnosis.report import write_report
 from ctr_dynamics.errors import InputError
+from ctr_dynamics.io.atomic_files import atomic_file, output_folder
 from ctr_dynamics.robot import Robot
 from ctr_dynamics.simulation.scenario import Scenario
-from ctr_dynamics.targets import atomic_file, output_folder
-
-from .diagnose import diagnose
-from .findings import findings, write
-from .planning import Plan, plan
-from .recording import Recording, read_recording
-from .rehearsal import rehearse
-from .report import write_report
 
 SCENARIO = "next_experiment.yaml"
 

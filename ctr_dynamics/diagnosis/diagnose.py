@@ -14,21 +14,20 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from ctr_dynamics.diagnosis.candidates import Candidate, candidates
+from ctr_dynamics.diagnosis.checks import Whiteness, block_bootstrap, rms, whiteness
+from ctr_dynamics.diagnosis.explanations import Explanation
+from ctr_dynamics.diagnosis.exploration import LEFT_NUMERICAL, LEFT_SHARE, Search, adequate, distinct
+from ctr_dynamics.diagnosis.fit import Fit, Local, Problem, fit, make_problem
+from ctr_dynamics.diagnosis.mistakes import find_mistake
+from ctr_dynamics.diagnosis.numerics import add_numerics
+from ctr_dynamics.diagnosis.recording import Recording
+from ctr_dynamics.diagnosis.search import search, second_opinion
+from ctr_dynamics.diagnosis.signatures import Linearisation, linearise, observable, separation
+from ctr_dynamics.diagnosis.unexplained import Unexplained, unexplained
 from ctr_dynamics.effects import EFFECTS, quantities
 from ctr_dynamics.errors import InputError
 from ctr_dynamics.robot import Robot
-
-from .candidates import Candidate, candidates
-from .checks import Whiteness, block_bootstrap, rms, whiteness
-from .explanations import Explanation
-from .exploration import LEFT_NUMERICAL, LEFT_SHARE, Search, adequate, distinct
-from .fit import Fit, Local, Problem, fit, make_problem
-from .mistakes import find_mistake
-from .numerics import add_numerics
-from .recording import Recording
-from .search import search, second_opinion
-from .signatures import Linearisation, linearise, observable, separation
-from .unexplained import Unexplained, unexplained
 
 Floats = NDArray[np.float64]
 Note = Callable[[str], None]

@@ -12,16 +12,16 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ctr_dynamics.effects import EFFECTS, Quantity, Setup, apply_effects, make_setup, play
+from ctr_dynamics.diagnosis.recording import Recording
+from ctr_dynamics.effects import EFFECTS, Quantity, Setup, apply_effects, make_setup
 from ctr_dynamics.errors import InputError
-from ctr_dynamics.estimation.signals import Signal
-from ctr_dynamics.model.lanes import PACK
+from ctr_dynamics.kernels.backlash import play
+from ctr_dynamics.kernels.lanes import PACK
 from ctr_dynamics.model.model import Model
-from ctr_dynamics.model.scheme import make_scheme
+from ctr_dynamics.model.time_scheme import make_scheme
 from ctr_dynamics.model.trajectory import InputRows, Trajectory, run
 from ctr_dynamics.robot import Robot
-
-from .recording import Recording
+from ctr_dynamics.sensing.interpolation import Signal
 
 Floats = NDArray[np.float64]
 Point = Mapping[

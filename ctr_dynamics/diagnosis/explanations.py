@@ -11,11 +11,10 @@ from joblib import Parallel, delayed
 from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
+from ctr_dynamics.diagnosis.candidates import Candidate, causes_of, keys_of
+from ctr_dynamics.diagnosis.fit import Fit, Key, Local, Problem, fit, posterior, variances
+from ctr_dynamics.diagnosis.signatures import PROBE_STEP, Linearisation, Scored, strayed
 from ctr_dynamics.effects import EFFECTS, Quantity, quantities
-
-from .candidates import Candidate, causes_of, keys_of
-from .fit import Fit, Key, Local, Problem, fit, posterior, variances
-from .signatures import PROBE_STEP, Linearisation, Scored, strayed
 
 Floats = NDArray[np.float64]
 LEAVES_LITTLE = 2.0  # times the noise: then no other size is tried

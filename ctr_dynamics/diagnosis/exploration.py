@@ -16,15 +16,23 @@ import numpy as np
 from joblib import Parallel, delayed
 from numpy.typing import NDArray
 
+from ctr_dynamics.diagnosis.candidates import Candidate, keys_of, log_prior
+from ctr_dynamics.diagnosis.explanations import (
+    Explanation,
+    Job,
+    combined,
+    finish,
+    fit_all,
+    look_closer,
+    reduced,
+    replaced,
+)
+from ctr_dynamics.diagnosis.fit import Fit, Key, Problem, corrected
+from ctr_dynamics.diagnosis.numerics import renew_numerics
+from ctr_dynamics.diagnosis.sets import rank_sets
+from ctr_dynamics.diagnosis.signatures import Linearisation, Scored, far_probes, linearise, screen, separation
+from ctr_dynamics.diagnosis.wall import wall
 from ctr_dynamics.effects import EFFECTS, quantities
-
-from .candidates import Candidate, keys_of, log_prior
-from .explanations import Explanation, Job, combined, finish, fit_all, look_closer, reduced, replaced
-from .fit import Fit, Key, Problem, corrected
-from .numerics import renew_numerics
-from .sets import rank_sets
-from .signatures import Linearisation, Scored, far_probes, linearise, screen, separation
-from .wall import wall
 
 Floats = NDArray[np.float64]
 TEMPERATURE = 1.6  # of the log evidence: a judgement against overconfidence, not fitted to cases

@@ -11,16 +11,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctr_dynamics import __version__
-from ctr_dynamics.bagio.replay import plain
+from ctr_dynamics.diagnosis.checks import rms
+from ctr_dynamics.diagnosis.diagnose import Diagnosis, Member
+from ctr_dynamics.diagnosis.fit import Fit
+from ctr_dynamics.diagnosis.noise import noise_floor
+from ctr_dynamics.diagnosis.robots import robot_of
 from ctr_dynamics.effects import EFFECTS, Quantity
+from ctr_dynamics.io.atomic_files import atomic_file
 from ctr_dynamics.robot import robot_to_yaml
-from ctr_dynamics.targets import atomic_file
-
-from .checks import rms
-from .diagnose import Diagnosis, Member
-from .fit import Fit
-from .noise import noise_floor
-from .robots import robot_of
+from ctr_dynamics.runtime.replay import plain
 
 Floats = NDArray[np.float64]
 SCHEMA = "ctr_dynamics/findings/1"

@@ -15,13 +15,12 @@ from numpy.typing import NDArray
 from scipy.optimize import lsq_linear
 from scipy.special import log_ndtr
 
+from ctr_dynamics.diagnosis.experiment import NODES, Experiment
+from ctr_dynamics.diagnosis.noise import Whitener
+from ctr_dynamics.diagnosis.recording import Recording
 from ctr_dynamics.effects import Quantity
 from ctr_dynamics.errors import InputError
 from ctr_dynamics.robot import Robot
-
-from .experiment import NODES, Experiment
-from .noise import Whitener
-from .recording import Recording
 
 Floats = NDArray[np.float64]
 Key = tuple[str, str]

@@ -9,13 +9,12 @@ from typing import Any
 
 import numpy as np
 
+from ctr_dynamics.diagnosis.experiment import Experiment
+from ctr_dynamics.diagnosis.noise import noise_floor
+from ctr_dynamics.diagnosis.recording import Recording
 from ctr_dynamics.errors import InputError
 from ctr_dynamics.robot import Robot
 from ctr_dynamics.robot.loader import robot_from_dict, robot_to_dict
-
-from .experiment import Experiment
-from .noise import noise_floor
-from .recording import Recording
 
 Pair = tuple[Recording, Robot]
 GROSS = 8.0  # times the noise floor: below, no mistake is looked for

@@ -8,19 +8,18 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ctr_dynamics.diagnosis.candidates import Candidate
+from ctr_dynamics.diagnosis.diagnose import Diagnosis
+from ctr_dynamics.diagnosis.experiment import Experiment
+from ctr_dynamics.diagnosis.fit import prior_variance
+from ctr_dynamics.diagnosis.noise import Whitener
+from ctr_dynamics.diagnosis.recording import Recording
+from ctr_dynamics.diagnosis.signatures import left_over, separation
 from ctr_dynamics.errors import InputError
 from ctr_dynamics.model.model import Model
 from ctr_dynamics.robot import Robot
 from ctr_dynamics.simulation.run import drives
 from ctr_dynamics.simulation.scenario import Scenario, load_scenario
-
-from .candidates import Candidate
-from .diagnose import Diagnosis
-from .experiment import Experiment
-from .fit import prior_variance
-from .noise import Whitener
-from .recording import Recording
-from .signatures import left_over, separation
 
 Floats = NDArray[np.float64]
 LIBRARY = ("release", "light_release", "reversals", "turns")

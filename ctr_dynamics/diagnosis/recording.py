@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ctr_dynamics.bagio.reader import Bag, open_bag
 from ctr_dynamics.errors import InputError
-from ctr_dynamics.estimation.signals import finite, joint_order
-from ctr_dynamics.messages.cdr import JointStateIn, PoseIn
+from ctr_dynamics.io.bag_reader import Bag, open_bag
+from ctr_dynamics.io.messages.cdr import JointStateIn, PoseIn
 from ctr_dynamics.robot import Robot
+from ctr_dynamics.sensing.interpolation import finite, joint_order
 
 Floats = NDArray[np.float64]
 SHORTEST = 2.0  # s of joints and tracker together, below which nothing can be said

@@ -6,11 +6,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from ctr_dynamics.diagnosis.experiment import Experiment
+from ctr_dynamics.diagnosis.recording import Recording
 from ctr_dynamics.effects import quantities
 from ctr_dynamics.robot import Robot
-
-from .experiment import Experiment
-from .recording import Recording
 
 MOMENT = 0.02  # s
 

@@ -10,17 +10,16 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from scipy.signal import periodogram
 
+from ctr_dynamics.diagnosis.checks import by_axis
+from ctr_dynamics.diagnosis.diagnose import Diagnosis
+from ctr_dynamics.diagnosis.fit import Fit
+from ctr_dynamics.diagnosis.noise import noise_floor
+from ctr_dynamics.diagnosis.sentences import summary
+from ctr_dynamics.diagnosis.signatures import separation
 from ctr_dynamics.effects import EFFECTS
-from ctr_dynamics.report.figures import Panel, figure_svg, to_svg
-from ctr_dynamics.report.page import Page
-from ctr_dynamics.targets import atomic_file
-
-from .checks import by_axis
-from .diagnose import Diagnosis
-from .fit import Fit
-from .noise import noise_floor
-from .sentences import summary
-from .signatures import separation
+from ctr_dynamics.io.atomic_files import atomic_file
+from ctr_dynamics.reporting.figures import Panel, figure_svg, to_svg
+from ctr_dynamics.reporting.page import Page
 
 Floats = NDArray[np.float64]
 AXES = "xyz"

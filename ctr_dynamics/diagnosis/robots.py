@@ -8,11 +8,10 @@ from typing import Any
 
 import numpy as np
 
+from ctr_dynamics.diagnosis.fit import Fit, Key
 from ctr_dynamics.effects import EFFECTS
-from ctr_dynamics.estimation.rotations import from_vector, matrix, multiply, to_vector
+from ctr_dynamics.kernels.rotations import from_vector, matrix, multiply, to_vector
 from ctr_dynamics.robot import Robot, robot_from_dict, robot_to_dict
-
-from .fit import Fit, Key
 
 _PLAIN = {
     ("base_coulomb", "mu_base"): ("friction", "base", "coulomb"),

@@ -9,11 +9,9 @@ from dataclasses import replace
 import numpy as np
 from joblib import Parallel, delayed
 
-from ctr_dynamics.effects import EFFECTS
-
-from .candidates import Candidate
-from .explanations import Explanation, finish, look_closer, with_nuisances
-from .exploration import (
+from ctr_dynamics.diagnosis.candidates import Candidate
+from ctr_dynamics.diagnosis.explanations import Explanation, finish, look_closer, with_nuisances
+from ctr_dynamics.diagnosis.exploration import (
     CONTENDERS,
     LEFT_SHARE,
     MUCH,
@@ -24,9 +22,10 @@ from .exploration import (
     probabilities,
     weigh,
 )
-from .fit import Fit, Problem, corrected, fit, make_problem, posterior
-from .numerics import add_numerics
-from .wall import parting
+from ctr_dynamics.diagnosis.fit import Fit, Problem, corrected, fit, make_problem, posterior
+from ctr_dynamics.diagnosis.numerics import add_numerics
+from ctr_dynamics.diagnosis.wall import parting
+from ctr_dynamics.effects import EFFECTS
 
 EARLY = 1.0  # s after model and measurement part, to which causes are first fitted where there are impacts
 SPANS = (2.0, 4.0)  # s after it, before the whole recording

@@ -14,11 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import log_ndtr
 
+from ctr_dynamics.diagnosis.candidates import Candidate, keys_of, log_prior, tube_of
+from ctr_dynamics.diagnosis.fit import INSIDE, LOG_INSIDE, Fit, Key, Problem
+from ctr_dynamics.diagnosis.signatures import Linearisation
 from ctr_dynamics.effects import Quantity
-
-from .candidates import Candidate, keys_of, log_prior, tube_of
-from .fit import INSIDE, LOG_INSIDE, Fit, Key, Problem
-from .signatures import Linearisation
 
 Floats = NDArray[np.float64]
 

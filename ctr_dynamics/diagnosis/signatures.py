@@ -10,10 +10,9 @@ import numpy as np
 from joblib import Parallel, delayed
 from numpy.typing import NDArray
 
+from ctr_dynamics.diagnosis.candidates import Candidate, causes_of, keys_of, tube_of
+from ctr_dynamics.diagnosis.fit import INSIDE, Fit, Key, Problem, inside, posterior, prior_variance, variances
 from ctr_dynamics.effects import EFFECTS, Quantity
-
-from .candidates import Candidate, causes_of, keys_of, tube_of
-from .fit import INSIDE, Fit, Key, Problem, inside, posterior, prior_variance, variances
 
 Floats = NDArray[np.float64]
 PROBE_STEP = 0.005  # s: what a finite size changes is large against the error in time of what it changes

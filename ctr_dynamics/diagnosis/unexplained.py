@@ -9,9 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import lombscargle
 
+from ctr_dynamics.diagnosis.experiment import Experiment, Point
 from ctr_dynamics.effects import quantities
-
-from .experiment import Experiment, Point
 
 Floats = NDArray[np.float64]
 FREQUENCIES = np.linspace(0.1, 18.0, 1800)  # Hz: below half of a 40 Hz tracker's rate

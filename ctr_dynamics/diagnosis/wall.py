@@ -16,14 +16,13 @@ from joblib import Parallel, delayed
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
+from ctr_dynamics.diagnosis.candidates import Candidate
+from ctr_dynamics.diagnosis.experiment import Experiment
+from ctr_dynamics.diagnosis.fit import Key, Problem
+from ctr_dynamics.diagnosis.noise import noise_floor
+from ctr_dynamics.diagnosis.recording import Recording
 from ctr_dynamics.effects import Quantity
-from ctr_dynamics.estimation.rotations import matrix
-
-from .candidates import Candidate
-from .experiment import Experiment
-from .fit import Key, Problem
-from .noise import noise_floor
-from .recording import Recording
+from ctr_dynamics.kernels.rotations import matrix
 
 Floats = NDArray[np.float64]
 EFFECT = "contact"

@@ -1,9 +1,9 @@
 """The catalogue of effects: what the model can be extended by, and what diagnosis looks for."""
 
-from . import drive, friction, structure, surroundings, tracking
-from .play import play
-from .registry import EFFECTS, Effect, Parameter, Quantity, apply_effects, quantities
-from .setup import Setup, make_setup
+from ctr_dynamics.effects import drive, friction, structure, surroundings, tracking
+from ctr_dynamics.effects.registry import EFFECTS, Effect, Parameter, Quantity, apply_effects, quantities
+from ctr_dynamics.effects.setup import Setup, make_setup
+from ctr_dynamics.kernels.backlash import play
 
 __all__ = [
     "EFFECTS",

@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING
 
-from .registry import Effect, Parameter, Values, register
+from ctr_dynamics.effects.registry import Effect, Parameter, Values, register
 
 if TYPE_CHECKING:
-    from .setup import Setup
+    from ctr_dynamics.effects.setup import Setup
 
 
 def _tubes(setup: Setup, values: Values, name: str) -> list[float]:

@@ -9,12 +9,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-from .registry import Effect, Parameter, Values, register
+from ctr_dynamics.effects.registry import Effect, Parameter, Values, register
 
 if TYPE_CHECKING:
+    from ctr_dynamics.effects.setup import Setup
     from ctr_dynamics.robot import Robot
-
-    from .setup import Setup
 
 
 def _put(group: str, name: str) -> Callable[[Setup, Values], None]:

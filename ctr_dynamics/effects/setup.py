@@ -13,13 +13,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from ctr_dynamics.estimation.rotations import from_vector
+from ctr_dynamics.effects.registry import apply_effects
+from ctr_dynamics.kernels.rotations import from_vector
 from ctr_dynamics.robot import Robot
 
-from .registry import apply_effects
-
 if TYPE_CHECKING:
-    from ctr_dynamics.model.layout import Layout
+    from ctr_dynamics.kernels.layout import Layout
     from ctr_dynamics.model.model import Model
 
 Floats = NDArray[np.float64]

@@ -7,12 +7,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ctr_dynamics.estimation.rotations import from_vector, matrix
-
-from .registry import Effect, Parameter, Values, register
+from ctr_dynamics.effects.registry import Effect, Parameter, Values, register
+from ctr_dynamics.kernels.rotations import from_vector, matrix
 
 if TYPE_CHECKING:
-    from .setup import Setup
+    from ctr_dynamics.effects.setup import Setup
 
 
 def _gravity(setup: Setup, values: Values) -> None:

@@ -6,12 +6,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ctr_dynamics.estimation.rotations import from_vector, matrix, multiply
-
-from .registry import Effect, Parameter, Values, register
+from ctr_dynamics.effects.registry import Effect, Parameter, Values, register
+from ctr_dynamics.kernels.rotations import from_vector, matrix, multiply
 
 if TYPE_CHECKING:
-    from .setup import Setup
+    from ctr_dynamics.effects.setup import Setup
 
 
 def _rotation(setup: Setup, values: Values) -> None:

@@ -5,12 +5,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from ctr_dynamics.estimation.filter.ekf import Fusion
+from ctr_dynamics.kernels.filter_steps import backbone_rows, matrix
 from ctr_dynamics.model.mesh import node_points, node_positions
 from ctr_dynamics.model.model import Model
 from ctr_dynamics.model.simulator import State
-
-from .fusion import Fusion
-from .kernels import backbone_rows, matrix
 
 Floats = NDArray[np.float64]
 SHAPES = 8  # sections at a beta whose nodes are remembered
@@ -24,7 +23,7 @@ class Backbone:
         self._nodes: dict[tuple, tuple[Floats, NDArray[np.int64]]] = {}
 
     def rows(self, state: State) -> NDArray[np.float32]:
-        """(P, 15) float32, see :class:`ctr_dynamics.estimation.outputs.StepOutput`."""
+        """(P, 15) float32, see :class:`ctr_dynamics.estimation.step_output.StepOutput`."""
         key = (state.key, state.inputs.beta.tobytes())
         if key not in self._nodes:
             if len(self._nodes) > SHAPES:

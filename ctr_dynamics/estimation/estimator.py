@@ -16,19 +16,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ctr_dynamics.estimation.backbone import Backbone
+from ctr_dynamics.estimation.inputs.input_buffer import DT_NS, InputBuffer, seconds
+from ctr_dynamics.estimation.modes import ModeTracker
+from ctr_dynamics.estimation.monitoring.consistency import misfit_monitor
+from ctr_dynamics.estimation.monitoring.health import Health
+from ctr_dynamics.estimation.runs import Kept, Runs
+from ctr_dynamics.estimation.step_output import Innovation, SolverStats, StepOutput
 from ctr_dynamics.model.model import Model
 from ctr_dynamics.model.simulator import StepResult
+from ctr_dynamics.model.stability import StabilityWatch
 from ctr_dynamics.parameters import Settings
 from ctr_dynamics.robot import Robot
-from ctr_dynamics.snap.stability import StabilityWatch
-
-from .backbone import Backbone
-from .health import Health
-from .inputs import DT_NS, InputBuffer, seconds
-from .misfit import misfit_monitor
-from .modes import ModeTracker
-from .outputs import Innovation, SolverStats, StepOutput
-from .runs import Kept, Runs
 
 Floats = NDArray[np.float64]
 STABILITY_EVERY = 33  # steps between looks at the elastic stability

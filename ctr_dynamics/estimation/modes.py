@@ -15,18 +15,17 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg.lapack import dgeev
 
+from ctr_dynamics.estimation.filter.covariance_factor import field_weights
+from ctr_dynamics.estimation.step_output import Modes
+from ctr_dynamics.kernels.filter_steps import modal_coordinates
+from ctr_dynamics.kernels.rotations import matrix
+from ctr_dynamics.kernels.shooting import lanes_for
+from ctr_dynamics.kernels.tangent import linearise
 from ctr_dynamics.model.mesh import Key
+from ctr_dynamics.model.mesh_interpolation import Transfer, transfer
 from ctr_dynamics.model.model import Model
-from ctr_dynamics.model.newton import lanes_for
 from ctr_dynamics.model.simulator import Inputs, State
 from ctr_dynamics.model.statics import Equilibrium, Statics
-from ctr_dynamics.model.tangent import linearise
-from ctr_dynamics.model.transfer import Transfer, transfer
-
-from .columns import field_weights
-from .kernels import modal_coordinates
-from .outputs import Modes
-from .rotations import matrix
 
 Floats = NDArray[np.float64]
 SHIFT_STEP = 0.02  # s: the shift 50 / s lies among the slow bending modes

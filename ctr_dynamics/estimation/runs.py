@@ -12,20 +12,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctr_dynamics.errors import InputError
+from ctr_dynamics.estimation.filter.ekf import Fusion, FusionOptions
+from ctr_dynamics.estimation.filter.tip_window import TipWindow
+from ctr_dynamics.estimation.inputs.actuation import Actuation, Signals, standing
+from ctr_dynamics.estimation.inputs.input_buffer import DT_NS, InputBuffer, Sample, seconds
+from ctr_dynamics.estimation.monitoring.health import Health
+from ctr_dynamics.estimation.step_output import Innovation, Moment
+from ctr_dynamics.kernels.workspace import input_row
 from ctr_dynamics.model.model import Model
-from ctr_dynamics.model.pair import Pair
-from ctr_dynamics.model.scheme import make_scheme
+from ctr_dynamics.model.paired_steps import Pair
 from ctr_dynamics.model.simulator import Simulator, State, StepResult
-from ctr_dynamics.model.workspace import input_row
+from ctr_dynamics.model.time_scheme import make_scheme
 from ctr_dynamics.parameters import Settings, axes_mask
-
-from .actuation import Actuation, Signals, standing
-from .fusion import Fusion, FusionOptions
-from .health import Health
-from .inputs import DT_NS, InputBuffer, Sample, seconds
-from .outputs import Innovation, Moment
-from .tip import TipWindow
-from .tracker import registered, tracker_model
+from ctr_dynamics.sensing.tracker import registered, tracker_model
 
 Floats = NDArray[np.float64]
 DT = seconds(1)

@@ -9,16 +9,17 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from ctr_dynamics.errors import InputError
-from ctr_dynamics.model.lockstep import solve_lanes
+from ctr_dynamics.kernels.batched_shooting import solve_lanes
+from ctr_dynamics.kernels.compiler import njit
+from ctr_dynamics.kernels.shooting import lane_lengths, lanes_for
+from ctr_dynamics.kernels.time_step import EARLIER, RENEW, extrapolate, history, remember
+from ctr_dynamics.kernels.workspace import input_row, lane_count
 from ctr_dynamics.model.model import Model
-from ctr_dynamics.model.newton import lane_lengths, lanes_for
-from ctr_dynamics.model.scheme import RATE_NOW, RATES, Y_BEFORE, Y_NOW, Scheme
 from ctr_dynamics.model.simulator import Inputs, Simulator, State
-from ctr_dynamics.model.step import EARLIER, RENEW, extrapolate, history, remember
+from ctr_dynamics.model.time_scheme import RATE_NOW, RATES, Y_BEFORE, Y_NOW, Scheme
 from ctr_dynamics.model.trajectory import (
     CHUNK,
     TIP_ROWS,
@@ -28,7 +29,6 @@ from ctr_dynamics.model.trajectory import (
     to_inputs,
     while_fitting,
 )
-from ctr_dynamics.model.workspace import input_row, lane_count
 
 Floats = NDArray[np.float64]
 LANES = 8  # cases in one batch: one pack, so that none waits for many

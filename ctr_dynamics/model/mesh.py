@@ -12,9 +12,9 @@ import itertools
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from ctr_dynamics.errors import InputError
+from ctr_dynamics.kernels.compiler import njit
 
 STAGES = 4  # Runge-Kutta stages a cell, each with its own history
 _STAGE_XI = (0.0, 0.5, 0.5, 1.0)

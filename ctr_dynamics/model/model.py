@@ -5,7 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from ctr_dynamics.effects import make_setup
-from ctr_dynamics.model.layout import Layout
+from ctr_dynamics.kernels.layout import Layout
+from ctr_dynamics.kernels.shooting import buffers, lanes_for
+from ctr_dynamics.kernels.workspace import workspace_rows
 from ctr_dynamics.model.mesh import (
     Key,
     Mesh,
@@ -17,8 +19,6 @@ from ctr_dynamics.model.mesh import (
     point_count,
     section_key,
 )
-from ctr_dynamics.model.newton import buffers, lanes_for
-from ctr_dynamics.model.workspace import workspace_rows
 from ctr_dynamics.robot import Robot
 
 LOAD_KINK = 0.02  # of the force and moment that bend the robot

@@ -12,12 +12,12 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 
 from ctr_dynamics.errors import InputError
+from ctr_dynamics.kernels.shooting import CONVERGED, NOT_FINITE
+from ctr_dynamics.kernels.time_step import EARLIER, RENEW, extrapolate, remember, step
 from ctr_dynamics.model.mesh import Mesh, point_positions
 from ctr_dynamics.model.model import Model
-from ctr_dynamics.model.newton import CONVERGED, NOT_FINITE
-from ctr_dynamics.model.scheme import RATES, Y_BEFORE, Y_NOW, Scheme, make_scheme
 from ctr_dynamics.model.statics import Statics
-from ctr_dynamics.model.step import EARLIER, RENEW, extrapolate, remember, step
+from ctr_dynamics.model.time_scheme import RATES, Y_BEFORE, Y_NOW, Scheme, make_scheme
 
 OUTCOMES = {
     CONVERGED: "ok",
@@ -65,7 +65,7 @@ class Record(NamedTuple):
     """What the tangent of a solved step needs.
 
     ``after`` (fields,): fields at its end; ``inputs`` (stages, 3N + 6) and ``found`` (stages, 5 + N) at its stages. :func:`step_tangent
-    <ctr_dynamics.model.tangent.step_tangent>` also reads ``before`` (3, fields), the stored fields before the step, and all of
+    <ctr_dynamics.kernels.tangent.step_tangent>` also reads ``before`` (3, fields), the stored fields before the step, and all of
     ``rates`` (stages, fields); without them ``before`` is empty and ``rates`` holds the last stage's alone.
     """
 

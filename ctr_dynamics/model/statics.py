@@ -8,14 +8,14 @@ from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike
 
-from ctr_dynamics.model.kernels import sweep
+from ctr_dynamics.kernels.compiler import njit
+from ctr_dynamics.kernels.rod import sweep
+from ctr_dynamics.kernels.shooting import CONVERGED, broadcast, lanes_for, solve
+from ctr_dynamics.kernels.workspace import lane_count
 from ctr_dynamics.model.mesh import Key, Mesh, section_lengths
 from ctr_dynamics.model.model import Model
-from ctr_dynamics.model.newton import CONVERGED, broadcast, lanes_for, solve
-from ctr_dynamics.model.workspace import lane_count
 
 
 @dataclass

@@ -11,19 +11,19 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from ctr_dynamics.errors import InputError
-from ctr_dynamics.model.lanes import PACK
+from ctr_dynamics.kernels.compiler import njit
+from ctr_dynamics.kernels.lanes import PACK
+from ctr_dynamics.kernels.shooting import CONVERGED, aligned_zeros, lanes_for
+from ctr_dynamics.kernels.tangent import linearise, step_tangent
+from ctr_dynamics.kernels.time_step import RENEW, extrapolate, remember, step
+from ctr_dynamics.kernels.workspace import input_row
 from ctr_dynamics.model.mesh import Key, Mesh, fits
 from ctr_dynamics.model.model import Model
-from ctr_dynamics.model.newton import CONVERGED, aligned_zeros, lanes_for
-from ctr_dynamics.model.scheme import RATES, Scheme
 from ctr_dynamics.model.simulator import Inputs, Record, Simulator, State, remap_columns
-from ctr_dynamics.model.step import RENEW, extrapolate, remember, step
-from ctr_dynamics.model.tangent import linearise, step_tangent
-from ctr_dynamics.model.workspace import input_row
+from ctr_dynamics.model.time_scheme import RATES, Scheme
 
 Floats = NDArray[np.float64]
 InputRows = Callable[[Floats], Floats]

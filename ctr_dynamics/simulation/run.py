@@ -13,16 +13,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctr_dynamics import __version__
-from ctr_dynamics.bagio.writer import write_bag
-from ctr_dynamics.effects import Setup, play
+from ctr_dynamics.effects import Setup
 from ctr_dynamics.errors import InputError
-from ctr_dynamics.estimation.rotations import from_vector, matrix, multiply
-from ctr_dynamics.messages import topics
-from ctr_dynamics.messages.encode import encode_joint_state, encode_pose_stamped, encode_wrench_stamped
+from ctr_dynamics.io.bag_writer import write_bag
+from ctr_dynamics.io.messages import topics
+from ctr_dynamics.io.messages.encode import encode_joint_state, encode_pose_stamped, encode_wrench_stamped
+from ctr_dynamics.kernels.backlash import play
+from ctr_dynamics.kernels.rotations import from_vector, matrix, multiply
 from ctr_dynamics.model.model import Model
-from ctr_dynamics.model.scheme import make_scheme
 from ctr_dynamics.model.simulator import Inputs, Simulator
 from ctr_dynamics.model.statics import Statics
+from ctr_dynamics.model.time_scheme import make_scheme
 from ctr_dynamics.robot import Robot
 from ctr_dynamics.simulation.scenario import Scenario
 

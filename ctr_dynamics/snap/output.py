@@ -10,13 +10,13 @@ from typing import Any
 
 import numpy as np
 
-from ctr_dynamics.bagio.writer import write_bag
-from ctr_dynamics.messages.encode import encode_joint_state
-from ctr_dynamics.messages.templates import Template, path, stamped_numbers
+from ctr_dynamics.io.atomic_files import atomic_file
+from ctr_dynamics.io.bag_writer import write_bag
+from ctr_dynamics.io.messages.encode import encode_joint_state
+from ctr_dynamics.io.messages.templates import Template, path, stamped_numbers
 from ctr_dynamics.snap.experiment import Trajectory
 from ctr_dynamics.snap.features import Extremum
 from ctr_dynamics.snap.scurve import SCurve
-from ctr_dynamics.targets import atomic_file
 
 FRAME = "ctr_base"
 BACKBONE, INNER, OUTER, ANGLES = (

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from ctr_dynamics.errors import InputError
+from ctr_dynamics.kernels.snap_newton import CONVERGED, NOT_FINITE, make_work, solve
 from ctr_dynamics.model.model import Model
-from ctr_dynamics.model.scheme import RATE_NOW, Y_BEFORE, Y_NOW, make_scheme
+from ctr_dynamics.model.time_scheme import RATE_NOW, Y_BEFORE, Y_NOW, make_scheme
 from ctr_dynamics.robot import Robot
 from ctr_dynamics.snap.grid import Grid, build_grid, default_cells
-from ctr_dynamics.snap.newton import CONVERGED, NOT_FINITE, make_work, solve
 
 TOLERANCE = 1e-9  # of ||E||^2, SI units (section III-F)
 # Effects on the mechanics that (25) does not hold; those of encoders and tracker do not concern it: its actuator angles are the true ones.
@@ -226,7 +226,7 @@ class SnapSolver:
         """Advance by ``dt`` s to the actuator angles ``alpha`` (N,) rad with rates (N,) rad/s.
 
         ``scheme`` is ``bdf2``, with coefficients for unequal steps, or another one-stage scheme of
-        :mod:`ctr_dynamics.model.scheme`, for equal steps.
+        :mod:`ctr_dynamics.model.time_scheme`, for equal steps.
         """
         layout = self.model.layout
         ratio = dt / self.dt if self.dt else 1.0

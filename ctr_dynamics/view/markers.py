@@ -8,8 +8,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from ctr_dynamics.messages import topics
-from ctr_dynamics.messages.cdr import CdrWriter
+from ctr_dynamics.io.messages import topics
+from ctr_dynamics.io.messages.cdr import CdrWriter
 from ctr_dynamics.robot import Robot
 
 TUBES_TOPIC = "/ctr/view/tubes"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ctr_dynamics.messages import cdr, topics
+from ctr_dynamics.io.messages import cdr, topics
 from ctr_dynamics.robot import Robot
 from ctr_dynamics.view.markers import encode_tubes
 

@@ -7,8 +7,8 @@ import time
 from typing import TYPE_CHECKING
 
 from ctr_dynamics.errors import InputError
-from ctr_dynamics.messages.schemas import schema
-from ctr_dynamics.messages.topics import TOPIC
+from ctr_dynamics.io.messages.schemas import schema
+from ctr_dynamics.io.messages.topics import TOPIC
 from ctr_dynamics.robot import Robot
 from ctr_dynamics.view.markers import MARKER_ARRAY, TUBES_TOPIC
 from ctr_dynamics.view.scene import Scene

@@ -19,13 +19,13 @@ from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Bool
 
-from ctr_dynamics.messages import topics
-from ctr_dynamics.messages.cdr import CdrError, decode_joint_state
-from ctr_dynamics.messages.encode import encode_joint_state
-from ctr_dynamics.nodes import qos
-from ctr_dynamics.nodes.naming import NAMESPACE, message_class
-from ctr_dynamics.nodes.spinning import spin_until, stop_on_signals
+from ctr_dynamics.io.messages import topics
+from ctr_dynamics.io.messages.cdr import CdrError, decode_joint_state
+from ctr_dynamics.io.messages.encode import encode_joint_state
 from ctr_dynamics.robot import load_robot
+from ctr_dynamics.ros import qos
+from ctr_dynamics.ros.node_runner import spin_until, stop_on_signals
+from ctr_dynamics.ros.topic_names import NAMESPACE, message_class
 
 sys.path.insert(0, str(Path(__file__).parent))
 from damper import DriveHistory, Estimate, Limits, ModalDamper, Tuning

@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctr_dynamics.estimation.estimator import Estimator
-from ctr_dynamics.messages import topics
-from ctr_dynamics.messages.cdr import decode_joint_state, decode_pose_stamped, decode_wrench_stamped
+from ctr_dynamics.io.messages import topics
+from ctr_dynamics.io.messages.cdr import decode_joint_state, decode_pose_stamped, decode_wrench_stamped
 from ctr_dynamics.model.model import Model
 from ctr_dynamics.model.statics import Statics
 from ctr_dynamics.parameters import Settings

@@ -13,13 +13,13 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from ctr_dynamics.estimation.rotations import from_vector, matrix, multiply
-from ctr_dynamics.messages import topics
-from ctr_dynamics.messages.encode import encode_joint_state, encode_pose_stamped, encode_wrench_stamped
+from ctr_dynamics.io.messages import topics
+from ctr_dynamics.io.messages.encode import encode_joint_state, encode_pose_stamped, encode_wrench_stamped
+from ctr_dynamics.kernels.rotations import from_vector, matrix, multiply
 from ctr_dynamics.model.model import Model
-from ctr_dynamics.model.scheme import make_scheme
 from ctr_dynamics.model.simulator import Inputs, Simulator
 from ctr_dynamics.model.statics import Statics
+from ctr_dynamics.model.time_scheme import make_scheme
 from ctr_dynamics.robot import Robot, quantities, robot_with
 
 Floats = NDArray[np.float64]

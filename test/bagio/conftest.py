@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ctr_dynamics.messages import topics
-from ctr_dynamics.messages.encode import innovation_entries, mode_names
-from ctr_dynamics.messages.schemas import typestore
+from ctr_dynamics.io.messages import topics
+from ctr_dynamics.io.messages.encode import innovation_entries, mode_names
+from ctr_dynamics.io.messages.schemas import typestore
 
 T0_NS = 1_700_000_000_000_000_000
 BAGS = Path(__file__).parents[1] / "data" / "bags"

@@ -10,10 +10,10 @@ from collections.abc import Callable
 
 import pytest
 
-from ctr_dynamics.bagio.info import BagReport, inspect
-from ctr_dynamics.bagio.writer import write_bag
-from ctr_dynamics.messages import topics
-from ctr_dynamics.messages.encode import encode_joint_state, encode_pose_stamped, encode_wrench_stamped
+from ctr_dynamics.io.bag_info import BagReport, inspect
+from ctr_dynamics.io.bag_writer import write_bag
+from ctr_dynamics.io.messages import topics
+from ctr_dynamics.io.messages.encode import encode_joint_state, encode_pose_stamped, encode_wrench_stamped
 
 NAMES = ("tube1_rotation", "tube1_translation", "tube2_rotation", "tube2_translation")
 T0 = 1_700_000_000_000_000_000

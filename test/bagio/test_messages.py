@@ -10,9 +10,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ctr_dynamics.messages import cdr, encode, topics
-from ctr_dynamics.messages.schemas import leaf_fields, schema, typestore
-from ctr_dynamics.messages.templates import NotFiniteError
+from ctr_dynamics.io.messages import cdr, encode, topics
+from ctr_dynamics.io.messages.schemas import leaf_fields, schema, typestore
+from ctr_dynamics.io.messages.templates import NotFiniteError
 
 STORE = typestore()
 OUTPUT_TOPICS = [topic.name for topic in topics.OUTPUTS if topic.name != topics.DIAGNOSTICS]

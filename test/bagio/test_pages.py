@@ -8,7 +8,8 @@ from pathlib import Path
 import pytest
 
 from ctr_dynamics.errors import InputError
-from ctr_dynamics.messages import pages, topics
+from ctr_dynamics.io.messages import topics
+from tools import message_pages as pages
 
 FOLDER = Path(__file__).parents[2] / "msg_docs"
 
@@ -28,7 +29,7 @@ def test_a_missing_or_unknown_field_is_noticed():
 
 @pytest.mark.parametrize("name", sorted(pages.pages()))
 def test_page_is_up_to_date(name):
-    hint = "write it with `python -m ctr_dynamics.messages.pages msg_docs`"
+    hint = "write it with `python -m tools.message_pages msg_docs`"
     assert (FOLDER / name).is_file(), hint
     assert (FOLDER / name).read_text(encoding="utf-8") == pages.pages()[name], hint
 

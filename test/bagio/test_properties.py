@@ -8,12 +8,12 @@ import numpy as np
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from ctr_dynamics.bagio.reader import open_bag
-from ctr_dynamics.bagio.writer import write_bag
 from ctr_dynamics.errors import InputError
-from ctr_dynamics.messages import cdr, topics
-from ctr_dynamics.messages.encode import encode_joint_state, encode_pose_stamped, encode_wrench_stamped
-from ctr_dynamics.messages.schemas import typestore
+from ctr_dynamics.io.bag_reader import open_bag
+from ctr_dynamics.io.bag_writer import write_bag
+from ctr_dynamics.io.messages import cdr, topics
+from ctr_dynamics.io.messages.encode import encode_joint_state, encode_pose_stamped, encode_wrench_stamped
+from ctr_dynamics.io.messages.schemas import typestore
 
 STAMPS = st.integers(0, 2**31 * 10**9 - 1)
 NUMBERS = st.floats(width=64)

@@ -16,11 +16,11 @@ from hypothesis import strategies as st
 from mcap.writer import CompressionType, IndexType, Writer
 from rosbags.highlevel import AnyReader
 
-from ctr_dynamics.bagio.reader import DECODERS, open_bag
 from ctr_dynamics.errors import InputError
-from ctr_dynamics.messages import topics
-from ctr_dynamics.messages.encode import encode_joint_state, encode_pose_stamped
-from ctr_dynamics.messages.schemas import schema
+from ctr_dynamics.io.bag_reader import DECODERS, open_bag
+from ctr_dynamics.io.messages import topics
+from ctr_dynamics.io.messages.encode import encode_joint_state, encode_pose_stamped
+from ctr_dynamics.io.messages.schemas import schema
 
 JOINTS = ["tube1_rotation", "tube1_translation", "tube2_rotation", "tube2_translation"]
 NAMES = (

@@ -17,17 +17,17 @@ import numpy as np
 import pytest
 
 from ctr_dynamics import __version__
-from ctr_dynamics.bagio.reader import InputMessage, open_bag, sha256_of
-from ctr_dynamics.bagio.replay import Player, arrivals, plain, replay
-from ctr_dynamics.bagio.writer import write_bag
 from ctr_dynamics.cli.main import main
-from ctr_dynamics.cli.replay import settings_for_replay
+from ctr_dynamics.cli.replay_command import settings_for_replay
 from ctr_dynamics.errors import InputError
-from ctr_dynamics.messages import cdr, topics
-from ctr_dynamics.messages.encode import encode_joint_state, encode_pose_stamped
-from ctr_dynamics.nodes.playback import load, shifted
+from ctr_dynamics.io.bag_reader import InputMessage, open_bag, sha256_of
+from ctr_dynamics.io.bag_writer import write_bag
+from ctr_dynamics.io.messages import cdr, topics
+from ctr_dynamics.io.messages.encode import encode_joint_state, encode_pose_stamped
 from ctr_dynamics.parameters import Settings
 from ctr_dynamics.robot import load_robot
+from ctr_dynamics.runtime.playback import load, shifted
+from ctr_dynamics.runtime.replay import Player, arrivals, plain, replay
 
 JOINTS = ("tube1_rotation", "tube1_translation", "tube2_rotation", "tube2_translation")
 T0 = 1_700_000_000_000_000_000

@@ -12,12 +12,12 @@ import pytest
 from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 
-from ctr_dynamics.bagio.reader import open_bag
-from ctr_dynamics.bagio.writer import LiveRecorder, write_bag
 from ctr_dynamics.errors import InputError
-from ctr_dynamics.messages import topics
-from ctr_dynamics.messages.encode import StepEncoder
-from ctr_dynamics.messages.schemas import schema, typestore
+from ctr_dynamics.io.bag_reader import open_bag
+from ctr_dynamics.io.bag_writer import LiveRecorder, write_bag
+from ctr_dynamics.io.messages import topics
+from ctr_dynamics.io.messages.encode import StepEncoder
+from ctr_dynamics.io.messages.schemas import schema, typestore
 
 META = {"version": "1.2.3", "parameters": '{"a": 1}'}
 
@@ -129,8 +129,8 @@ def test_killed_recorder_loses_little(tmp_path):
     program = textwrap.dedent(
         f"""
         import os, signal
-        from ctr_dynamics.bagio.writer import LiveRecorder
-        from ctr_dynamics.messages.encode import encode_joint_state
+        from ctr_dynamics.io.bag_writer import LiveRecorder
+        from ctr_dynamics.io.messages.encode import encode_joint_state
         recorder = LiveRecorder({str(path)!r}, {{}})
         for i in range(20000):
             recorder.write("/ctr/joint_states", i, encode_joint_state(i, ["tube1_rotation"], [0.1]))

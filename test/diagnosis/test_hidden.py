@@ -105,8 +105,8 @@ def test_findings_are_plain_json_without_nan_and_files_are_there(outcomes):
 
 def test_extended_robot_predicts_better_through_the_same_door(outcomes):
     """The robot file that diagnosis writes, used by replay without fusion."""
-    from ctr_dynamics.bagio.replay import replay
     from ctr_dynamics.parameters import Settings
+    from ctr_dynamics.runtime.replay import replay
 
     findings, _, folder = outcomes["payload"]
     bag = folder.parent / "sweep.mcap"

@@ -5,12 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ctr_dynamics.bagio.writer import write_bag
 from ctr_dynamics.diagnosis.diagnose import measured_axes
 from ctr_dynamics.diagnosis.recording import GAP, SETTLING, SHORTEST, UNSETTLED, read_recording
 from ctr_dynamics.errors import InputError
-from ctr_dynamics.messages import topics
-from ctr_dynamics.messages.encode import encode_joint_state, encode_pose_stamped, encode_wrench_stamped
+from ctr_dynamics.io.bag_writer import write_bag
+from ctr_dynamics.io.messages import topics
+from ctr_dynamics.io.messages.encode import encode_joint_state, encode_pose_stamped, encode_wrench_stamped
 from ctr_dynamics.robot import load_robot
 
 START_NS = 1_700_000_000_000_000_000

@@ -13,8 +13,8 @@ from truth.motion import Motion, play, protocol, still
 from truth.sensors import readings
 from truth.world import World, carry_out
 
-from ctr_dynamics.bagio.reader import open_bag
-from ctr_dynamics.messages.topics import JOINT_STATES, TIP_LOAD, TRACKER_TIP
+from ctr_dynamics.io.bag_reader import open_bag
+from ctr_dynamics.io.messages.topics import JOINT_STATES, TIP_LOAD, TRACKER_TIP
 from ctr_dynamics.model.model import Model
 from ctr_dynamics.model.statics import Statics
 from ctr_dynamics.robot import load_robot

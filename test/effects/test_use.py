@@ -5,14 +5,14 @@ import copy
 import numpy as np
 import pytest
 
-from ctr_dynamics.bagio import open_bag
-from ctr_dynamics.bagio.replay import Player
-from ctr_dynamics.effects import play
 from ctr_dynamics.estimation.estimator import Estimator
-from ctr_dynamics.estimation.signals import Drives
-from ctr_dynamics.messages.cdr import JointStateIn
+from ctr_dynamics.io import open_bag
+from ctr_dynamics.io.messages.cdr import JointStateIn
+from ctr_dynamics.kernels import backlash as play
 from ctr_dynamics.parameters import Settings
 from ctr_dynamics.robot import load_robot, robot_from_dict, robot_to_dict
+from ctr_dynamics.runtime.replay import Player
+from ctr_dynamics.sensing.interpolation import Drives
 from ctr_dynamics.simulation import Scenario, simulate
 from ctr_dynamics.simulation.run import write_recording
 

@@ -11,13 +11,13 @@ from typing import Any
 
 import numpy as np
 
-from ctr_dynamics.bagio.reader import open_bag
-from ctr_dynamics.bagio.replay import Player
 from ctr_dynamics.estimation.estimator import DT_NS, Estimator
-from ctr_dynamics.estimation.outputs import StepOutput
-from ctr_dynamics.messages.cdr import JointStateIn, PoseIn
+from ctr_dynamics.estimation.step_output import StepOutput
+from ctr_dynamics.io.bag_reader import open_bag
+from ctr_dynamics.io.messages.cdr import JointStateIn, PoseIn
 from ctr_dynamics.parameters import Settings
 from ctr_dynamics.robot import load_robot
+from ctr_dynamics.runtime.replay import Player
 
 BAGS = Path(__file__).parents[1] / "data" / "bags"
 START_NS = 1_700_000_000_000_000_000

@@ -18,8 +18,8 @@ from estimation_cases import (
 )
 
 from ctr_dynamics.estimation.estimator import MAX_FAILURES
-from ctr_dynamics.messages.encode import StepEncoder
-from ctr_dynamics.messages.topics import DIAGNOSTICS
+from ctr_dynamics.io.messages.encode import StepEncoder
+from ctr_dynamics.io.messages.topics import DIAGNOSTICS
 from ctr_dynamics.robot import load_robot
 from ctr_dynamics.snap.scurve import s_curve
 

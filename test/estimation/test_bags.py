@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from estimation_cases import BAGS, check_outputs, nearer, rms, truth_error
 
-from ctr_dynamics.bagio.replay import replay
-from ctr_dynamics.cli.replay import settings_for_replay
+from ctr_dynamics.cli.replay_command import settings_for_replay
+from ctr_dynamics.runtime.replay import replay
 
 # bag: steps, tip error in mm
 BAG_FIGURES = {

@@ -4,16 +4,16 @@ import numpy as np
 import pytest
 from scipy.optimize import curve_fit
 
-import ctr_dynamics.estimation.columns as columns_module
-from ctr_dynamics.estimation.columns import Columns, energy_rows, field_weights
+import ctr_dynamics.estimation.filter.covariance_factor as columns_module
+from ctr_dynamics.estimation.filter.covariance_factor import Columns, energy_rows, field_weights
+from ctr_dynamics.estimation.filter.parameter_priors import bias_sigma, model_uncertainty
 from ctr_dynamics.estimation.modes import MOST_KEPT, ModeTracker, modal_basis
-from ctr_dynamics.estimation.uncertainty import bias_sigma, model_uncertainty
+from ctr_dynamics.kernels.workspace import base_rows
 from ctr_dynamics.model.mesh import build_mesh
+from ctr_dynamics.model.mesh_interpolation import coarse_key, transfer
 from ctr_dynamics.model.model import Model
 from ctr_dynamics.model.simulator import Inputs, Simulator
 from ctr_dynamics.model.statics import Statics
-from ctr_dynamics.model.transfer import coarse_key, transfer
-from ctr_dynamics.model.workspace import base_rows
 from ctr_dynamics.robot import load_robot
 
 BETA, ALPHA, ZERO = np.array([-0.2521, -0.1977]), np.array([1.5708, 1.5708]), np.zeros(2)

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from ctr_dynamics.estimation.drive import MOST, ForceDrive
+from ctr_dynamics.estimation.filter.process_noise import MOST, ForceDrive
 
 DECAY, NOISE = 0.8, 1.0  # of the force from one reading to the next; variance of a reading
 

@@ -4,7 +4,9 @@ import numpy as np
 import pytest
 from scipy.sparse import random_array
 
-from ctr_dynamics.estimation import kernels, rotations, variance_kernels
+from ctr_dynamics.kernels import covariance as variance_kernels
+from ctr_dynamics.kernels import filter_steps as kernels
+from ctr_dynamics.kernels import rotations
 
 RNG = np.random.default_rng(3)
 

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from ctr_dynamics.effects import EFFECTS
-from ctr_dynamics.estimation.misfit import FEWEST, MisfitLimits, MisfitMonitor, ljung_box
-from ctr_dynamics.estimation.outputs import OK, WARN, Innovation, Moment
-from ctr_dynamics.estimation.rotations import from_vector, matrix
-from ctr_dynamics.estimation.signatures import SIGNATURES, Regression
+from ctr_dynamics.estimation.monitoring.consistency import FEWEST, MisfitLimits, MisfitMonitor, ljung_box
+from ctr_dynamics.estimation.monitoring.likely_causes import SIGNATURES, Regression
+from ctr_dynamics.estimation.step_output import OK, WARN, Innovation, Moment
+from ctr_dynamics.kernels.rotations import from_vector, matrix
 
 INTERVAL_NS = 25_000_000
 NOISE = 0.35e-3

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from estimation_cases import bag_messages, estimator, play, rms, truth_error
 
-from ctr_dynamics.estimation.uncertainty import model_uncertainty
+from ctr_dynamics.estimation.filter.parameter_priors import model_uncertainty
 
 
 @pytest.fixture

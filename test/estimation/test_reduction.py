@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
-from ctr_dynamics.estimation import reduction, reduction_kernels
-from ctr_dynamics.estimation.reduction import APPENDED, principal, reduced
+from ctr_dynamics.estimation.filter import reduction
+from ctr_dynamics.estimation.filter.reduction import APPENDED, principal, reduced
+from ctr_dynamics.kernels import covariance_reduction as reduction_kernels
 
 RANK, OTHERS, ROWS = 9, 4, 40
 WIDE = RANK + APPENDED

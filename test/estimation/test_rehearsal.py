@@ -2,8 +2,8 @@
 
 import pytest
 
-from ctr_dynamics.estimation.rehearsal import rehearse
-from ctr_dynamics.model.pair import Pair
+from ctr_dynamics.estimation.warm_up import rehearse
+from ctr_dynamics.model.paired_steps import Pair
 from ctr_dynamics.model.simulator import Simulator
 from ctr_dynamics.parameters import Settings
 from ctr_dynamics.robot import load_robot

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from ctr_dynamics.estimation.rotations import conjugate, from_vector, matrix, multiply, skew, to_vector
-from ctr_dynamics.estimation.signals import Signal, finite, joint_order
+from ctr_dynamics.kernels.rotations import conjugate, from_vector, matrix, multiply, skew, to_vector
+from ctr_dynamics.sensing.interpolation import Signal, finite, joint_order
 
 RNG = np.random.default_rng(7)
 

@@ -5,8 +5,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from ctr_dynamics.estimation.actuation import Signals
-from ctr_dynamics.estimation.signals import Drives, Signal
+from ctr_dynamics.estimation.inputs.actuation import Signals
+from ctr_dynamics.sensing.interpolation import Drives, Signal
 
 MS = 1_000_000
 RNG = np.random.default_rng(5)

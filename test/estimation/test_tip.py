@@ -8,11 +8,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 from tracker_twin import expected, residual
 
-from ctr_dynamics.estimation.reduction import through
-from ctr_dynamics.estimation.rotations import conjugate, from_vector, matrix, multiply, to_vector
-from ctr_dynamics.estimation.tip import Tip, TipWindow, tip_rows
-from ctr_dynamics.estimation.tracker import DELAY, STATES, TrackerModel, innovation
-from ctr_dynamics.estimation.tracker_kernels import fused_tip
+from ctr_dynamics.estimation.filter.reduction import through
+from ctr_dynamics.estimation.filter.tip_window import Tip, TipWindow, tip_rows
+from ctr_dynamics.kernels.rotations import conjugate, from_vector, matrix, multiply, to_vector
+from ctr_dynamics.kernels.tracker_measurement import fused_tip
+from ctr_dynamics.sensing.tracker import DELAY, STATES, TrackerModel, innovation
 
 RNG = np.random.default_rng(11)
 COLUMNS, STEP = 5, 1e-6

@@ -4,8 +4,8 @@ import math
 
 import numpy as np
 
-from ctr_dynamics.estimation.rotations import conjugate, from_vector, matrix, multiply, to_vector
-from ctr_dynamics.estimation.tracker import DRIFT, LEVER, ROTATION, TRANSLATION
+from ctr_dynamics.kernels.rotations import conjugate, from_vector, matrix, multiply, to_vector
+from ctr_dynamics.sensing.tracker import DRIFT, LEVER, ROTATION, TRANSLATION
 
 
 def expected(model, bias, tip):

@@ -11,14 +11,14 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from ctr_dynamics.bagio.reader import open_bag
 from ctr_dynamics.cli import main as cli
+from ctr_dynamics.csv_import.column_layout import Layout
+from ctr_dynamics.csv_import.convert import read_log
 from ctr_dynamics.errors import InputError
-from ctr_dynamics.estimation.rotations import from_vector, matrix, multiply
-from ctr_dynamics.importing.convert import read_log
-from ctr_dynamics.importing.layout import Layout
-from ctr_dynamics.messages import topics
-from ctr_dynamics.messages.cdr import JointStateIn, PoseIn
+from ctr_dynamics.io.bag_reader import open_bag
+from ctr_dynamics.io.messages import topics
+from ctr_dynamics.io.messages.cdr import JointStateIn, PoseIn
+from ctr_dynamics.kernels.rotations import from_vector, matrix, multiply
 from ctr_dynamics.units import measure
 
 BAG = Path(__file__).parents[1] / "data" / "bags" / "exact_release.mcap"

@@ -6,7 +6,7 @@ import pytest
 from ctr_dynamics.effects import apply_effects, make_setup
 from ctr_dynamics.model.batch import run_many
 from ctr_dynamics.model.model import Model
-from ctr_dynamics.model.scheme import make_scheme
+from ctr_dynamics.model.time_scheme import make_scheme
 from ctr_dynamics.model.trajectory import run
 from ctr_dynamics.robot import load_robot
 

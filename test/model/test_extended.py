@@ -11,12 +11,12 @@ import pytest
 from model_cases import dominant_frequency, make_robot, make_tube
 from scipy.interpolate import CubicSpline
 
-from ctr_dynamics.model.kernels import sweep
+from ctr_dynamics.kernels.rod import sweep
 from ctr_dynamics.model.mesh import node_positions, section_lengths
 from ctr_dynamics.model.model import Model
-from ctr_dynamics.model.scheme import make_scheme
 from ctr_dynamics.model.simulator import Inputs, Simulator
 from ctr_dynamics.model.statics import Statics
+from ctr_dynamics.model.time_scheme import make_scheme
 from ctr_dynamics.robot import robot_from_dict, robot_to_dict
 
 E3 = np.array([0.0, 0.0, 1.0])

@@ -5,11 +5,11 @@ import pytest
 from model_cases import many_tubes
 from model_oracle import Oracle
 
-from ctr_dynamics.model.kernels import sweep
-from ctr_dynamics.model.lanes import sincos
+from ctr_dynamics.kernels.lanes import sincos
+from ctr_dynamics.kernels.rod import sweep
+from ctr_dynamics.kernels.workspace import lane_count
 from ctr_dynamics.model.mesh import section_lengths
 from ctr_dynamics.model.model import Model
-from ctr_dynamics.model.workspace import lane_count
 
 
 def random_problem(n, seed, nodes=12):

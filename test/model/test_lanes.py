@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from numba import njit
 
-from ctr_dynamics.model.lanes import PACK, columns, fma, largest, local_copy, rows, where_above
-from ctr_dynamics.model.newton import aligned_zeros
-from ctr_dynamics.model.workspace import lane_count, workspace_rows
+from ctr_dynamics.kernels.lanes import PACK, columns, fma, largest, local_copy, rows, where_above
+from ctr_dynamics.kernels.shooting import aligned_zeros
+from ctr_dynamics.kernels.workspace import lane_count, workspace_rows
 
 
 @njit

@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from ctr_dynamics.model.lockstep import _learn
+from ctr_dynamics.kernels.batched_shooting import _learn
 from ctr_dynamics.model.model import Model
-from ctr_dynamics.model.pair import Pair
-from ctr_dynamics.model.scheme import make_scheme
+from ctr_dynamics.model.paired_steps import Pair
 from ctr_dynamics.model.simulator import Inputs, Simulator
+from ctr_dynamics.model.time_scheme import make_scheme
 from ctr_dynamics.robot import load_robot
 
 DT, TOLERANCE = 0.003, 1e-9

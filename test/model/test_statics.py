@@ -9,9 +9,9 @@ from model_cases import make_robot, make_tube, still
 
 from ctr_dynamics.errors import InputError
 from ctr_dynamics.model.model import Model
-from ctr_dynamics.model.scheme import make_scheme
 from ctr_dynamics.model.simulator import Simulator
 from ctr_dynamics.model.statics import Statics
+from ctr_dynamics.model.time_scheme import make_scheme
 from ctr_dynamics.robot import load_robot
 
 DATA = Path(__file__).parents[1] / "data" / "static"

@@ -10,8 +10,8 @@ from scipy.optimize import brentq
 
 from ctr_dynamics.model.mesh import section_lengths
 from ctr_dynamics.model.model import Model
-from ctr_dynamics.model.scheme import RATES, make_scheme
 from ctr_dynamics.model.simulator import Simulator
+from ctr_dynamics.model.time_scheme import RATES, make_scheme
 
 L = 0.2
 

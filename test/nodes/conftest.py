@@ -17,14 +17,14 @@ from rclpy.parameter_client import AsyncParameterClient
 from rclpy.serialization import deserialize_message
 from std_srvs.srv import SetBool, Trigger
 
-from ctr_dynamics.messages import topics
-from ctr_dynamics.messages.cdr import decode_pose_stamped, decode_stamp
-from ctr_dynamics.messages.encode import encode_joint_state, encode_pose_stamped
-from ctr_dynamics.nodes import qos
-from ctr_dynamics.nodes.listener import Listener
-from ctr_dynamics.nodes.naming import message_class
-from ctr_dynamics.nodes.processes import ESTIMATOR, NodeProcess
+from ctr_dynamics.io.messages import topics
+from ctr_dynamics.io.messages.cdr import decode_pose_stamped, decode_stamp
+from ctr_dynamics.io.messages.encode import encode_joint_state, encode_pose_stamped
 from ctr_dynamics.robot import load_robot
+from ctr_dynamics.ros import qos
+from ctr_dynamics.ros.listener import Listener
+from ctr_dynamics.ros.topic_names import message_class
+from ctr_dynamics.runtime.processes import ESTIMATOR, NodeProcess
 
 PATIENCE_S = 120.0  # of every wait: nothing is asserted about how long anything takes
 BAGS = Path(__file__).parents[1] / "data" / "bags"

@@ -13,13 +13,13 @@ from rclpy.qos import ReliabilityPolicy
 from std_msgs.msg import Bool
 from std_srvs.srv import SetBool
 
-from ctr_dynamics.bagio.reader import open_bag
-from ctr_dynamics.messages import topics
-from ctr_dynamics.nodes.processes import DRIVER, ESTIMATOR, NodeProcess
-from ctr_dynamics.nodes.qos import profile
+from ctr_dynamics.io.bag_reader import open_bag
+from ctr_dynamics.io.messages import topics
 from ctr_dynamics.robot import load_robot, robot_to_yaml
+from ctr_dynamics.ros.qos import profile
+from ctr_dynamics.runtime.processes import DRIVER, ESTIMATOR, NodeProcess
 
-VIEW = "ctr_dynamics.nodes.view_node"
+VIEW = "ctr_dynamics.ros.view_node"
 pytestmark = pytest.mark.ros
 
 

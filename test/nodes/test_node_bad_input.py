@@ -6,7 +6,7 @@ import time
 import numpy as np
 import pytest
 
-from ctr_dynamics.messages import topics
+from ctr_dynamics.io.messages import topics
 
 pytestmark = pytest.mark.ros
 

@@ -4,11 +4,11 @@ import json
 
 import pytest
 
-from ctr_dynamics.bagio.reader import open_bag
-from ctr_dynamics.cli import demo as demo_file
+from ctr_dynamics.cli import demo_command as demo_file
 from ctr_dynamics.errors import InputError
-from ctr_dynamics.messages import topics
-from ctr_dynamics.nodes import processes
+from ctr_dynamics.io.bag_reader import open_bag
+from ctr_dynamics.io.messages import topics
+from ctr_dynamics.runtime import processes
 
 pytestmark = pytest.mark.ros
 
@@ -40,7 +40,7 @@ def test_an_unknown_robot_or_policy_is_refused_before_anything_starts(tmp_path, 
 
 
 def test_an_estimator_that_does_not_start_fails_the_demo(tmp_path, capfd, monkeypatch):
-    monkeypatch.setattr(processes, "ESTIMATOR", "ctr_dynamics.nodes.no_such_module")
+    monkeypatch.setattr(processes, "ESTIMATOR", "ctr_dynamics.ros.no_such_module")
     code, shown = run(capfd, output=tmp_path)
     assert code == 1
     assert "demo failed: the estimator did not start" in shown

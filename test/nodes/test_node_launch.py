@@ -7,8 +7,8 @@ from types import ModuleType, SimpleNamespace
 
 import pytest
 
-from ctr_dynamics.nodes.tables import DRIVER, VIEW
 from ctr_dynamics.parameters import PARAMETERS
+from ctr_dynamics.runtime.node_parameters import DRIVER, VIEW
 
 ROOT = Path(__file__).parents[2]
 KNOWN = {
@@ -45,7 +45,7 @@ def launch_file(monkeypatch):
         for name in names:
             setattr(stub, name, stand_in(name))
         monkeypatch.setitem(sys.modules, module, stub)
-    monkeypatch.delitem(sys.modules, "ctr_dynamics.launching", raising=False)
+    monkeypatch.delitem(sys.modules, "ctr_dynamics.ros.launch_files", raising=False)
 
     def load(name):
         path = ROOT / "launch" / f"{name}.launch.py"

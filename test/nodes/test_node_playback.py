@@ -3,15 +3,16 @@
 import numpy as np
 import pytest
 
-from ctr_dynamics.bagio.reader import open_bag
-from ctr_dynamics.bagio.writer import write_bag
 from ctr_dynamics.cli.main import main
 from ctr_dynamics.errors import InputError
-from ctr_dynamics.messages import topics
-from ctr_dynamics.messages.cdr import CdrError, decode_joint_state, decode_stamp
-from ctr_dynamics.messages.encode import encode_joint_state, encode_pose_stamped
-from ctr_dynamics.nodes.listener import Heard
-from ctr_dynamics.nodes.live_report import (
+from ctr_dynamics.io.bag_reader import open_bag
+from ctr_dynamics.io.bag_writer import write_bag
+from ctr_dynamics.io.messages import topics
+from ctr_dynamics.io.messages.cdr import CdrError, decode_joint_state, decode_stamp
+from ctr_dynamics.io.messages.encode import encode_joint_state, encode_pose_stamped
+from ctr_dynamics.robot import load_robot, robot_with
+from ctr_dynamics.ros.listener import Heard
+from ctr_dynamics.runtime.live_report import (
     Trace,
     compare,
     compare_truth,
@@ -21,8 +22,7 @@ from ctr_dynamics.nodes.live_report import (
     tracker_of,
     truth_of,
 )
-from ctr_dynamics.nodes.playback import load, pace, shifted
-from ctr_dynamics.robot import load_robot, robot_with
+from ctr_dynamics.runtime.playback import load, pace, shifted
 
 
 def test_shifting_moves_the_stamp_and_nothing_else():

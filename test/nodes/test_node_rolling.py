@@ -4,16 +4,16 @@ import threading
 
 import pytest
 
-from ctr_dynamics.bagio.reader import open_bag
 from ctr_dynamics.diagnosis.recording import read_recording
 from ctr_dynamics.errors import InputError
-from ctr_dynamics.estimation.outputs import WARN, Status
-from ctr_dynamics.messages import topics
-from ctr_dynamics.messages.cdr import decode_stamp
-from ctr_dynamics.messages.encode import encode_joint_state, encode_wrench_stamped
-from ctr_dynamics.nodes import rolling
-from ctr_dynamics.nodes.rolling import RollingRecording
+from ctr_dynamics.estimation.step_output import WARN, Status
+from ctr_dynamics.io.bag_reader import open_bag
+from ctr_dynamics.io.messages import topics
+from ctr_dynamics.io.messages.cdr import decode_stamp
+from ctr_dynamics.io.messages.encode import encode_joint_state, encode_wrench_stamped
 from ctr_dynamics.robot import load_robot
+from ctr_dynamics.runtime import ring_buffer_recording as rolling
+from ctr_dynamics.runtime.ring_buffer_recording import RollingRecording
 
 MS = 1_000_000
 S = 1_000 * MS

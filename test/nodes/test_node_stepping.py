@@ -8,9 +8,10 @@ from types import SimpleNamespace
 
 import pytest
 
-from ctr_dynamics.estimation.outputs import ERROR, OK, WARN
-from ctr_dynamics.nodes.diagnostics import clock_status, topics_status
-from ctr_dynamics.nodes.stepping import (
+from ctr_dynamics.estimation.step_output import ERROR, OK, WARN
+from ctr_dynamics.ros.diagnostics import clock_status, topics_status
+from ctr_dynamics.runtime.clock_offset import StampClock
+from ctr_dynamics.runtime.step_loop import (
     CATCH_UP_NS,
     INBOX_LIMIT,
     REHEARSAL_NS,
@@ -18,8 +19,7 @@ from ctr_dynamics.nodes.stepping import (
     STEP_NS,
     StepLoop,
 )
-from ctr_dynamics.nodes.timing import Histogram, StepTiming
-from ctr_dynamics.stamps import StampClock
+from ctr_dynamics.runtime.timing import Histogram, StepTiming
 
 MS = 1_000_000
 

@@ -6,7 +6,7 @@ import threading
 
 import pytest
 
-from ctr_dynamics.nodes.spinning import Stopped, apart, stop_on_signals
+from ctr_dynamics.ros.node_runner import Stopped, apart, stop_on_signals
 
 
 def test_work_apart_gives_its_result():

@@ -11,8 +11,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ctr_dynamics.report.figures import Panel, figure_svg, thinned
-from ctr_dynamics.report.page import Page, png
+from ctr_dynamics.reporting.figures import Panel, figure_svg, thinned
+from ctr_dynamics.reporting.page import Page, png
 
 NASTY = "</script><script>document.title='owned'</script><img src=x onerror=alert(1)>\"'&"
 

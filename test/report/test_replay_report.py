@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from ctr_dynamics.bagio.reader import open_bag
-from ctr_dynamics.bagio.writer import write_bag
 from ctr_dynamics.cli import main as cli
-from ctr_dynamics.messages import topics
-from ctr_dynamics.messages.encode import encode_pose_stamped
+from ctr_dynamics.io.bag_reader import open_bag
+from ctr_dynamics.io.bag_writer import write_bag
+from ctr_dynamics.io.messages import topics
+from ctr_dynamics.io.messages.encode import encode_pose_stamped
 
 BAGS = Path(__file__).parents[1] / "data" / "bags"
 HEADINGS = (

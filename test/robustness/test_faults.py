@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ctr_dynamics.messages import cdr, topics
-from ctr_dynamics.nodes.playback import load
+from ctr_dynamics.io.messages import cdr, topics
+from ctr_dynamics.runtime.playback import load
 
 ROOT = Path(__file__).parents[2]
 BAG = ROOT / "test" / "data" / "bags" / "clean_release.mcap"

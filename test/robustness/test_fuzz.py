@@ -65,8 +65,8 @@ def test_failures_are_counted(fuzz, tmp_path):
 
 
 def test_nothing_in_a_file_is_executed(tmp_path):
+    from ctr_dynamics.csv_import.column_layout import read_layout
     from ctr_dynamics.errors import InputError
-    from ctr_dynamics.importing.layout import read_layout
     from ctr_dynamics.parameters import read_parameter_file
     from ctr_dynamics.robot import load_robot
 

@@ -6,8 +6,8 @@ import numpy as np
 from model_cases import many_tubes
 from model_oracle import Oracle, rotation, turn
 
+from ctr_dynamics.kernels.snap_newton import make_work, residual
 from ctr_dynamics.model.model import Model
-from ctr_dynamics.snap.newton import make_work, residual
 from ctr_dynamics.snap.solver import SnapSolver
 
 EXAMPLE, START = "till2020_snap_example", 3.56

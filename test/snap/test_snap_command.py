@@ -8,9 +8,9 @@ import pytest
 import yaml
 from snap_cases import EXAMPLE
 
-from ctr_dynamics.bagio.info import inspect
 from ctr_dynamics.cli.main import main
 from ctr_dynamics.errors import InputError
+from ctr_dynamics.io.bag_info import inspect
 from ctr_dynamics.robot import load_robot, robot_to_dict
 from ctr_dynamics.snap.experiment import Plan, Trajectory, robot_for_snap, run
 

@@ -6,9 +6,9 @@ from model_cases import many_tubes
 
 from ctr_dynamics.errors import InputError
 from ctr_dynamics.model.model import Model
-from ctr_dynamics.model.scheme import make_scheme
 from ctr_dynamics.model.simulator import Inputs, Simulator
 from ctr_dynamics.model.statics import Statics
+from ctr_dynamics.model.time_scheme import make_scheme
 from ctr_dynamics.robot import load_robot, robot_with
 from ctr_dynamics.snap.solver import SnapSolver
 

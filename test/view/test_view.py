@@ -19,17 +19,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from ctr_dynamics.bagio.reader import open_bag
-from ctr_dynamics.bagio.replay import Player
 from ctr_dynamics.cli import main as cli
 from ctr_dynamics.estimation.estimator import Estimator
-from ctr_dynamics.estimation.rotations import matrix
-from ctr_dynamics.messages import topics
-from ctr_dynamics.messages.cdr import CdrError, decode_point_cloud
-from ctr_dynamics.messages.encode import encode_step
-from ctr_dynamics.messages.schemas import typestore
+from ctr_dynamics.io.bag_reader import open_bag
+from ctr_dynamics.io.messages import topics
+from ctr_dynamics.io.messages.cdr import CdrError, decode_point_cloud
+from ctr_dynamics.io.messages.encode import encode_step
+from ctr_dynamics.io.messages.schemas import typestore
+from ctr_dynamics.kernels.rotations import matrix
 from ctr_dynamics.parameters import Settings
 from ctr_dynamics.robot import load_robot
+from ctr_dynamics.runtime.replay import Player
 from ctr_dynamics.view.markers import CHI_95, MARKER_ARRAY, TUBES_TOPIC, ellipsoid, encode_tubes, tube_lines
 from ctr_dynamics.view.scene import Scene
 
@@ -246,18 +246,16 @@ def test_layouts_show_topics_that_exist():
 @pytest.mark.ros
 def test_node_draws_what_the_estimator_says(step, tmp_path):
     pytest.importorskip("rclpy")
-    from ctr_dynamics.nodes import qos
-    from ctr_dynamics.nodes.listener import Listener
-    from ctr_dynamics.nodes.naming import message_class
-    from ctr_dynamics.nodes.processes import NodeProcess
+    from ctr_dynamics.ros import qos
+    from ctr_dynamics.ros.listener import Listener
+    from ctr_dynamics.ros.topic_names import message_class
+    from ctr_dynamics.runtime.processes import NodeProcess
 
     _, messages = step
     domain = int(os.environ["ROS_DOMAIN_ID"])
     names = (topics.TIP_POSE, topics.BACKBONE_STATE)
     with (
-        NodeProcess(
-            "ctr_dynamics.nodes.view_node", {"rate_hz": 1000.0}, domain, tmp_path / "view.log"
-        ) as view,
+        NodeProcess("ctr_dynamics.ros.view_node", {"rate_hz": 1000.0}, domain, tmp_path / "view.log") as view,
         Listener(domain, [], name="test_view") as listener,
     ):
         pictures = []

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ctr_dynamics.bagio.writer import write_bag
-from ctr_dynamics.messages.encode import encode_joint_state, encode_pose_stamped, encode_wrench_stamped
-from ctr_dynamics.messages.topics import JOINT_STATES, TIP_LOAD, TRACKER_TIP
+from ctr_dynamics.io.bag_writer import write_bag
+from ctr_dynamics.io.messages.encode import encode_joint_state, encode_pose_stamped, encode_wrench_stamped
+from ctr_dynamics.io.messages.topics import JOINT_STATES, TIP_LOAD, TRACKER_TIP
 from ctr_dynamics.robot.schema import Robot
 
 from .motion import CUT_S, Motion

@@ -1,0 +1,294 @@
+"""The release test: a weight of 60 g hangs beyond the tip and is cut at 1 s while the tubes stand still. Costs, and errors in time and space."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ctr_dynamics.benchmarks.sweeps import sweep_cost
+from ctr_dynamics.model import trajectory
+from ctr_dynamics.model.model import Model
+from ctr_dynamics.model.simulator import Inputs, Simulator
+from ctr_dynamics.model.time_scheme import make_scheme
+from ctr_dynamics.robot import Robot, load_robot
+from ctr_dynamics.simulation import load_scenario
+from ctr_dynamics.simulation import simulate as run_scenario
+
+Floats = NDArray[np.float64]
+DT = 0.003
+ROUNDS = 3  # runs of which the fastest counts
+SCHEMES = ("backward_euler", "bdf2", "bdf_alpha", "trapezoid", "sdirk2", "sdirk3")
+
+
+@cache
+def release_robot() -> Robot:
+    """The robot of the test."""
+    return load_robot("till2020_tissue")
+
+
+@cache
+def _at_rest() -> tuple[Floats, Floats, Floats]:
+    """Angles (2,) rad and translations (2,) m of the tubes, and their rates."""
+    rest = release_robot().rest
+    return np.array(rest.alpha.value), np.array(rest.beta.value), np.zeros(2)
+
+
+@dataclass(frozen=True)
+class Release:
+    """Robot and load of the test: the weight's wrench (6,), and how much earlier than at 1 s it is cut (s)."""
+
+    wrench: Floats
+    early: float
+
+    @property
+    def events(self) -> tuple[float, float]:
+        """Times in s at which the load begins to fall and is gone."""
+        return 1.0 - self.early, 1.01 - self.early
+
+    @classmethod
+    def make(cls, cut: float) -> Release:
+        """The shipped scenario's weight on `till2020_tissue`, cut at `cut` s within 10 ms."""
+        scenario = load_scenario("release")
+        short = scenario.model_copy(update={"duration_s": 0.002})
+        return cls(run_scenario(short, release_robot()).wrench(0.0), 1.0 - cut)
+
+    def at(self, t: float) -> Inputs:
+        """Inputs at `t` s."""
+        wrench = min(max((1.01 - self.early - t) / 0.01, 0.0), 1.0) * self.wrench
+        alpha, beta, still = _at_rest()
+        return Inputs(alpha, still, beta, still, wrench[:3], wrench[3:])
+
+
+@dataclass(frozen=True)
+class Path:
+    """A simulated release: tips (steps + 1, 3) m, wall time in s, work of all steps; `failure` is empty when it went well."""
+
+    dt: float
+    tips: Floats
+    wall: float
+    solves: int
+    sweeps: int
+    jacobians: int
+    failure: str = ""
+
+    @property
+    def steps(self) -> int:
+        """Steps taken."""
+        return len(self.tips) - 1
+
+    @property
+    def realtime(self) -> float:
+        """Time simulated over time spent."""
+        return self.steps * self.dt / self.wall
+
+
+def compiled(test: Release, nodes: int, duration: float, tolerance: float) -> tuple[float, float]:
+    """The release at the default scheme in the compiled loop of :mod:`ctr_dynamics.model.trajectory`: real-time ratio and sweeps a step.
+
+    Inputs are sampled before the clock starts, as they are those of a bag or a scenario.
+    """
+    scheme = make_scheme("sdirk3", DT)
+    steps = round(duration / DT)
+    rows = sampled(test, DT, duration)
+    wall = np.inf
+    for _ in range(ROUNDS):
+        model = Model(release_robot(), nodes=nodes)
+        begin = time.perf_counter()
+        done = trajectory.run(model, scheme, model.parameters, rows, duration, tolerance=tolerance)
+        wall = min(wall, time.perf_counter() - begin)
+    return steps * DT / wall, done.sweeps / steps
+
+
+def sampled(test: Release, dt: float, duration: float, turn: Floats | None = None) -> trajectory.InputRows:
+    """Inputs of the release as :func:`trajectory.run <ctr_dynamics.model.trajectory.run>` asks for them with the default scheme, ``dt`` and
+    ``duration`` in s, both tubes turned by ``turn`` (2,) rad. They are sampled here, before a clock starts, as those of a bag are."""
+    known: dict[tuple[float, int], Floats] = {}
+    more = np.zeros(2) if turn is None else turn
+
+    def rows(times: Floats) -> Floats:
+        key = float(times[0]), len(times)
+        if key not in known:
+            found = [test.at(float(t)) for t in times]
+            known[key] = np.array(
+                [np.r_[x.alpha + more, x.alpha_rate, x.beta, x.force, x.torque] for x in found]
+            )
+        return known[key]
+
+    # as many as a run takes, or it would sample the last ones anew
+    count = int(np.floor(duration / dt + 1e-9))
+    for first in range(0, count, trajectory.CHUNK):
+        steps = np.arange(first, min(first + trajectory.CHUNK, count))
+        rows(((steps[:, None] + make_scheme("sdirk3", dt).times) * dt).ravel())
+    return rows
+
+
+def divided(test: Release, dt: float, nodes: int, duration: float, tolerance: float = 1e-7) -> Path:
+    """The release at the default scheme, the steps around the cut divided there."""
+    model = Model(release_robot(), nodes=nodes)
+    rows = sampled(test, dt, duration)
+    begin = time.perf_counter()
+    done = trajectory.run(
+        model, make_scheme("sdirk3", dt), model.parameters, rows, duration, tolerance=tolerance, events=test.events
+    )  # fmt: skip
+    wall = time.perf_counter() - begin
+    return Path(dt, done.tip[:, :3], wall, 3 * (len(done.t) - 1), done.sweeps, 0, done.failure)
+
+
+def run(test: Release, scheme: str, dt: float, nodes: int, duration: float, tolerance: float = 1e-7) -> Path:
+    """Simulate the release at a fixed step, from Python one step at a time."""
+    simulator = Simulator(Model(release_robot(), nodes=nodes), make_scheme(scheme, dt), tolerance=tolerance)
+    state = simulator.rest(test.at(0.0))
+    tips = [state.nodes[-1, :3].copy()]
+    sweeps = jacobians = 0
+    failure = ""
+    steps = round(duration / dt)
+    begin = time.perf_counter()
+    for k in range(steps):
+        result = simulator.step(state, k * dt, test.at)
+        if not result.ok:
+            failure = f"step at {k * dt:.4f} s: {result.reason}"
+            break
+        sweeps += result.sweeps
+        jacobians += result.jacobians
+        tips.append(state.nodes[-1, :3].copy())
+    wall = time.perf_counter() - begin
+    return Path(
+        dt, np.array(tips), wall, simulator.scheme.stages * (len(tips) - 1), sweeps, jacobians, failure
+    )
+
+
+def rms_difference(path: Path, reference: Path, since: float) -> float | None:
+    """3-D rms (m) between two runs from `since` s on, at the coarser steps; None if one of them failed."""
+    if path.failure or reference.failure:
+        return None
+    ratio = round(path.dt / reference.dt)
+    other = reference.tips[::ratio]
+    count = min(len(path.tips), len(other))
+    first = round(since / path.dt)
+    return _rms(path.tips[first:count] - other[first:count])
+
+
+def _rms(differences: Floats) -> float:
+    """3-D rms of (K, 3)."""
+    return float(np.sqrt(np.mean(np.sum(differences**2, axis=1))))
+
+
+def work(
+    test: Release, nodes_list: tuple[int, ...], duration: float, tolerance: float
+) -> list[dict[str, Any]]:
+    """Sweeps a solve and a step, and the cost of a step in plain sweeps of the same nodes, at the default scheme."""
+    rows = []
+    for nodes in nodes_list:
+        run(test, "sdirk3", DT, nodes, 0.03, tolerance)
+        path = min(
+            (run(test, "sdirk3", DT, nodes, duration, tolerance) for _ in range(ROUNDS)), key=lambda p: p.wall
+        )
+        plain = sweep_cost(Model(release_robot(), nodes=nodes), (), max(3, 4000 // nodes))
+        step = path.wall / path.steps
+        compiled_ratio, _ = compiled(test, nodes, duration, tolerance)
+        rows.append(
+            {
+                "nodes": nodes,
+                "tolerance": tolerance,
+                "steps": path.steps,
+                "sweeps_per_solve": path.sweeps / path.solves,
+                "sweeps_per_step": path.sweeps / path.steps,
+                "jacobians_per_step": path.jacobians / path.steps,
+                "step_us": 1e6 * step,
+                "plain_sweep_us": 1e6 * plain,
+                "step_ratio_to_plain_sweep": step / plain,
+                "realtime_ratio": path.realtime,
+                "compiled_realtime_ratio": compiled_ratio,
+                "failure": path.failure,
+            }
+        )
+    return rows
+
+
+def time_error(
+    test: Release, nodes: int, duration: float, reference: tuple[str, float], since: float
+) -> dict[str, Any]:
+    """Error of every scheme at 3 ms against the scheme and step (s) `reference` on the same nodes; and of the default scheme over the step, with
+    steps across the cut as they fall and divided there."""
+    scheme, fine_dt = reference
+    fine = run(test, scheme, fine_dt, nodes, duration)
+    steps = []
+    for count in (1, 2, 3):
+        dt = DT / count
+        steps.append(
+            {
+                "dt_s": dt,
+                "error_m": rms_difference(run(test, "sdirk3", dt, nodes, duration), fine, since),
+                "divided_error_m": rms_difference(divided(test, dt, nodes, duration), fine, since),
+            }
+        )
+    rows = []
+    for name in SCHEMES:
+        path = run(test, name, DT, nodes, duration)
+        rows.append(
+            {
+                "scheme": name,
+                "error_m": rms_difference(path, fine, since),
+                "realtime_ratio": path.realtime,
+                "failure": path.failure or fine.failure,
+            }
+        )
+    return {"nodes": nodes, "reference": {"scheme": scheme, "dt_s": fine_dt}, "schemes": rows, "steps": steps}
+
+
+def grid(
+    test: Release, dts: tuple[float, ...], nodes_list: tuple[int, ...], duration: float
+) -> list[dict[str, Any]]:
+    """The paper's Figure 13: real-time ratio over time step and node spacing, at the default scheme and tolerance of the estimator."""
+    reach = tip_length()
+    rows = []
+    for nodes in nodes_list:
+        for dt in dts:
+            path = run(test, "sdirk3", dt, nodes, duration, 1e-4)
+            rows.append(
+                {
+                    "nodes": nodes,
+                    "spacing_m": reach / (nodes - 1),
+                    "dt_s": dt,
+                    "realtime_ratio": path.realtime,
+                    "failure": path.failure,
+                }
+            )
+    return rows
+
+
+def space_error(test: Release, nodes_list: tuple[int, ...], fine: int, duration: float) -> dict[str, Any]:
+    """The paper's Figure 14: error over node spacing at 3 ms of fourth-order Runge-Kutta and of Euler's method, against `fine` nodes of the former.
+
+    The paper's own reference is a spacing of 0.02 mm; that of `fine` nodes lies as close to it as rounding allows.
+    """
+    from ctr_dynamics.benchmarks.euler import euler_tips  # which needs this module
+
+    reach = tip_length()
+    reference = run(test, "sdirk3", DT, fine, duration)
+    rows = []
+    for nodes in nodes_list:
+        path = run(test, "sdirk3", DT, nodes, duration)
+        euler = euler_tips(test, nodes, duration)
+        rows.append(
+            {
+                "nodes": nodes,
+                "spacing_m": reach / (nodes - 1),
+                "error_m": rms_difference(path, reference, 0.0),
+                "euler_error_m": None if euler is None else _rms(euler - reference.tips[: len(euler)]),
+                "realtime_ratio": path.realtime,
+                "failure": path.failure or reference.failure,
+            }
+        )
+    return {"reference_nodes": fine, "reference_spacing_m": reach / (fine - 1), "rows": rows}
+
+
+def tip_length() -> float:
+    """Length of the robot beyond the plate in m."""
+    robot = release_robot()
+    return float(robot.lengths[0] + robot.rest.beta.value[0])

@@ -1,0 +1,202 @@
+"""`ctr-dynamics demo`: estimator node and driver as two processes over real DDS on this machine."""
+
+from __future__ import annotations
+
+import json
+import math
+import tempfile
+import time
+from collections.abc import Sequence
+from importlib import resources
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.table import Table
+
+from ctr_dynamics.errors import InputError
+from ctr_dynamics.io.atomic_files import atomic_file, output_folder
+from ctr_dynamics.io.bag_writer import write_bag
+from ctr_dynamics.io.messages import topics
+from ctr_dynamics.io.messages.cdr import decode_stamp
+from ctr_dynamics.parameters import Settings
+from ctr_dynamics.robot import load_robot
+from ctr_dynamics.runtime import live_report
+from ctr_dynamics.runtime.playback import load
+
+if TYPE_CHECKING:
+    from ctr_dynamics.ros.listener import Listener
+    from ctr_dynamics.runtime.processes import NodeProcess
+
+SHIPPED = "clean_release"
+SHORTEST_S = 2.0
+"""Of a run, below which its errors say nothing: the start is left out."""
+START_S = 900.0
+"""Longest wait for the estimator: the first start compiles every kernel."""
+
+
+def demo(
+    bag: Annotated[Path | None, typer.Option(help="Bag to play; default: the shipped one.")] = None,
+    truth: Annotated[Path | None, typer.Option(help="Truth of that bag (.npz), if there is one.")] = None,
+    output: Annotated[Path, typer.Option(help="Folder for picture, figures and recorded outputs.")] = Path(
+        "demo_output"
+    ),
+    robot: Annotated[str, typer.Option(help="Robot name or file.")] = "till2020_tissue",
+    policy: Annotated[str, typer.Option(help="output.policy: predict or wait.")] = "predict",
+    duration: Annotated[float, typer.Option(help="Seconds of the bag to play; 0: all.")] = 0.0,
+) -> int:
+    """Play a bag as live topics to the estimator node and show how well and how punctually it follows."""
+    console = Console()
+    try:
+        from ctr_dynamics.ros.listener import Listener
+        from ctr_dynamics.runtime.processes import DRIVER, ESTIMATOR, NodeProcess, free_domain
+    except ImportError as error:
+        raise InputError(
+            f"the demo needs rclpy ({error})", do="source ROS 2 or pip install 'ctr_dynamics[ros]'"
+        ) from None
+    nominal = live_report.nominal_tracker(load_robot(robot))
+    Settings({"output.policy": policy})
+    if not (duration == 0.0 or SHORTEST_S <= duration < math.inf):
+        raise InputError(f"--duration is {duration:g} s", do=f"write {SHORTEST_S:g} s or more, or 0 for all")
+    if bag is None:
+        bag, truth = shipped_file(f"{SHIPPED}.mcap"), truth or shipped_truth()
+    candidates = live_report.truth_of(truth) if truth is not None else []
+    messages = load(bag, 0.0, duration)
+    span_s = (messages[-1].log_ns - messages[0].log_ns) * 1e-9
+    if span_s < 0.9 * SHORTEST_S:
+        raise InputError(
+            f"holds {span_s:.2f} s, {SHORTEST_S:g} s are needed", do="give a longer bag", where=str(bag)
+        )
+    output_folder(output)
+    domain = free_domain()
+    with tempfile.TemporaryDirectory(prefix="ctr_demo_") as name:
+        folder = Path(name)
+        settings = {"robot": robot, "output.policy": policy, "timing_report": str(folder / "timing.json")}
+        heard_topics = [topic.name for topic in topics.OUTPUTS]
+        with (
+            NodeProcess(ESTIMATOR, settings, domain, folder / "estimator.log") as estimator,
+            Listener(domain, heard_topics, depth=5000) as listener,
+        ):
+            with console.status("starting the estimator (its first start compiles for some minutes)"):
+                ready = listener.wait_for(lambda: listener.matched() or estimator.code is not None, START_S)
+            if not ready or estimator.code is not None:
+                return failed(console, "the estimator did not start", estimator.output())
+            console.print(f"estimator is up on ROS domain {domain}; playing {bag} for {span_s:.1f} s")
+            played = {"bag": str(bag), "duration_s": duration, "report": str(folder / "driver.json")}
+            with NodeProcess(DRIVER, played, domain, folder / "driver.log") as driver:
+                follow(console, driver, listener, span_s)
+                if driver.code != 0:
+                    return failed(console, "the driver failed", driver.output())
+            time.sleep(0.3)
+            code, log = estimator.stop(), estimator.output()
+        if code != 0:
+            return failed(console, f"the estimator ended with code {code}", log)
+        timing = json.loads((folder / "timing.json").read_text(encoding="utf-8"))
+        shift = json.loads((folder / "driver.json").read_text(encoding="utf-8"))
+    heard = listener.heard
+    if not heard[topics.TIP_POSE] or not heard[topics.TIP_POSE_PREDICTED]:
+        return failed(
+            console,
+            f"no tip pose came in {span_s:.1f} s ({len(heard[topics.VALID])} messages on {topics.VALID})",
+            log,
+        )
+    record(output / "outputs.mcap", listener)
+    bag_start_ns = min(decode_stamp(m.data) for m in messages if m.topic == topics.JOINT_STATES)
+    start_ns = bag_start_ns + shift["shift_ns"]
+    alone = live_report.trace_of(heard[topics.TIP_POSE_PREDICTED], start_ns)
+    fused = live_report.trace_of(heard[topics.TIP_POSE], start_ns)
+    tracker = live_report.tracker_of(bag, bag_start_ns, nominal)
+    comparisons = live_report.comparisons(tracker, candidates, alone, fused)
+    if not comparisons:
+        console.print("neither tracker poses nor a truth fall into the run: nothing to compare it with")
+    show(console, comparisons, timing, len(fused.t))
+    shapes = live_report.backbones(heard[topics.BACKBONE_STATE], start_ns, 8)
+    live_report.draw(output / "demo.png", shapes, alone, fused, tracker, f"{bag.name}, robot {robot}, live")
+    figures = {"comparisons": [vars(c) for c in comparisons], "timing": timing, "driver": shift}
+    with atomic_file(output / "demo.json") as part:
+        part.write_text(json.dumps(figures, indent=1), encoding="utf-8")
+    console.print(f"picture, figures and recorded outputs are in {output}")
+    return 0
+
+
+def shipped_file(name: str) -> Path:
+    """A file of the package's `data/bags`.
+
+    Raises:
+        InputError: it is not there.
+    """
+    path = Path(str(resources.files("ctr_dynamics") / "data" / "bags" / name))
+    if not path.is_file():
+        raise InputError("the shipped bag is missing", do="give one with --bag", where=str(path))
+    return path
+
+
+def shipped_truth() -> Path | None:
+    """The truth of the shipped bag, if it is shipped too."""
+    try:
+        return shipped_file(f"{SHIPPED}.npz")
+    except InputError:
+        return None
+
+
+def follow(console: Console, driver: NodeProcess, listener: Listener, span_s: float) -> None:
+    """Show the progress until the driver has ended."""
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TextColumn("{task.percentage:3.0f}%"),
+        TimeElapsedColumn(),
+        TextColumn("{task.fields[state]}"),
+    )
+    with Progress(*columns, console=console) as progress:
+        task = progress.add_task("playing", total=span_s, state="waiting for the first step")
+        while driver.code is None:
+            steps = listener.count(topics.VALID)
+            valid = listener.count(topics.TIP_POSE)
+            state = f"{steps} steps, {valid} valid" if steps else "waiting for the first step"
+            progress.update(task, completed=min(steps * topics.STEP_NS * 1e-9, span_s), state=state)
+            time.sleep(0.1)
+
+
+def failed(console: Console, what: str, log: str) -> int:
+    """Say what went wrong, with the end of the log; returns the exit code."""
+    console.print(f"demo failed: {what}", style="bold red", highlight=False)
+    console.print(log, markup=False, highlight=False)
+    return 1
+
+
+def record(file: Path, listener: Listener) -> None:
+    """Write what was heard as a bag; log time is the moment of arrival."""
+    messages = [(m.arrival_ns, topic, m.data) for topic, heard in listener.heard.items() for m in heard]
+    with write_bag(file, {"source": "ctr-dynamics demo"}) as writer:
+        for arrival_ns, topic, data in sorted(messages):
+            writer.write(topic, arrival_ns, data)
+
+
+def show(
+    console: Console, comparisons: Sequence[live_report.Comparison], timing: dict[str, Any], published: int
+) -> None:
+    """The final tables: tip errors in mm, then punctuality."""
+    if comparisons:
+        errors = Table(title="tip error, 3-D (mm)")
+        errors.add_column("run")
+        for c in comparisons:
+            errors.add_column(f"{c.reference}: rms", justify="right")
+            errors.add_column("max", justify="right")
+        for run in ("alone", "fused"):
+            values = [getattr(c, f"{run}_{kind}") for c in comparisons for kind in ("rms", "max")]
+            errors.add_row("model alone" if run == "alone" else "fused", *(f"{1e3 * v:.2f}" for v in values))
+        console.print(errors)
+    steps = Table(title=f"steps of 3 ms, policy {timing['policy']}")
+    for name in ("", "p50 (ms)", "p99 (ms)", "max (ms)"):
+        steps.add_column(name, justify="right" if name else "left")
+    for label, key in (("computing a step", "step_ms"), ("published after it was due", "lateness_ms")):
+        steps.add_row(label, *(f"{timing[key][part]:.2f}" for part in ("p50", "p99", "max")))
+    console.print(steps)
+    console.print(
+        f"{published} valid steps heard. Of {timing['steps']} published, {timing['late_over_3ms']} were more "
+        f"than 3 ms late, {timing['late_over_20ms']} more than 20 ms; {timing['skipped']} were skipped; "
+        f"{timing['start']['steps']} fell into the start."
+    )

@@ -1,0 +1,93 @@
+"""`ctr-dynamics info`: what is in a bag, and its rates, gaps, clock and unit problems."""
+
+from __future__ import annotations
+
+import json
+from datetime import datetime, timezone
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from ctr_dynamics.io.bag_info import BagReport, TopicReport, inspect
+from ctr_dynamics.runtime.replay import plain
+
+
+def _cell(value: float | None, form: str) -> str:
+    return "-" if value is None else format(value, form)
+
+
+def _topic_row(topic: TopicReport) -> tuple[str, ...]:
+    offset = topic.log_minus_stamp_s
+    return (
+        topic.name,
+        topic.ros_type,
+        str(topic.messages),
+        _cell(topic.rate_hz, ".1f"),
+        _cell(topic.longest_gap_s, ".3f"),
+        _cell(topic.first_s, ".3f"),
+        _cell(topic.last_s, ".3f"),
+        _cell(offset["median"] * 1e3 if offset else None, ".1f"),
+        ", ".join(frame or "(empty)" for frame in topic.frames) or "-",
+    )
+
+
+_HEAD = ("topic", "type", "messages", "Hz", "longest gap s", "first s", "last s", "log - stamp ms", "frame")
+
+
+def _text(report: BagReport) -> str:
+    """The report as plain text."""
+    try:
+        start = datetime.fromtimestamp(report.start_ns * 1e-9, tz=timezone.utc).isoformat(
+            timespec="milliseconds"
+        )
+    except (OverflowError, ValueError, OSError):
+        start = f"{report.start_ns} ns"
+    lines = [f"bag       {report.bag}"]
+    for file in report.files:
+        state = "" if file["complete"] else ", not closed properly"
+        lines.append(
+            f"file      {file['name']}, {file['bytes']} bytes, written by {file['library'] or '?'}{state}"
+        )
+    lines += [f"start     {start}", f"duration  {report.duration_s:.3f} s", ""]
+    rows = [_HEAD, *(_topic_row(topic) for topic in report.topics)]
+    widths = [max(len(row[i]) for row in rows) for i in range(len(_HEAD))]
+    numeric = {2, 3, 4, 5, 6, 7}
+    for row in rows:
+        cells = (
+            f"{cell:>{width}}" if i in numeric else f"{cell:<{width}}"
+            for i, (cell, width) in enumerate(zip(row, widths, strict=True))
+        )
+        lines.append("  ".join(cells).rstrip())
+    for topic in report.topics:
+        joints = topic.values.get("joints", {})
+        for name, extent in joints.items():
+            unit = "m" if name.endswith("_translation") else "rad"
+            low, high = _cell(extent["min"], ".4f"), _cell(extent["max"], ".4f")
+            lines.append(f"{'' if name != next(iter(joints)) else chr(10)}{name}: {low} to {high} {unit}")
+    if report.metadata:
+        lines += ["", "metadata"]
+        lines += [f"  {key}: {value[:100]}" for key, value in report.metadata.items()]
+    lines.append("")
+    if not report.problems:
+        lines.append("no problems found")
+    for finding in report.problems:
+        where = f"{finding.topic}: " if finding.topic else ""
+        lines.append(f"{finding.level}: {where}{finding.text}")
+    return "\n".join(lines)
+
+
+def info(
+    bag: Annotated[Path, typer.Argument(metavar="BAG", help="An .mcap file, or a folder with one.")],
+    as_json: Annotated[bool, typer.Option("--json", help="Print the report as JSON.")] = False,
+) -> int:
+    """Say what is in a bag: topics, rates, gaps, clock and unit problems.
+
+    Exit code 0 whatever is found, 2 when the file is not a bag.
+    """
+    report = inspect(bag)
+    if as_json:
+        print(json.dumps(plain(report.to_dict()), indent=1, allow_nan=False, ensure_ascii=False))
+    else:
+        print(_text(report))
+    return 0

@@ -1,0 +1,76 @@
+"""`ctr-dynamics statics`: static shapes for a table of actuator positions."""
+
+from __future__ import annotations
+
+import csv
+import sys
+from collections import Counter
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from ctr_dynamics.errors import InputError
+from ctr_dynamics.io.atomic_files import atomic_file, check_targets
+from ctr_dynamics.model.model import Model
+from ctr_dynamics.model.pose_table import output_cells, output_header, read_poses, solve_poses
+from ctr_dynamics.robot import load_robot
+
+SHOWN = 20  # failed rows named one by one
+
+
+def statics(
+    robot: Annotated[
+        str, typer.Option("--robot", metavar="NAME_OR_FILE", help="A shipped robot or a robot file.")
+    ],
+    poses: Annotated[
+        Path,
+        typer.Option(
+            "--poses",
+            metavar="POSES.csv",
+            help="Columns beta1,..,alpha1,..[,Fx,Fy,Fz][,psiL1,..] in m, rad, N.",
+        ),
+    ],
+    output: Annotated[
+        Path, typer.Option("--output", metavar="OUT.csv", help="Table to write, one row for each pose.")
+    ],
+    nodes: Annotated[
+        int, typer.Option("--nodes", metavar="N", help="Nodes from base plate to tip, 8 to 1000.")
+    ] = 100,
+) -> int:
+    """Solve the static model for a table of actuator positions.
+
+    Columns are matched by name. Fx,Fy,Fz is a force on tube 1's tip in the base frame; psiL1,.. are end
+    angles that choose the branch where a pose has several stable shapes. Exit code 1 when a row failed or is
+    invalid.
+    """
+    if not 8 <= nodes <= 1000:
+        raise InputError(f"--nodes {nodes} is outside 8 to 1000", do="100 is accurate to a micrometre")
+    check_targets({"output": output}, {"table of poses": poses, "robot file": robot})
+    model = Model(load_robot(robot), nodes=nodes)
+    table, spare = read_poses(poses, model)
+    if spare:
+        print(f"ctr-dynamics: note: columns not read: {', '.join(spare)}", file=sys.stderr)
+    counts: Counter[str] = Counter()
+    failed = []
+    with atomic_file(output) as temporary, temporary.open("w", newline="", encoding="utf-8") as stream:
+        writer = csv.writer(stream, lineterminator="\n")
+        writer.writerow(output_header(model.n))
+        for row in solve_poses(model, table):
+            writer.writerow(output_cells(row, model.n))
+            counts[row.status] += 1
+            if row.reason:
+                failed.append(row)
+    for row in failed[:SHOWN]:
+        print(f"ctr-dynamics: line {row.line}: {row.status}: {row.reason}", file=sys.stderr)
+    if len(failed) > SHOWN:
+        print(f"ctr-dynamics: and {len(failed) - SHOWN} more rows failed", file=sys.stderr)
+    print(
+        ", ".join(
+            f"{counts[status]} {status}"
+            for status in ("ok", "unstable", "failed", "invalid")
+            if counts[status]
+        )
+    )
+    print(f"output  {output}")
+    return 1 if failed else 0

@@ -1,0 +1,96 @@
+"""Messages on their way in: numbers that the estimator can use, or why it cannot."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ctr_dynamics.effects.setup import Setup
+from ctr_dynamics.io.messages.topics import accepts_frame
+from ctr_dynamics.sensing.interpolation import finite, joint_order
+
+Floats = NDArray[np.float64]
+UNIT = 1e-3  # by which a quaternion's norm may miss one without a word
+
+
+class Unusable(Exception):
+    """A message that is left out: ``kind`` as the diagnostics count it, ``text`` with value, limit and what to do."""
+
+    def __init__(self, kind: str, text: str) -> None:
+        super().__init__(text)
+        self.kind, self.text = kind, text
+
+
+def joint_values(setup: Setup, stamp_ns: int, names: Sequence[str], positions: Sequence[float]) -> Floats:
+    """(2 N,) alpha in rad and beta in m of every tube from a joint state's lists, with the robot file's gains and offsets.
+
+    Raises:
+        Unusable: joints are missing or double, numbers are missing or not finite, or the robot cannot be there.
+    """
+    n = setup.n
+    order = joint_order(tuple(names), n)
+    if isinstance(order, str):
+        raise Unusable("names", order)
+    if len(positions) < len(names):
+        raise Unusable(
+            "positions", f"joint state has {len(positions)} positions for {len(names)} names; give one each"
+        )
+    value = np.array([positions[i] for i in order], dtype=float)
+    if not finite(value.tolist()):
+        raise Unusable(
+            "not finite", f"joint state at {stamp_ns} ns holds a value that is not finite; it was left out"
+        )
+    value[:n] = setup.gain * value[:n] + setup.offset
+    value[n:] += setup.beta_offset
+    numbers = value.tolist()
+    reason = setup.robot.actuator_problem(numbers[n:], numbers[:n])
+    if reason:
+        raise Unusable("out of range", f"{reason}; the joint state was left out")
+    return value
+
+
+def pose_values(
+    stamp_ns: int, position: Sequence[float], quaternion_xyzw: Sequence[float], frame_id: str, frame: str
+) -> tuple[Floats, Floats, float]:
+    """Position (3,) m, unit quaternion (4,) wxyz, and the norm that it had; ``frame``: the one that is expected.
+
+    Raises:
+        Unusable: another frame, numbers that are not finite, or no unit quaternion.
+    """
+    if not accepts_frame(frame_id, frame):
+        raise Unusable(
+            "other frame",
+            f"pose in frame '{frame_id}', expected '{frame}'; register the tracker or rename its frame",
+        )
+    if not (finite(position) and finite(quaternion_xyzw)):
+        raise Unusable(
+            "not finite", f"pose at {stamp_ns} ns holds a value that is not finite; it was left out"
+        )
+    x, y, z, w = quaternion_xyzw
+    norm = math.sqrt(x * x + y * y + z * z + w * w)
+    if not 0.9 <= norm <= 1.1:
+        raise Unusable(
+            "quaternion",
+            f"norm {norm:.3g} is outside 0.9 to 1.1; send unit quaternions; the pose was left out",
+        )
+    return np.array(position, dtype=float), np.array([w, x, y, z]) / norm, norm
+
+
+def wrench_values(
+    stamp_ns: int, force: Sequence[float], torque: Sequence[float], frame_id: str, frame: str
+) -> Floats:
+    """(6,) force in N and torque in N m; ``frame``: the one that is expected.
+
+    Raises:
+        Unusable: another frame, or numbers that are not finite.
+    """
+    if not accepts_frame(frame_id, frame):
+        raise Unusable("other frame", f"load in frame '{frame_id}', expected '{frame}'; send it in base axes")
+    if not (finite(force) and finite(torque)):
+        raise Unusable(
+            "not finite", f"load at {stamp_ns} ns holds a value that is not finite; it was left out"
+        )
+    return np.array([*force, *torque], dtype=float)

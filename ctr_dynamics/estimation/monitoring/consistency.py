@@ -1,0 +1,178 @@
+"""Misfit monitor: does the filter's picture of the robot still hold? Windowed NIS, CUSUM and whiteness of the innovations. No clock, no ROS.
+
+The limits are set by simulated white innovations (benchmarks/misfit_limits.py): a consistent filter at 40 Hz alarms less than once in ten hours.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ctr_dynamics.estimation.monitoring.likely_causes import Cause, Regression
+from ctr_dynamics.estimation.step_output import OK, WARN, Innovation, Status
+
+Floats = NDArray[np.float64]
+
+LAGS = 8  # of the autocorrelation, in samples: 0.2 s at 40 Hz
+EVERY = 20  # samples between looks at the autocorrelation
+FEWEST = 80  # samples in the window before anything but the CUSUM is judged
+
+
+@dataclass(frozen=True)
+class MisfitLimits:
+    """When to alarm.
+
+    Attributes:
+        window: s. nis: mean NIS per degree of freedom over the window. slack: excess NIS per degree of freedom that the CUSUM lets pass.
+        cusum: its limit, in units of NIS. whiteness: Ljung-Box statistic over the window per degree of freedom.
+    """
+
+    window: float = 10.0
+    nis: float = 1.3
+    slack: float = 0.5
+    cusum: float = 60.0
+    whiteness: float = 2.5
+
+
+def ljung_box(white: Floats, lags: int = LAGS) -> float:
+    """Ljung-Box statistic of ``white`` (k, axes) over ``lags``, per degree of freedom: near 1 for white innovations.
+
+    Ljung and Box, Biometrika 65 (1978), without removing the mean, for a bias is a misfit too; and innovations smaller than predicted are
+    related to what was predicted: they are no misfit, however they are correlated.
+    """
+    k, axes = white.shape
+    size = np.maximum(np.einsum("ij,ij->j", white, white), k)
+    rho = np.array([np.einsum("ij,ij->j", white[lag:], white[:-lag]) for lag in range(1, lags + 1)])
+    rho /= size
+    weight = k * (k + 2.0) / (k - np.arange(1, lags + 1))
+    return float(weight @ np.sum(rho**2, axis=1)) / (lags * axes)
+
+
+class MisfitMonitor:
+    """Fed once per tracker sample that reached the gate.
+
+    Attributes:
+        nis, cusum, whiteness: present values; NaN while there are too few samples. alarm: whether one of them was beyond its limit within the
+        last window. alarms: how often it rose.
+    """
+
+    def __init__(self, limits: MisfitLimits | None = None, noise: float = 0.0) -> None:
+        self.limits = limits or MisfitLimits()
+        self.alarms = 0
+        self._regression = Regression(self.limits.window, noise)
+        self.clear()
+
+    def clear(self) -> None:
+        """Begin anew; the count of alarms stays."""
+        self.nis = self.whiteness = math.nan
+        self.cusum = 0.0
+        self.alarm = False
+        self._beyond: tuple[float, str] | None = None  # time and words of the last value beyond its limit
+        self._samples: deque[tuple[float, float, int, Floats]] = deque()  # time, NIS, dof, whitened
+        self._nis, self._dof, self._count = 0.0, 0, 0
+        self._regression.clear()
+        self._causes: tuple[int, list[Cause]] | None = None
+
+    def add(self, innovation: Innovation) -> None:
+        """Take in a sample; one without degrees of freedom is passed over."""
+        if not innovation.dof or innovation.white is None:
+            return
+        time = innovation.stamp_ns * 1e-9
+        if self._samples and abs(time - self._samples[-1][0]) > self.limits.window:
+            self.clear()  # nothing links what was before such a gap
+        nis = min(innovation.nis, 1e6)
+        self._samples.append((time, nis, innovation.dof, innovation.white))
+        self._nis += nis
+        self._dof += innovation.dof
+        while time - self._samples[0][0] > self.limits.window:
+            _, old, dof, _ = self._samples.popleft()
+            self._nis -= old
+            self._dof -= dof
+        self._count += 1
+        if innovation.moment is not None:
+            self._regression.add(time, innovation.moment)
+        self._judge(time, nis, innovation.dof)
+
+    def _judge(self, time: float, nis: float, dof: int) -> None:
+        limits = self.limits
+        # held below twice the limit, so that it comes back within seconds once the filter is consistent again
+        self.cusum = min(max(0.0, self.cusum + nis - dof * (1.0 + limits.slack)), 2.0 * limits.cusum)
+        words = []
+        if self.cusum > limits.cusum:
+            words.append(f"CUSUM of NIS {self.cusum:.0f}, limit {limits.cusum:g}")
+        if len(self._samples) >= FEWEST:
+            if self._count % EVERY == 0:
+                self._nis = sum(sample[1] for sample in self._samples)  # no rounding piles up
+                measured = np.array([sample[3] for sample in self._samples])
+                self.whiteness = ljung_box(measured[:, np.isfinite(measured).all(axis=0)])
+            self.nis = self._nis / self._dof
+            # a window that is not full yet scatters more
+            limit = max(limits.nis, 1.0 + 6.0 * math.sqrt(2.0 / self._dof))
+            if self.nis > limit:
+                words.append(
+                    f"mean NIS {self.nis:.2f} per degree of freedom over {limits.window:g} s, limit {limit:.2f}"
+                )
+            if self.whiteness > limits.whiteness:
+                words.append(
+                    f"autocorrelation of the innovations {self.whiteness:.1f}, limit {limits.whiteness:g}"
+                )
+        if words:
+            self._beyond = (time, "; ".join(words))
+        was, self.alarm = (
+            self.alarm,
+            self._beyond is not None and time - self._beyond[0] <= limits.window,
+        )
+        self.alarms += self.alarm and not was
+
+    def causes(self) -> list[Cause]:
+        """Likeliest causes of the residual that the model alone leaves at present, likeliest first."""
+        if self._causes is None or self._causes[0] != self._count:
+            self._causes = (self._count, self._regression.causes())
+        return self._causes[1]
+
+    def status(self) -> Status:
+        """The monitor's line of diagnostics."""
+        limits = self.limits
+
+        def shown(value: float) -> str:
+            return f"{value:.2f}" if math.isfinite(value) else "too few samples"
+
+        values = {
+            f"nis per dof, last {limits.window:g} s": shown(self.nis),
+            "cusum of nis": f"{self.cusum:.1f}",
+            "autocorrelation": shown(self.whiteness),
+            "alarms": str(self.alarms),
+        }
+        if not self.alarm:
+            return Status(
+                "misfit", OK, "innovations as expected" if self._samples else "no samples yet", values
+            )
+        assert self._beyond is not None
+        causes = self.causes()
+        for number, cause in enumerate(causes, 1):
+            added = ", on top of the first" if cause.added else ""
+            values[f"cause {number}"] = f"{cause.effect} ({100 * cause.explained:.0f} % explained{added})"
+        if causes:
+            which = "likeliest causes: " + ", ".join(cause.effect for cause in causes)
+        else:
+            which = "no cause of the list explains it"
+        return Status("misfit", WARN, f"{self._beyond[1]}; {which}", values)
+
+
+def misfit_monitor(settings: Mapping[str, Any], noise: float) -> MisfitMonitor:
+    """The monitor of the parameter table's values; ``noise`` of the tracker's position, m per axis."""
+    names = {
+        "window": "window_s",
+        "nis": "nis_limit",
+        "slack": "cusum_slack",
+        "cusum": "cusum_limit",
+        "whiteness": "whiteness_limit",
+    }
+    limits = MisfitLimits(**{field: float(settings[f"misfit.{name}"]) for field, name in names.items()})
+    return MisfitMonitor(limits, noise)

@@ -1,0 +1,318 @@
+"""Checks of the numbers in the input topics: units, signs, names, frames, NaN, quaternions."""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any, Literal, Protocol
+
+from ctr_dynamics.io.messages import cdr
+from ctr_dynamics.io.messages.topics import JOINT_STATES, TIP_LOAD, TRACKER_TIP, accepts_frame
+
+FRAME = "ctr_base"
+LENGTH_LIMIT_M = 1.0  # no laboratory robot is longer
+ANGLE_LIMIT_RAD = 4 * math.pi  # two turns; 12.6 read as degrees is a small angle
+NORM_LIMIT = 1e-3
+FORCE_LIMIT_N = 50.0
+_JOINT = re.compile(r"tube([1-9][0-9]?)_(rotation|translation)")
+
+
+@dataclass(frozen=True)
+class Finding:
+    """Something about a bag that its user should know; `topic` is empty for the bag as a whole."""
+
+    level: Literal["note", "warning", "error"]
+    topic: str
+    text: str
+
+
+class Inspector(Protocol):
+    """Takes in the messages of one topic and sums them up."""
+
+    def add(self, data: bytes) -> None: ...
+    def values(self) -> dict[str, Any]: ...
+    def findings(self) -> list[Finding]: ...
+
+
+class _Range:
+    """Smallest and largest finite value, and how many were not finite."""
+
+    def __init__(self) -> None:
+        self.low = math.inf
+        self.high = -math.inf
+        self.bad = 0
+
+    def add(self, value: float) -> None:
+        if math.isfinite(value):
+            self.low = min(self.low, value)
+            self.high = max(self.high, value)
+        else:
+            self.bad += 1
+
+    @property
+    def size(self) -> float:
+        """Largest magnitude, 0 when there is no finite value."""
+        return max(abs(self.low), abs(self.high)) if self.low <= self.high else 0.0
+
+    def as_dict(self) -> dict[str, float | int | None]:
+        seen = self.low <= self.high
+        return {"min": self.low if seen else None, "max": self.high if seen else None, "not_finite": self.bad}
+
+
+class _Base:
+    """What all inspectors count: frames and messages that cannot be decoded."""
+
+    topic = ""
+
+    def __init__(self) -> None:
+        self.malformed = 0
+        self.fault = ""
+        self.frames: dict[str, int] = {}
+
+    def _failed(self, error: cdr.CdrError) -> None:
+        self.malformed += 1
+        self.fault = self.fault or str(error)
+
+    def _frame(self, frame: str) -> None:
+        if len(self.frames) < 20 or frame in self.frames:
+            self.frames[frame] = self.frames.get(frame, 0) + 1
+
+    def _common(self) -> list[Finding]:
+        found = []
+        if self.malformed:
+            found.append(
+                Finding("error", self.topic, f"{self.malformed} messages cannot be decoded ({self.fault})")
+            )
+        for frame, count in self.frames.items():
+            if not accepts_frame(frame, FRAME):
+                found.append(
+                    Finding(
+                        "error",
+                        self.topic,
+                        f"{count} messages are in frame {frame!r}, {FRAME!r} is expected; transform them, "
+                        "or name the frame so if it is that one",
+                    )
+                )
+        return found
+
+    def _not_finite(self, count: int) -> list[Finding]:
+        return [Finding("warning", self.topic, f"{count} numbers are NaN or infinite")] if count else []
+
+
+class JointInspector(_Base):
+    """Joint names, ranges and units."""
+
+    topic = JOINT_STATES
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.ranges: dict[str, _Range] = {}
+        self.others: set[str] = set()
+        self.uneven = 0
+        self.disordered = 0
+        self.incomplete = 0
+        self.messages = 0
+
+    def add(self, data: bytes) -> None:
+        try:
+            message = cdr.decode_joint_state(data)
+        except cdr.CdrError as error:
+            self._failed(error)
+            return
+        self.messages += 1
+        if len(message.names) != len(message.positions):
+            self.uneven += 1
+        betas: dict[int, float] = {}
+        count = 0
+        for name, value in zip(message.names, message.positions, strict=False):
+            match = _JOINT.fullmatch(name)
+            if match is None:
+                if len(self.others) < 50:
+                    self.others.add(name)
+                continue
+            count += 1
+            self.ranges.setdefault(name, _Range()).add(value)
+            if match[2] == "translation":
+                betas[int(match[1])] = value
+        if count < len(self.ranges):
+            self.incomplete += 1
+        ordered = [betas[tube] for tube in sorted(betas)]
+        if any(inner > outer for inner, outer in pairwise(ordered)):
+            self.disordered += 1
+
+    @property
+    def tubes(self) -> list[int]:
+        return sorted({int(match[1]) for name in self.ranges if (match := _JOINT.fullmatch(name))})
+
+    def values(self) -> dict[str, Any]:
+        joints = {name: self.ranges[name].as_dict() for name in sorted(self.ranges)}
+        return {"tubes": len(self.tubes), "joints": joints, "other_names": sorted(self.others)}
+
+    def findings(self) -> list[Finding]:
+        found = self._common()
+        if not self.ranges:
+            others = ", ".join(sorted(self.others)[:8]) or "none"
+            text = (
+                f"no joint is named tubeN_rotation or tubeN_translation (names found: {others}); rename them"
+            )
+            return [*found, Finding("error", self.topic, text)]
+        missing = [
+            name
+            for tube in range(1, max(self.tubes) + 1)
+            for name in (f"tube{tube}_rotation", f"tube{tube}_translation")
+            if name not in self.ranges
+        ]
+        if missing:
+            found.append(Finding("error", self.topic, f"missing joints: {', '.join(missing)}"))
+        if self.uneven:
+            found.append(
+                Finding("error", self.topic, f"{self.uneven} messages have not as many positions as names")
+            )
+        if self.incomplete:
+            found.append(
+                Finding(
+                    "note",
+                    self.topic,
+                    f"{self.incomplete} of {self.messages} messages do not hold every joint",
+                )
+            )
+        if self.disordered:
+            found.append(
+                Finding(
+                    "error",
+                    self.topic,
+                    f"{self.disordered} messages break tube1_translation <= tube2_translation <= ... <= 0: "
+                    "an inner tube's base lies behind the next outer one's; check tube numbers (1 is the "
+                    "innermost)",
+                )
+            )
+        found += self._not_finite(sum(r.bad for r in self.ranges.values()))
+        for name, extent in sorted(self.ranges.items()):
+            found += self._units(name, extent)
+        return found
+
+    def _units(self, name: str, extent: _Range) -> list[Finding]:
+        if name.endswith("_translation"):
+            if extent.size > LENGTH_LIMIT_M:
+                text = (
+                    f"{name} reaches {extent.size:g} m, limit {LENGTH_LIMIT_M:g} m: millimetres? Give metres"
+                )
+                return [Finding("error", self.topic, text)]
+            if extent.high > 0:
+                text = (
+                    f"{name} reaches {extent.high:+g} m, it must be zero or negative (behind the base plate)"
+                )
+                return [Finding("error", self.topic, text)]
+        elif extent.size > ANGLE_LIMIT_RAD:
+            text = (
+                f"{name} reaches {extent.size:g} rad, limit {ANGLE_LIMIT_RAD:.3g} rad: degrees? Give radians"
+            )
+            return [Finding("error", self.topic, text)]
+        return []
+
+
+class PoseInspector(_Base):
+    """Tracker positions, quaternions, frame and units."""
+
+    topic = TRACKER_TIP
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.axes = (_Range(), _Range(), _Range())
+        self.norm = _Range()
+        self.unnormalised = 0
+        self.zero = 0
+
+    def add(self, data: bytes) -> None:
+        try:
+            message = cdr.decode_pose_stamped(data)
+        except cdr.CdrError as error:
+            self._failed(error)
+            return
+        self._frame(message.frame_id)
+        for axis, value in zip(self.axes, message.position, strict=True):
+            axis.add(value)
+        norm = math.sqrt(sum(q * q for q in message.quaternion_xyzw if abs(q) < 1e150))
+        if not all(math.isfinite(q) for q in message.quaternion_xyzw):
+            self.norm.bad += 1
+            return
+        self.norm.add(norm)
+        if norm == 0.0:
+            self.zero += 1
+        elif abs(norm - 1.0) > NORM_LIMIT:
+            self.unnormalised += 1
+
+    def values(self) -> dict[str, Any]:
+        ranges = {name: axis.as_dict() for name, axis in zip("xyz", self.axes, strict=True)}
+        return {"position_m": ranges, "quaternion_norm": self.norm.as_dict()}
+
+    def findings(self) -> list[Finding]:
+        found = self._common()
+        found += self._not_finite(sum(axis.bad for axis in self.axes) + self.norm.bad)
+        size = max(axis.size for axis in self.axes)
+        if size > LENGTH_LIMIT_M:
+            text = (
+                f"positions reach {size:g} m, limit {LENGTH_LIMIT_M:g} m: "
+                "millimetres, or another frame? Give metres"
+            )
+            found.append(Finding("error", self.topic, text))
+        if self.zero:
+            text = (
+                f"{self.zero} quaternions are zero; "
+                "if the tracker has no orientation, set tracker.axes to xyz"
+            )
+            found.append(Finding("warning", self.topic, text))
+        if self.unnormalised:
+            text = (
+                f"{self.unnormalised} quaternions are not of unit length (norm {self.norm.low:g} to "
+                f"{self.norm.high:g}, limit 1 +- {NORM_LIMIT:g})"
+            )
+            found.append(Finding("warning", self.topic, text))
+        return found
+
+
+class WrenchInspector(_Base):
+    """Loads: frame, size, NaN."""
+
+    topic = TIP_LOAD
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.force = _Range()
+        self.torque = _Range()
+
+    def add(self, data: bytes) -> None:
+        try:
+            message = cdr.decode_wrench_stamped(data)
+        except cdr.CdrError as error:
+            self._failed(error)
+            return
+        self._frame(message.frame_id)
+        for value in message.force:
+            self.force.add(value)
+        for value in message.torque:
+            self.torque.add(value)
+
+    def values(self) -> dict[str, Any]:
+        return {"force_N": self.force.as_dict(), "torque_Nm": self.torque.as_dict()}
+
+    def findings(self) -> list[Finding]:
+        found = self._common() + self._not_finite(self.force.bad + self.torque.bad)
+        if self.force.size > FORCE_LIMIT_N:
+            text = (
+                f"forces reach {self.force.size:g} N, limit {FORCE_LIMIT_N:g} N: millinewtons? Give newtons"
+            )
+            found.append(Finding("warning", self.topic, text))
+        return found
+
+
+def inspector_for(topic: str) -> Inspector:
+    """A new inspector of an input topic."""
+    kinds: dict[str, type[JointInspector] | type[PoseInspector] | type[WrenchInspector]] = {
+        JOINT_STATES: JointInspector,
+        TRACKER_TIP: PoseInspector,
+        TIP_LOAD: WrenchInspector,
+    }
+    return kinds[topic]()

@@ -1,0 +1,295 @@
+"""What is in a bag and what is wrong with it: rates, gaps, stamps, clocks, frames, units, numbers.
+
+`inspect` reads a bag once and returns plain facts per topic and a list of problems, each with value, limit,
+unit and what to do. It needs no robot: limits are those that hold for any concentric tube robot of laboratory
+size.
+"""
+
+from __future__ import annotations
+
+from array import array
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ctr_dynamics.io.bag_checks import Finding, Inspector, inspector_for
+from ctr_dynamics.io.bag_reader import DECODERS, Bag, open_bag
+from ctr_dynamics.io.messages import cdr
+from ctr_dynamics.io.messages.topics import JOINT_STATES, TIP_LOAD, TOPIC, TRACKER_TIP
+
+GAP_LIMIT_S = {JOINT_STATES: 0.1, TRACKER_TIP: 0.5}  # the joints' is the default of input_timeout_s
+LATE_LIMIT_S = 0.2  # default of filter.window_s
+START_LIMIT_S = 0.5
+CLOCK_LIMIT_S = 0.5
+CLOCK_DIFFERENCE_S = 0.05
+_SHOWN_GAPS = 10
+
+
+@dataclass
+class TopicReport:
+    """Facts about one topic. Times in s; `first_s` from the bag's first message; stamps are header stamps."""
+
+    name: str
+    ros_type: str
+    messages: int
+    rate_hz: float | None = None
+    first_s: float | None = None
+    last_s: float | None = None
+    longest_gap_s: float | None = None
+    gaps: list[dict[str, float]] = field(default_factory=list)
+    duplicate_stamps: int = 0
+    stamps_backwards: int = 0
+    log_minus_stamp_s: dict[str, float] | None = None
+    frames: list[str] = field(default_factory=list)
+    values: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass
+class BagReport:
+    """Content and problems of a bag."""
+
+    bag: str
+    files: list[dict[str, Any]]
+    duration_s: float
+    start_ns: int
+    topics: list[TopicReport]
+    problems: list[Finding]
+    metadata: dict[str, str]
+
+    @property
+    def worst(self) -> Literal["ok", "note", "warning", "error"]:
+        levels = {finding.level for finding in self.problems}
+        for level in ("error", "warning", "note"):
+            if level in levels:
+                return level
+        return "ok"
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain content for JSON."""
+        return {**asdict(self), "verdict": self.worst}
+
+
+class _Times:
+    """Log times and header stamps of one topic, in arrival order."""
+
+    def __init__(self, stamped: bool) -> None:
+        self.stamped = stamped
+        self.log = array("q")
+        self.stamp = array("q")
+        self.frames: dict[str, int] = {}
+
+    def add(self, log_ns: int, data: bytes) -> None:
+        self.log.append(min(log_ns, 2**63 - 1))
+        if self.stamped:
+            try:
+                stamp, frame = cdr.decode_header(data)
+            except cdr.CdrError:
+                return
+            self.stamp.append(stamp)
+            if len(self.frames) < 20 or frame in self.frames:
+                self.frames[frame] = self.frames.get(frame, 0) + 1
+
+
+def inspect(path: str | Path) -> BagReport:
+    """Read a bag through once.
+
+    Raises:
+        InputError: not a bag, or an input topic of another type or encoding.
+    """
+    bag = open_bag(path)
+    bag.check_inputs(required=())
+    times: dict[str, _Times] = {}
+    inspectors: dict[str, Inspector] = {}
+    known = bag.topics
+    for topic, log_ns, data in bag.messages():
+        entry = times.get(topic)
+        if entry is None:
+            definition = TOPIC.get(topic)
+            stamped = (
+                definition is not None
+                and definition.has_header
+                and definition.ros_type == known[topic].ros_type
+            )
+            entry = times[topic] = _Times(stamped)
+        entry.add(log_ns, data)
+        if topic in DECODERS:
+            inspectors.setdefault(topic, inspector_for(topic)).add(data)
+    starts = [t.log[0] for t in times.values()]
+    ends = [t.log[-1] for t in times.values()]
+    start_ns = min(starts, default=0)
+    problems = [Finding("warning", "", note) for note in bag.notes]
+    reports = [
+        _topic_report(known[name].ros_type, name, times.get(name), start_ns, problems) for name in known
+    ]
+    for report in reports:
+        if report.name in inspectors:
+            report.values = inspectors[report.name].values()
+            problems += inspectors[report.name].findings()
+    problems += _between_topics(bag, times, reports)
+    return BagReport(
+        bag=str(bag.path),
+        files=[
+            {
+                "name": f.path.name,
+                "bytes": f.size,
+                "complete": f.complete,
+                "library": f.library,
+                "profile": f.profile,
+            }
+            for f in bag.files
+        ],
+        duration_s=(max(ends, default=0) - start_ns) * 1e-9,
+        start_ns=start_ns,
+        topics=reports,
+        problems=problems,
+        metadata=bag.metadata("ctr_dynamics"),
+    )
+
+
+def _topic_report(
+    ros_type: str, name: str, times: _Times | None, start_ns: int, problems: list[Finding]
+) -> TopicReport:
+    report = TopicReport(name, ros_type, len(times.log) if times else 0)
+    if times is None:
+        return report
+    log = np.frombuffer(times.log, dtype=np.int64)
+    report.first_s = float(log[0] - start_ns) * 1e-9
+    report.last_s = float(log[-1] - start_ns) * 1e-9
+    report.frames = sorted(times.frames)
+    stamps = np.frombuffer(times.stamp, dtype=np.int64) if len(times.stamp) == len(log) else log
+    ordered = np.sort(stamps)
+    steps = np.diff(ordered)
+    report.duplicate_stamps = int(np.count_nonzero(steps == 0))
+    report.stamps_backwards = int(np.count_nonzero(np.diff(stamps) < 0))
+    if np.any(steps > 0):
+        report.rate_hz = float(1e9 / np.median(steps[steps > 0]))
+        report.longest_gap_s = float(steps.max()) * 1e-9
+    if stamps is not log:
+        offset = (log - stamps) * 1e-9
+        report.log_minus_stamp_s = {
+            "min": float(offset.min()),
+            "median": float(np.median(offset)),
+            "max": float(offset.max()),
+        }
+    if name in DECODERS:
+        problems += _stamp_findings(report, ordered, stamps, steps)
+    return report
+
+
+def _stamp_findings(
+    report: TopicReport, ordered: NDArray[np.int64], stamps: NDArray[np.int64], steps: NDArray[np.int64]
+) -> list[Finding]:
+    name = report.name
+    found: list[Finding] = []
+    limit = GAP_LIMIT_S.get(name)
+    if limit is not None:
+        wide = np.flatnonzero(steps > limit * 1e9)
+        report.gaps = [
+            {"at_s": float(ordered[i] - ordered[0]) * 1e-9, "length_s": float(steps[i]) * 1e-9}
+            for i in wide[:_SHOWN_GAPS]
+        ]
+        if wide.size:
+            worst = int(wide[np.argmax(steps[wide])])
+            found.append(
+                Finding(
+                    "warning",
+                    name,
+                    f"{wide.size} gaps longer than {limit:g} s, the longest {steps[worst] * 1e-9:.3f} s at "
+                    f"{(ordered[worst] - ordered[0]) * 1e-9:.3f} s after its first stamp; outputs are "
+                    "invalid or open-loop there",
+                )
+            )
+    if report.duplicate_stamps:
+        found.append(
+            Finding(
+                "warning", name, f"{report.duplicate_stamps} stamps occur more than once; check the driver"
+            )
+        )
+    if report.stamps_backwards:
+        back = -int(np.diff(stamps).min()) * 1e-9
+        late = name == TRACKER_TIP and back <= LATE_LIMIT_S
+        found.append(
+            Finding(
+                "note" if late else "warning",
+                name,
+                f"stamps run backwards {report.stamps_backwards} times, by {back:.3f} s at most"
+                + (
+                    f" (up to {LATE_LIMIT_S:g} s is fused at its own stamp)" if late else "; check the clocks"
+                ),
+            )
+        )
+    return found
+
+
+def _between_topics(bag: Bag, times: dict[str, _Times], reports: list[TopicReport]) -> list[Finding]:
+    """Problems of topics against each other: missing ones, clocks, start and end."""
+    found: list[Finding] = []
+    by_name = {report.name: report for report in reports}
+    for name, level, text in (
+        (JOINT_STATES, "error", "not in the bag; nothing can be estimated without it"),
+        (TRACKER_TIP, "warning", "not in the bag; only the model alone can run (`replay --no-fusion`)"),
+        (TIP_LOAD, "note", "not in the bag; the known load is taken as zero"),
+    ):
+        if name not in times:
+            found.append(Finding(level, name, text))  # type: ignore[arg-type]
+    for name in (JOINT_STATES, TRACKER_TIP, TIP_LOAD):
+        offset = by_name[name].log_minus_stamp_s if name in times else None
+        if offset and abs(offset["median"]) > CLOCK_LIMIT_S:
+            found.append(
+                Finding(
+                    "warning",
+                    name,
+                    f"log times are {offset['median']:.3f} s after the stamps (median), limit "
+                    f"{CLOCK_LIMIT_S:g} s: driver and recorder use different clocks",
+                )
+            )
+        if offset and name == TRACKER_TIP and offset["max"] - offset["min"] > LATE_LIMIT_S:
+            found.append(
+                Finding(
+                    "warning",
+                    name,
+                    f"the slowest sample came {offset['max'] - offset['min']:.3f} s later than the "
+                    f"quickest, limit {LATE_LIMIT_S:g} s: such samples are not fused; raise filter.window_s "
+                    "or mend the driver",
+                )
+            )
+    joints, tracker = by_name.get(JOINT_STATES), by_name.get(TRACKER_TIP)
+    if joints and tracker and joints.log_minus_stamp_s and tracker.log_minus_stamp_s:
+        difference = joints.log_minus_stamp_s["median"] - tracker.log_minus_stamp_s["median"]
+        if abs(difference) > CLOCK_DIFFERENCE_S:
+            found.append(
+                Finding(
+                    "warning",
+                    TRACKER_TIP,
+                    f"its stamps are {difference:.3f} s ahead of the joints' by arrival, limit "
+                    f"{CLOCK_DIFFERENCE_S:g} s; synchronise the clocks or set tracker.delay_s",
+                )
+            )
+        found += _start_and_end(times[JOINT_STATES], times[TRACKER_TIP])
+    return found
+
+
+def _start_and_end(joints: _Times, tracker: _Times) -> list[Finding]:
+    found: list[Finding] = []
+    if not joints.stamp or not tracker.stamp:
+        return found
+    start = (min(tracker.stamp) - min(joints.stamp)) * 1e-9
+    end = (max(joints.stamp) - max(tracker.stamp)) * 1e-9
+    if abs(start) > START_LIMIT_S:
+        side = "after" if start > 0 else "before"
+        found.append(
+            Finding(
+                "warning",
+                TRACKER_TIP,
+                f"starts {abs(start):.3f} s {side} the joints, limit {START_LIMIT_S:g} s; "
+                + ("the model runs alone until then" if start > 0 else "earlier samples are not used"),
+            )
+        )
+    if end > START_LIMIT_S:
+        found.append(
+            Finding("warning", TRACKER_TIP, f"ends {end:.3f} s before the joints, limit {START_LIMIT_S:g} s")
+        )
+    return found

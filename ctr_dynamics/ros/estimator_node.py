@@ -1,0 +1,394 @@
+"""The estimator as a ROS 2 node: topics in, topics out, services, parameters, diagnostics, recording."""
+
+from __future__ import annotations
+
+import json
+import sys
+import threading
+import time
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from rclpy.clock import JumpThreshold, TimeJump
+from rclpy.duration import Duration
+from rclpy.event_handler import SubscriptionEventCallbacks
+from rclpy.logging import get_logging_directory
+from rclpy.node import Node
+from rclpy.parameter import Parameter as RosParameter
+from std_srvs.srv import SetBool, Trigger
+
+from ctr_dynamics import __version__
+from ctr_dynamics.errors import InputError
+from ctr_dynamics.estimation.estimator import Estimator
+from ctr_dynamics.estimation.warm_up import rehearse
+from ctr_dynamics.io.atomic_files import atomic_file, check_targets
+from ctr_dynamics.io.bag_writer import LiveRecorder
+from ctr_dynamics.io.messages import topics
+from ctr_dynamics.io.messages.cdr import (
+    CdrError,
+    decode_joint_state,
+    decode_pose_stamped,
+    decode_wrench_stamped,
+)
+from ctr_dynamics.io.messages.encode import StepEncoder
+from ctr_dynamics.parameters import Settings
+from ctr_dynamics.robot import load_robot
+from ctr_dynamics.ros import diagnostics, qos
+from ctr_dynamics.ros.node_runner import Stopped, apart, run_node
+from ctr_dynamics.ros.parameter_declaration import declare, watch
+from ctr_dynamics.ros.publishers import Outputs
+from ctr_dynamics.ros.topic_names import NAME, NAMESPACE, message_class, node_topic
+from ctr_dynamics.runtime.memory import keep_memory
+from ctr_dynamics.runtime.recorder import Recorder
+from ctr_dynamics.runtime.ring_buffer_recording import RollingRecording
+from ctr_dynamics.runtime.step_loop import StepLoop
+from ctr_dynamics.runtime.timing import StepTiming
+
+DIAGNOSTICS_NS = 500_000_000
+DIAGNOSTICS_WAIT_NS = 100_000_000  # how long they wait for a pause between steps
+# A thread that wants the interpreter gets it after this long; the default of 5 ms is longer than a step.
+SWITCH_INTERVAL_S = 1e-4
+
+
+class EstimatorNode(Node):
+    """Node `/ctr/estimator`. The executor only queues what arrives; a thread of its own takes the steps.
+
+    Raises:
+        InputError: a parameter or the robot file cannot be used.
+        Stopped: `stop` was set while the kernels were compiled.
+    """
+
+    def __init__(self, stop: threading.Event) -> None:
+        super().__init__(NAME, namespace=NAMESPACE, automatically_declare_parameters_from_overrides=True)
+        self.settings = declare(self)
+        self._robot = load_robot(self.settings["robot"])
+        written = ("timing_report", "record.rolling_path", "record.path")
+        check_targets({name: self.settings[name] for name in written}, {"robot file": self._robot.source})
+        try:
+            self._estimator = apart(self._warm_estimator, stop)
+        except Stopped:
+            self.destroy_node()  # so that others hear of the end
+            raise
+        self._prepared: tuple[Settings, set[str], Estimator | None] | None = None
+        self._use_sim_time = bool(self.get_parameter("use_sim_time").value)
+
+        self.timing = StepTiming(
+            self.settings["output.policy"], round(self.settings["input_timeout_s"] * 1e9)
+        )
+        self.rolling = self._open_rolling()
+        self.recorder = self._open_recorder()
+        self._qos_faults = qos.QosFaults()
+        self._undecodable: dict[str, tuple[int, str]] = {}
+        self._next_diagnostics_ns = 0
+        self._shown: tuple[bool | None, bool] | None = (
+            None  # validity and warning of a snap as last published
+        )
+        self.outputs = Outputs(
+            self,
+            qos.profile(self.settings["qos.publisher_reliability"], self.settings["qos.publisher_depth"]),
+            self._qos_faults,
+            StepEncoder(
+                self.settings["output.frame_id"], self._robot.name, self.settings["output.backbone_every"]
+            ),
+            self.recorder.put if self.recorder else None,
+        )
+        self._now_ns = self._clock_source()
+        self.loop = StepLoop(
+            self._estimator,
+            self.outputs.step,
+            self._housekeeping,
+            self._now_ns,
+            self.timing,
+            self.get_logger().error,
+            wall=not self._use_sim_time,
+            rehearse=self._rehearse,
+        )
+        self._offered = [
+            self.create_service(Trigger, "~/reset", self._on_reset),
+            self.create_service(Trigger, "~/save_snapshot", self._on_save_snapshot),
+            self.create_service(SetBool, "~/enable_fusion", self._on_enable_fusion),
+        ]
+        watch(self, lambda: self.settings, self._prepare, self._apply)
+        self.loop.start()
+        self._inputs = [self._subscribe(topic) for topic in topics.INPUTS]
+        self.get_logger().info(
+            f"robot '{self._robot.name}', policy '{self.timing.policy}', waiting for {topics.JOINT_STATES}"
+        )
+
+    # Start.
+
+    def _warm_estimator(self) -> Estimator:
+        self.get_logger().info("compiling the kernels (seconds with a filled cache, minutes without)")
+        begin = time.perf_counter()
+        rehearse(self._robot, self.settings)
+        self.get_logger().info(f"kernels ready after {time.perf_counter() - begin:.1f} s")
+        return Estimator(self._robot, self.settings)
+
+    def _open_recorder(self) -> Recorder | None:
+        path = self.settings["record.path"]
+        return Recorder(LiveRecorder(path, self._provenance()), self.get_logger().error) if path else None
+
+    def _open_rolling(self) -> RollingRecording | None:
+        seconds = self.settings["record.rolling_s"]
+        if not seconds:
+            return None
+        path = self.settings["record.rolling_path"]
+        if not path:
+            folder = Path(get_logging_directory())
+            folder.mkdir(parents=True, exist_ok=True)
+            path = folder / "ctr_estimator_rolling.mcap"
+        return RollingRecording(
+            path, seconds, self.settings["robot"], self._provenance(), self.get_logger().warning
+        )
+
+    def _provenance(self) -> dict[str, str]:
+        return {
+            "version": __version__,
+            "robot": self._robot.name,
+            "robot_sha256": self._robot.sha256,
+            "parameters": json.dumps(self.settings.as_dict()),
+        }
+
+    def _clock_source(self) -> Callable[[], int]:
+        """Current time of the clock that stamps the messages."""
+        if not self._use_sim_time:
+            return time.time_ns  # what the node's clock reads, without the objects around it
+        clock = self.get_clock()
+        threshold = JumpThreshold(
+            min_forward=Duration(nanoseconds=1), min_backward=Duration(nanoseconds=-1), on_clock_change=True
+        )
+        self._jumps = clock.create_jump_callback(threshold, post_callback=self._on_clock)
+        return lambda: int(clock.now().nanoseconds)
+
+    def _subscribe(self, topic: topics.Topic) -> Any:
+        take = {
+            topics.JOINT_STATES: self._take_joints,
+            topics.TRACKER_TIP: self._take_tracker,
+            topics.TIP_LOAD: self._take_load,
+        }[topic.name]
+        loop, now_ns, record, rolling = self.loop, self._now_ns, self.recorder, self.rolling
+
+        def arrived(data: bytes) -> None:
+            arrival_ns = now_ns()
+            loop.offer(partial(take, data, arrival_ns))
+            if record is not None:
+                record.put(topic.name, arrival_ns, data)
+            if rolling is not None:
+                rolling.put(topic.name, arrival_ns, data)
+
+        return self.create_subscription(
+            message_class(topic.ros_type),
+            node_topic(topic.name),
+            arrived,
+            qos.profile(
+                self.settings["qos.subscription_reliability"], self.settings["qos.subscription_depth"]
+            ),
+            raw=True,
+            event_callbacks=SubscriptionEventCallbacks(
+                incompatible_qos=self._qos_faults.subscription(topic.name)
+            ),
+        )
+
+    # In the stepping thread.
+
+    def _take_joints(self, data: bytes, arrival_ns: int) -> None:
+        try:
+            message = decode_joint_state(data)
+        except CdrError as error:
+            self._note_undecodable(topics.JOINT_STATES, error)
+            return
+        if arrival_ns <= 0:  # before the first /clock: the arrival tells nothing of the stamps' clock
+            self._estimator.add_joint_state(message.stamp_ns, message.names, message.positions)
+            return
+        clock = self.loop.stamp_clock
+        if not clock.sample(message.stamp_ns, arrival_ns):
+            refusal = clock.refusal(message.stamp_ns, arrival_ns)
+            self._estimator.health.note("joints", "far ahead", refusal)
+            return
+        self.timing.arrived(message.stamp_ns, clock.at(arrival_ns))
+        self._estimator.add_joint_state(message.stamp_ns, message.names, message.positions)
+
+    def _take_tracker(self, data: bytes, arrival_ns: int) -> None:
+        try:
+            message = decode_pose_stamped(data)
+        except CdrError as error:
+            self._note_undecodable(topics.TRACKER_TIP, error)
+            return
+        self._estimator.add_tracker_pose(
+            message.stamp_ns, message.position, message.quaternion_xyzw, message.frame_id
+        )
+
+    def _take_load(self, data: bytes, arrival_ns: int) -> None:
+        try:
+            message = decode_wrench_stamped(data)
+        except CdrError as error:
+            self._note_undecodable(topics.TIP_LOAD, error)
+            return
+        self._estimator.add_tip_load(message.stamp_ns, message.force, message.torque, message.frame_id)
+
+    def _note_undecodable(self, topic: str, error: CdrError) -> None:
+        count, _ = self._undecodable.get(topic, (0, ""))
+        self._undecodable[topic] = (count + 1, str(error))
+
+    def _rehearse(self) -> None:
+        self._estimator.rehearse()
+        self.outputs.rehearse()
+
+    def _housekeeping(self, now_ns: int, pause: bool) -> None:
+        """Diagnostics, at once when validity or the warning of a snap has changed and else at 2 Hz of the wall clock."""
+        monotonic_ns = time.monotonic_ns()
+        if self.rolling is not None:
+            self.rolling.alarm(self._estimator.health.misfitting, monotonic_ns)
+        before, now = self._shown, (self.outputs.valid, self._estimator.health.snap_ahead)
+        due_ns = self._next_diagnostics_ns + (0 if pause else DIAGNOSTICS_WAIT_NS)
+        if now == before and monotonic_ns < due_ns:
+            return
+        self._next_diagnostics_ns = monotonic_ns + DIAGNOSTICS_NS
+        self._shown = now
+        if before is None or self.outputs.valid != before[0]:
+            if self.outputs.valid:
+                self.get_logger().info("outputs are valid")
+            else:
+                self.get_logger().warning(f"outputs are invalid: {self.outputs.reason}")
+        self.outputs.diagnostics(max(now_ns, 0), self._statuses(now_ns))
+
+    def _statuses(self, now_ns: int) -> list[Any]:
+        health = self._estimator.health.statuses()
+        if self.rolling is not None:
+            health = [self.rolling.describe(s) if s.name == "misfit" else s for s in health]
+        return [
+            *health,
+            diagnostics.timing_status(
+                self.timing, self.loop.faults, self.loop.last_fault, self.outputs.stamps.behind_ns
+            ),
+            diagnostics.clock_status(
+                self.loop.stamp_clock,
+                now_ns,
+                self._use_sim_time,
+                self.timing.input_timeout_ns if self.timing.policy == "predict" else None,
+            ),
+            diagnostics.topics_status(self._qos_faults.by_topic, self._undecodable, self.loop.refused),
+        ]
+
+    # In the executor.
+
+    def _on_clock(self, jump: TimeJump) -> None:
+        if jump.delta.nanoseconds < 0:
+            self.loop.put(self._clock_went_back)
+        else:
+            self.loop.wake()
+
+    def _reset(self) -> None:
+        self.loop.reset()
+        self.outputs.stamps.let_go_back()
+
+    def _clock_went_back(self) -> None:
+        self.loop.reset()
+        self.outputs.stamps.forget()
+
+    def _on_reset(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        return self._answer(
+            response,
+            lambda: self.loop.call(self._reset),
+            lambda _: "the estimator starts anew at the next complete joint state",
+        )
+
+    def _on_save_snapshot(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        return self._answer(response, self._save_snapshot, lambda path: f"saved {path}")
+
+    def _on_enable_fusion(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
+        return self._answer(
+            response,
+            lambda: self._set_fusion(bool(request.data)),
+            lambda _: f"fusion is {'on' if request.data else 'off'}",
+        )
+
+    @staticmethod
+    def _answer(response: Any, action: Callable[[], Any], text: Callable[[Any], str]) -> Any:
+        try:
+            response.message = text(action())
+            response.success = True
+        except (OSError, TimeoutError, InputError) as error:
+            response.message = str(error)
+            response.success = False
+        return response
+
+    def _set_fusion(self, on: bool) -> None:
+        result = self.set_parameters([RosParameter("filter.enabled", value=on)])[0]
+        if not result.successful:
+            raise InputError(result.reason)
+
+    def _save_snapshot(self) -> Path:
+        snapshot = self.loop.call(self._estimator.snapshot)
+        if self.rolling is not None:
+            self.rolling.save("snapshot saved")
+        folder = Path(get_logging_directory())
+        folder.mkdir(parents=True, exist_ok=True)
+        path = folder / f"ctr_estimator_{time.time_ns()}.json"
+        content = {
+            "version": __version__,
+            "robot": self._robot.name,
+            "robot_sha256": self._robot.sha256,
+            "parameters": self.settings.as_dict(),
+            "timing": self.timing.report(),
+            "estimator": snapshot,
+        }
+        with path.open("w", encoding="utf-8") as file:
+            json.dump(content, file)  # piece by piece: dumps() would hold up the stepping thread
+        return path
+
+    def _prepare(self, settings: Settings, changes: set[str]) -> None:
+        """Refuse parameters that cannot be used; where a new estimator is needed, make it here."""
+        fresh = Estimator(self._robot, settings) if changes - {"filter.enabled"} else None
+        self._prepared = (settings, changes, fresh)
+
+    def _apply(self) -> None:
+        if self._prepared is None:
+            return
+        settings, changes, fresh = self._prepared
+        self._prepared = None
+        self.settings = settings
+        if fresh is not None:
+            self.loop.put(partial(self._swap, fresh, settings))
+            self.get_logger().info(f"{', '.join(sorted(changes))} changed: the estimator starts anew")
+        elif "filter.enabled" in changes:
+            self.loop.put(lambda: self._estimator.set_fusion(settings["filter.enabled"]))
+
+    def _swap(self, estimator: Estimator, settings: Settings) -> None:
+        estimator.inputs.carry_load(self._estimator.inputs.load)
+        self._estimator = estimator
+        self.timing.policy = settings["output.policy"]
+        self.timing.input_timeout_ns = round(settings["input_timeout_s"] * 1e9)
+        self.loop.swap(estimator)
+
+    # End.
+
+    def close(self) -> None:
+        """Stop stepping, finish the recording, write the timing report, destroy the node."""
+        self.loop.stop()
+        self.loop.join()
+        if self.recorder is not None:
+            self.recorder.close()
+        if self.rolling is not None:
+            self.rolling.close(self._estimator.health.misfitting)
+        path = self.settings["timing_report"]
+        try:
+            if path:
+                with atomic_file(Path(path)) as part:
+                    part.write_text(json.dumps(self.timing.report(), indent=1), encoding="utf-8")
+        except InputError as error:
+            self.get_logger().error(f"the timing report could not be written: {error}")
+        self.destroy_node()
+
+
+def main(args: list[str] | None = None) -> int:
+    """Run the node; returns 0 after SIGINT or SIGTERM, 2 when it cannot start with what it was given."""
+    sys.setswitchinterval(SWITCH_INTERVAL_S)
+    keep_memory()
+    return run_node("estimator", EstimatorNode, EstimatorNode.close, args)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,86 @@
+"""The node's publishers: one per output topic, fed with serialised bytes, each stamp once."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from rclpy.event_handler import PublisherEventCallbacks
+from rclpy.node import Node
+from rclpy.qos import QoSProfile
+
+from ctr_dynamics.io.messages import topics
+from ctr_dynamics.io.messages.encode import StepEncoder, encode_diagnostics
+from ctr_dynamics.ros.qos import QosFaults
+from ctr_dynamics.ros.topic_names import message_class, node_topic
+from ctr_dynamics.runtime.clock_offset import EachOnce
+
+
+class Outputs:
+    """Publishes the messages of steps. No stamp goes out twice, not even after a reset of the estimator.
+
+    Args:
+        node: makes the publishers.
+        profile: their quality of service.
+        faults: told about subscribers that do not fit.
+        encoder: makes the messages.
+        record: also given every message (topic, stamp in ns, bytes).
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        profile: QoSProfile,
+        faults: QosFaults,
+        encoder: StepEncoder,
+        record: Callable[[str, int, bytes], None] | None = None,
+    ) -> None:
+        self.stamps = EachOnce()
+        self._last: Any = None  # the last step that was published
+        self._encoder = encoder
+        self._record = record
+        self._publishers = {
+            topic.name: node.create_publisher(
+                message_class(topic.ros_type),
+                node_topic(topic.name),
+                profile,
+                event_callbacks=PublisherEventCallbacks(incompatible_qos=faults.publisher(topic.name)),
+            )
+            for topic in topics.OUTPUTS
+        }
+
+    def step(self, out: Any) -> bool:
+        """Publish one step; False when its stamp is not later than all that were published."""
+        if not self.stamps.passes(out.stamp_ns):
+            return False
+        self._last = out
+        for message in self._encoder.encode(out):
+            self._send(*message)
+        return True
+
+    @property
+    def valid(self) -> bool | None:
+        """Whether the last step that was published is valid; None before the first."""
+        return None if self._last is None else bool(self._last.valid)
+
+    @property
+    def reason(self) -> str:
+        """Why it is not; empty when it is."""
+        if self._last is None:
+            return "no step has been taken yet: waiting for the first complete joint state"
+        return str(self._last.reason)
+
+    def rehearse(self) -> None:
+        """Make the last step's messages again, for nobody, so that the next ones are made sooner."""
+        if self._last is not None:
+            self._encoder.encode(self._last)
+
+    def diagnostics(self, stamp_ns: int, statuses: list[Any]) -> None:
+        """Publish /diagnostics."""
+        data = encode_diagnostics(stamp_ns, statuses, self._encoder.hardware_id)
+        self._send(topics.DIAGNOSTICS, stamp_ns, data)
+
+    def _send(self, topic: str, stamp_ns: int, data: bytes) -> None:
+        self._publishers[topic].publish(data)
+        if self._record is not None:
+            self._record(topic, stamp_ns, data)

@@ -1,0 +1,200 @@
+"""What a live run has shown: tip errors of the model alone and fused, punctuality, and a picture."""
+
+from __future__ import annotations
+
+import contextlib
+import zipfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ctr_dynamics.errors import InputError
+from ctr_dynamics.io.bag_reader import open_bag
+from ctr_dynamics.io.messages import topics
+from ctr_dynamics.io.messages.cdr import PoseIn, decode_pose_stamped
+from ctr_dynamics.model.model import Model
+from ctr_dynamics.robot import Robot
+from ctr_dynamics.ros.listener import Heard
+from ctr_dynamics.sensing.tracker import TrackerModel, tracker_model
+
+SETTLE_S = 0.5
+"""Left out at the start of comparisons with the truth."""
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Trace:
+    """A point over time: `t` (n,) in s from the start of the bag, `p` (n, 3) in m in the base frame."""
+
+    t: Floats
+    p: Floats
+
+    def at(self, t: Floats) -> Floats:
+        """Linear in between, (len(t), 3)."""
+        return np.column_stack([np.interp(t, self.t, self.p[:, axis]) for axis in range(3)])
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Distances (m) of the model alone and of the fused tip from a reference over its samples."""
+
+    reference: str
+    samples: int
+    alone_rms: float
+    alone_max: float
+    fused_rms: float
+    fused_max: float
+
+
+def trace_of(messages: Sequence[Heard], start_ns: int) -> Trace:
+    """Positions in pose messages (with or without covariance) relative to `start_ns`, in order of stamp."""
+    poses = sorted(decode_pose_stamped(message.data) for message in messages)
+    return Trace(
+        np.array([(pose.stamp_ns - start_ns) * 1e-9 for pose in poses]),
+        np.array([pose.position for pose in poses]).reshape(-1, 3),
+    )
+
+
+def nominal_tracker(robot: Robot) -> TrackerModel:
+    """The tracker of a robot file."""
+    return tracker_model(Model(robot, nodes=12).setup)
+
+
+def tracker_of(bag: Path, start_ns: int, tracker: TrackerModel) -> Trace:
+    """The tip in the base frame as the usable poses of a bag show it, relative to its own `start_ns`."""
+    poses = [m.message for m in open_bag(bag).inputs() if isinstance(m.message, PoseIn)]
+    t, p = [], []
+    for pose in sorted(poses):
+        q = np.array(pose.quaternion_xyzw)[[3, 0, 1, 2]]
+        if np.isfinite(pose.position).all() and np.isfinite(q).all() and 0.9 < np.linalg.norm(q) < 1.1:
+            t.append((pose.stamp_ns - start_ns) * 1e-9 - tracker.delay)
+            p.append(tracker.to_base(np.array(pose.position), q)[0])
+    return Trace(np.array(t), np.array(p).reshape(-1, 3))
+
+
+def truth_of(file: Path) -> list[Trace]:
+    """Candidate traces of a truth file: the tip `p`, and `p_trk` where the drawn registration is in it.
+
+    Raises:
+        InputError: not such a file.
+    """
+    try:
+        with np.load(file) as data:
+            t = np.asarray(data["t"], dtype=float)
+            traces = [
+                Trace(t, np.asarray(data[name], dtype=float)) for name in ("p", "p_trk") if name in data
+            ]
+    except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
+        raise InputError(f"cannot be read as a truth file ({error})", where=str(file)) from None
+    if not traces or any(trace.p.shape != (*t.shape, 3) for trace in traces):
+        raise InputError("holds no tip 'p' or 'p_trk' (n, 3) over 't' (n,)", where=str(file))
+    return traces
+
+
+def compare(reference: str, target: Trace, alone: Trace, fused: Trace, since_s: float = 0.0) -> Comparison:
+    """Distances from `target` at its samples within both runs, from `since_s` on.
+
+    Raises:
+        ValueError: no sample of the reference lies in the run.
+    """
+    begin = max(alone.t[0], fused.t[0], since_s)
+    inside = (target.t >= begin) & (target.t <= min(alone.t[-1], fused.t[-1]))
+    if not inside.any():
+        raise ValueError(f"no sample of the {reference} lies in the time of the run")
+    t, p = target.t[inside], target.p[inside]
+    a = np.linalg.norm(alone.at(t) - p, axis=1)
+    f = np.linalg.norm(fused.at(t) - p, axis=1)
+    return Comparison(reference, len(t), _rms(a), float(a.max()), _rms(f), float(f.max()))
+
+
+def compare_truth(candidates: Sequence[Trace], alone: Trace, fused: Trace) -> Comparison:
+    """The comparison with whichever candidate the fused tip is nearer to over the run."""
+    found = [compare("truth", candidate, alone, fused, SETTLE_S) for candidate in candidates]
+    return min(found, key=lambda comparison: comparison.fused_rms)
+
+
+def comparisons(tracker: Trace, truth: Sequence[Trace], alone: Trace, fused: Trace) -> list[Comparison]:
+    """With the tracker and the truth, as far as they have samples in the time of the run."""
+    found = []
+    if len(tracker.t):
+        with contextlib.suppress(ValueError):
+            found.append(compare("tracker", tracker, alone, fused))
+    if truth:
+        with contextlib.suppress(ValueError):
+            found.append(compare_truth(truth, alone, fused))
+    return found
+
+
+def _rms(distances: Floats) -> float:
+    return float(np.sqrt(np.mean(distances**2)))
+
+
+def backbones(messages: Sequence[Heard], start_ns: int, count: int) -> list[tuple[float, Floats]]:
+    """Up to `count` evenly spaced backbones: time in s and points (n, 3) in m."""
+    from rclpy.serialization import deserialize_message
+    from sensor_msgs.msg import PointCloud2
+
+    if not messages:
+        return []
+    chosen = np.unique(np.linspace(0, len(messages) - 1, count).astype(int))
+    shapes = []
+    for index in chosen:
+        cloud: Any = deserialize_message(messages[index].data, PointCloud2)
+        rows = np.frombuffer(cloud.data, np.float32).reshape(cloud.width, len(topics.BACKBONE_FIELDS))
+        stamp_ns = cloud.header.stamp.sec * 1_000_000_000 + cloud.header.stamp.nanosec
+        shapes.append(((stamp_ns - start_ns) * 1e-9, rows[:, 1:4].astype(float)))
+    return shapes
+
+
+def draw(
+    file: Path,
+    shapes: Sequence[tuple[float, Floats]],
+    alone: Trace,
+    fused: Trace,
+    tracker: Trace,
+    title: str,
+) -> None:
+    """Backbones, tip traces and distances from the tracker as a PNG; millimetres."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    figure = plt.figure(figsize=(14, 8), layout="constrained")
+    grid = figure.add_gridspec(4, 2, width_ratios=(1, 1.6))
+    views = {"side view": (2, 1, "z", "y"), "top view": (2, 0, "z", "x")}
+    colours = plt.get_cmap("viridis")(np.linspace(0, 0.9, max(len(shapes), 1)))
+    for row, (name, (across, up, across_name, up_name)) in enumerate(views.items()):
+        axes = figure.add_subplot(grid[2 * row : 2 * row + 2, 0])
+        for colour, (t, points) in zip(colours, shapes, strict=False):
+            axes.plot(1e3 * points[:, across], 1e3 * points[:, up], color=colour, lw=1.5, label=f"{t:.1f} s")
+        axes.plot(1e3 * fused.p[:, across], 1e3 * fused.p[:, up], color="tab:red", lw=0.6, label="fused tip")
+        axes.set(xlabel=f"{across_name} (mm)", ylabel=f"{up_name} (mm)", title=f"backbone, {name}")
+        axes.set_aspect("equal", adjustable="datalim")
+        axes.grid(alpha=0.3)
+        if row == 0:
+            axes.legend(fontsize=7, loc="best")
+    for axis, name in enumerate("xyz"):
+        axes = figure.add_subplot(grid[axis, 1])
+        axes.plot(tracker.t, 1e3 * tracker.p[:, axis], ".", ms=2, color="0.6", label="tracker")
+        axes.plot(alone.t, 1e3 * alone.p[:, axis], color="tab:blue", lw=1, label="model alone")
+        axes.plot(fused.t, 1e3 * fused.p[:, axis], color="tab:red", lw=1, label="fused")
+        axes.set_ylabel(f"tip {name} (mm)")
+        axes.grid(alpha=0.3)
+        if axis == 0:
+            axes.legend(fontsize=8, ncols=3, loc="upper right")
+    axes = figure.add_subplot(grid[3, 1])
+    inside = (tracker.t >= fused.t[0]) & (tracker.t <= fused.t[-1])
+    t, p = tracker.t[inside], tracker.p[inside]
+    axes.plot(t, 1e3 * np.linalg.norm(alone.at(t) - p, axis=1), color="tab:blue", lw=0.8)
+    axes.plot(t, 1e3 * np.linalg.norm(fused.at(t) - p, axis=1), color="tab:red", lw=0.8)
+    axes.set(xlabel="time (s)", ylabel="from tracker (mm)", ylim=(0, None))
+    axes.grid(alpha=0.3)
+    figure.suptitle(title)
+    figure.savefig(file, dpi=110)
+    plt.close(figure)

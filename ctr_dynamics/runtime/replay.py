@@ -1,0 +1,402 @@
+"""Replay: a recorded bag through the estimator, without a ROS graph and as fast as it goes.
+
+Messages are given to the estimator in the order in which they arrived (log time, ties by topic name), all of
+one arrival time before a step is taken, so that a replay does what a node would have done, and twice the
+same.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import math
+import time
+from array import array
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ctr_dynamics import __version__
+from ctr_dynamics.errors import InputError
+from ctr_dynamics.io.atomic_files import atomic_file, check_targets
+from ctr_dynamics.io.bag_reader import Bag, InputMessage, open_bag
+from ctr_dynamics.io.bag_writer import BagWriter, write_bag
+from ctr_dynamics.io.messages.cdr import CdrError, JointStateIn, PoseIn, decode_stamp
+from ctr_dynamics.io.messages.encode import StepEncoder
+from ctr_dynamics.io.messages.topics import JOINT_STATES, STEP_NS, TRACKER_TIP
+from ctr_dynamics.parameters import PARAMETERS, Settings
+from ctr_dynamics.robot import Robot, load_robot
+from ctr_dynamics.runtime.clock_offset import EachOnce, StampClock
+from ctr_dynamics.runtime.garbage_collection import seldom_collected
+
+if TYPE_CHECKING:
+    from ctr_dynamics.estimation.estimator import Estimator, StepOutput
+    from ctr_dynamics.reporting.replay_report import ReplayLog
+
+MakeEstimator = Callable[[Robot, Settings], "Estimator"]
+Progress = Callable[[float, int], None]
+AFTER_NS = 1_000_000_000  # what arrives later than this after the last joint state changes no step
+LIVE_ONLY = ("qos.", "record.", "timing_report")  # parameters of a node
+_MAX_STRETCHES = 100
+
+
+@dataclass
+class ReplayResult:
+    """Outcome of a replay: the content of summary.json, and what was odd about the inputs, each kind in a line."""
+
+    summary: dict[str, Any]
+    notes: list[str] = field(default_factory=list)
+
+    @property
+    def failures(self) -> int:
+        """Steps that the solver could not take."""
+        return int(self.summary["solver"]["failures"])
+
+
+def last_joints(bag: Bag) -> tuple[int, int]:
+    """The last stamp of a joint state, ns, stamps of one that is wildly ahead left out, and the last log time of one."""
+    clock = StampClock(own=False)
+    last_ns = last_log_ns = 0
+    for _, log_ns, data in bag.messages({JOINT_STATES}):
+        with contextlib.suppress(CdrError):
+            stamp_ns = decode_stamp(data)
+            if clock.sample(stamp_ns, log_ns):
+                last_ns, last_log_ns = max(last_ns, stamp_ns), log_ns
+    return last_ns, last_log_ns
+
+
+def arrivals(messages: Iterator[InputMessage]) -> Iterator[list[InputMessage]]:
+    """Messages grouped by arrival time."""
+    group: list[InputMessage] = []
+    for item in messages:
+        if group and item.log_ns != group[0].log_ns:
+            yield group
+            group = []
+        group.append(item)
+    if group:
+        yield group
+
+
+class Player:
+    """Feeds an estimator from a bag and yields its steps."""
+
+    def __init__(self, estimator: Estimator) -> None:
+        self.estimator = estimator
+        estimator.step_times_s = array("d")
+        self.joint_names: set[str] = set()
+        self.unused = 0  # messages that came too long after the last joints
+        self._clock = StampClock(own=False)
+        self._now_ns: int | None = None
+        self._last_ns = 0  # the last joint stamp
+        self._call_times_s = array("d")
+
+    def times_s(self) -> Sequence[float]:
+        """Time spent on each step, in s, roll-back included.
+
+        From the estimator's own account (`step_times_s`) when it has one of every step; else steps that came
+        from one call share its time.
+        """
+        own = self.estimator.step_times_s
+        return own if own is not None and len(own) == len(self._call_times_s) else self._call_times_s
+
+    def play(self, bag: Bag) -> Iterator[StepOutput]:
+        """Steps in order, to the last joint stamp."""
+        self._last_ns, last_log_ns = last_joints(bag)
+        for group in arrivals(bag.inputs()):
+            log_ns = group[0].log_ns
+            if log_ns > last_log_ns + AFTER_NS:
+                self.unused += len(group)
+                continue
+            # what a live node would have done by itself before these messages came
+            yield from self._advance(log_ns - 1)
+            for item in group:
+                self._add(item)
+            yield from self._advance(log_ns)
+        yield from self._timed(self.estimator.finish)
+
+    def _add(self, item: InputMessage) -> None:
+        message = item.message
+        if isinstance(message, JointStateIn):
+            if len(self.joint_names) < 100:
+                self.joint_names.update(message.names[:100])
+            if self._clock.sample(message.stamp_ns, item.log_ns):
+                self.estimator.add_joint_state(message.stamp_ns, message.names, message.positions)
+            else:
+                refusal = self._clock.refusal(message.stamp_ns, item.log_ns)
+                self.estimator.health.note("joints", "far ahead", refusal)
+        elif isinstance(message, PoseIn):
+            self.estimator.add_tracker_pose(
+                message.stamp_ns, message.position, message.quaternion_xyzw, message.frame_id
+            )
+        else:
+            self.estimator.add_tip_load(message.stamp_ns, message.force, message.torque, message.frame_id)
+
+    def _advance(self, log_ns: int) -> Iterator[StepOutput]:
+        """Take what is due at that log time; the stamps' time goes back only where their clock has been set back."""
+        if self._clock.known:
+            now_ns = self._clock.at(log_ns)
+            if self._now_ns is not None and 0 < self._now_ns - now_ns <= self._clock.limit_ns:
+                now_ns = self._now_ns
+            self._now_ns = now_ns
+            until_ns = min(now_ns + self.estimator.lead_ns, self._last_ns)
+            yield from self._timed(partial(self.estimator.advance, until_ns))
+
+    def _timed(self, call: Callable[[], list[StepOutput]]) -> Iterator[StepOutput]:
+        begin = time.perf_counter()
+        steps = call()
+        if steps:
+            spent = (time.perf_counter() - begin) / len(steps)
+            self._call_times_s.extend([spent] * len(steps))
+            yield from steps
+            self.estimator.use_pause()
+
+
+class _Invalid:
+    """Stretches of invalid steps, for the summary."""
+
+    def __init__(self) -> None:
+        self.steps = 0
+        self.stretches: list[dict[str, Any]] = []
+        self._previous = -2
+
+    def add(self, out: StepOutput, first_ns: int) -> None:
+        if out.valid:
+            return
+        self.steps += 1
+        now = (out.stamp_ns - first_ns) * 1e-9
+        last = self.stretches[-1] if self.stretches else None
+        if last is not None and out.k == self._previous + 1 and last["reason"] == out.reason:
+            last["to_s"] = now
+        elif len(self.stretches) < _MAX_STRETCHES:
+            self.stretches.append({"from_s": now, "to_s": now, "reason": out.reason})
+        self._previous = out.k
+
+
+def plain(value: Any) -> Any:
+    """The value for JSON: NumPy numbers as plain ones, and null for what is not finite."""
+    if isinstance(value, dict):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple, np.ndarray)):
+        return [plain(item) for item in value]
+    if isinstance(value, np.generic):
+        value = value.item()
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
+
+
+def replay(
+    bag: str | Path,
+    robot: Robot | str | Path,
+    settings: Settings,
+    output: str | Path | None = None,
+    summary: str | Path | None = None,
+    progress: Progress | None = None,
+    make_estimator: MakeEstimator | None = None,
+    report: str | Path | None = None,
+) -> ReplayResult:
+    """Run a bag through the estimator.
+
+    Args:
+        bag: an ``.mcap`` file, a rosbag2 folder, or a folder that holds exactly one ``.mcap``.
+        robot: a robot, the name of a shipped one, or a robot file.
+        settings: parameters; ``output.policy`` counts as given (the command takes ``wait`` by default).
+        output: MCAP file to write every output topic to; None for none. Files appear only when the
+            replay ends well.
+        summary: JSON file for the summary; None for none.
+        progress: called now and then with the fraction done and the number of steps.
+        make_estimator: another estimator with the same interface.
+        report: HTML file for the report; None for none.
+
+    Raises:
+        InputError: an input that cannot be used, or no step at all.
+    """
+    opened = open_bag(bag)
+    opened.check_inputs()
+    if not isinstance(robot, Robot):
+        robot = load_robot(robot)
+    settings = settings.replace({"robot": robot.source or robot.name})
+    read = {"bag" if i == 0 else f"bag's part {i + 1}": file.path for i, file in enumerate(opened.files)}
+    check_targets(
+        {"output": output, "summary": summary, "report": report}, {**read, "robot file": robot.source}
+    )
+    inputs = opened.sha256()
+    provenance = {
+        "version": __version__,
+        "robot": {"name": robot.name, "source": robot.source, "sha256": robot.sha256},
+        "inputs": [{"name": name, "sha256": digest} for name, digest in inputs.items()],
+        "parameters": settings.as_dict(),
+    }
+    with contextlib.ExitStack() as stack:
+        writer: BagWriter | None = None
+        if output is not None:
+            writer = stack.enter_context(write_bag(Path(output), _metadata(provenance)))
+        summary_part = stack.enter_context(atomic_file(Path(summary))) if summary is not None else None
+        make = make_estimator or _rehearsed_estimator(robot, settings)
+        report_part = stack.enter_context(atomic_file(Path(report))) if report is not None else None
+        estimator = make(robot, settings)
+        log = _report_log(estimator, opened) if report_part is not None else None
+        stack.enter_context(seldom_collected())
+        numbers, times_s = _run(opened, estimator, robot, settings, writer, progress, log)
+        notes = [
+            *opened.notes,
+            *_without(opened, settings),
+            *_input_notes(numbers["input_problems"]),
+            *_left_out(numbers),
+        ]
+        content = plain({**numbers, **provenance, "notes": notes})
+        if summary_part is not None:
+            text = json.dumps(content, indent=1, allow_nan=False, ensure_ascii=False)
+            # a name that is not UTF-8 is escaped as JSON does it
+            summary_part.write_text(text + "\n", encoding="utf-8", errors="backslashreplace")
+        if report_part is not None and log is not None:
+            from ctr_dynamics.reporting.replay_report import replay_page
+
+            page = replay_page(log, content, times_s).text()
+            report_part.write_text(page, encoding="utf-8", errors="backslashreplace")
+    return ReplayResult(content, notes)
+
+
+def _rehearsed_estimator(robot: Robot, settings: Settings) -> MakeEstimator:
+    """The estimator, with everything compiled and loaded before the clock starts."""
+    # Imported late: it brings the compiled model, which reading and checking a bag do not need.
+    from ctr_dynamics.estimation.estimator import Estimator
+    from ctr_dynamics.estimation.warm_up import rehearse
+
+    rehearse(robot, settings)
+    return Estimator
+
+
+def _report_log(estimator: Estimator, bag: Bag) -> ReplayLog:
+    """What a report collects, with the bag's tracker samples in it."""
+    from ctr_dynamics.reporting.replay_report import ReplayLog  # brings the plotting library
+
+    log = ReplayLog(estimator.tracker)
+    for item in bag.inputs():
+        if isinstance(item.message, PoseIn):
+            log.pose(item.message)
+    return log
+
+
+def _run(
+    bag: Bag,
+    estimator: Estimator,
+    robot: Robot,
+    settings: Settings,
+    writer: BagWriter | None,
+    progress: Progress | None,
+    log: ReplayLog | None,
+) -> tuple[dict[str, Any], Sequence[float]]:
+    """The replay itself; returns the numbers of the summary and the time spent on each step, s."""
+    encoder = StepEncoder(settings["output.frame_id"], robot.name, settings["output.backbone_every"])
+    player = Player(estimator)
+    invalid = _Invalid()
+    steps = withheld = 0
+    stamps = EachOnce()
+    first_ns = last_ns = 0
+    blocks = [block for file in bag.files for block in file.blocks]
+    span_ns = max((b.end_ns for b in blocks), default=0) - min((b.start_ns for b in blocks), default=0)
+    begin = time.perf_counter()
+    for out in player.play(bag):
+        if not stamps.passes(out.stamp_ns):
+            withheld += 1
+            continue
+        if steps == 0:
+            first_ns = out.stamp_ns
+        last_ns = out.stamp_ns
+        steps += 1
+        invalid.add(out, first_ns)
+        if log is not None:
+            log.step(out)
+        if writer is not None:
+            for message in encoder.encode(out, estimator.health.statuses, estimator.health.snap_ahead):
+                writer.write(message.topic, message.stamp_ns, message.data)
+        if progress is not None and steps % 50 == 0:
+            progress(min(1.0, (last_ns - first_ns) / span_ns) if span_ns > 0 else 1.0, steps)
+    wall_s = time.perf_counter() - begin
+    if steps == 0:
+        raise no_step(bag, robot, player.joint_names, estimator.summary()["input_problems"]["joints"])
+    duration_s = (last_ns - first_ns) * 1e-9
+    p50, p99, worst = np.percentile(np.array(player.times_s()) * 1e3, (50, 99, 100))
+    numbers = {
+        **estimator.summary(),
+        "steps": steps,
+        "withheld": withheld,
+        "unused": player.unused,
+        "duration_s": duration_s,
+        "wall_s": wall_s,
+        "realtime_ratio": duration_s / wall_s,
+        "step_ms": {"p50": p50, "p99": p99, "max": worst},
+        "invalid": {"steps": invalid.steps, "stretches": invalid.stretches},
+        "malformed": dict(bag.malformed),
+    }
+    return numbers, player.times_s()
+
+
+def _metadata(provenance: dict[str, Any]) -> dict[str, str]:
+    """Provenance as the text entries of an MCAP metadata record."""
+    return {
+        key: value if isinstance(value, str) else json.dumps(plain(value), sort_keys=True)
+        for key, value in provenance.items()
+    }
+
+
+def _input_notes(problems: dict[str, dict[str, Any]]) -> list[str]:
+    """A line for each kind of odd input that the estimator has noted, by group."""
+    return [
+        f"{group}: {kind} ({found['count']}), the last: {found['last']}"
+        for group, kinds in problems.items()
+        for kind, found in kinds.items()
+    ]
+
+
+def _without(bag: Bag, settings: Settings) -> list[str]:
+    """What a replay does without: a tracker, and the live node's own outputs."""
+    tracker = bag.topics.get(TRACKER_TIP)
+    notes = (
+        []
+        if tracker is not None and tracker.messages
+        else [f"no pose on {TRACKER_TIP}: the model runs alone"]
+    )
+    live = [p.name for p in PARAMETERS if p.name.startswith(LIVE_ONLY) and settings[p.name] != p.default]
+    if live:
+        notes.append(f"parameters of the live node alone, without effect here: {', '.join(live)}")
+    return notes
+
+
+def _left_out(numbers: dict[str, Any]) -> list[str]:
+    """What of the bag, and of the steps, is in no output."""
+    withheld, unused = numbers["withheld"], numbers["unused"]
+    notes = []
+    if withheld:
+        notes.append(
+            f"joints: their clock was set back; {withheld} steps of {STEP_NS * 1e-6:g} ms lie before what was out already "
+            "and are left out, as no stamp is published twice: cut it off with `mcap filter` and replay it by itself"
+        )
+    if unused:
+        notes.append(
+            f"{unused} messages came more than {AFTER_NS * 1e-9:g} s after the last joint state and are not used: a replay ends with the joints"
+        )
+    return notes
+
+
+def no_step(bag: Bag, robot: Robot, names: set[str], problems: dict[str, Any]) -> InputError:
+    """Why a replay of ``bag`` has had no step, from the joint ``names`` in it and the estimator's ``problems`` with them."""
+    expected = ", ".join(f"tube{i}_rotation, tube{i}_translation" for i in range(1, robot.n_tubes + 1))
+    found = ", ".join(sorted(names)[:12]) or "none"
+    odd = "".join(f"; {note}" for note in _input_notes({"joints": problems}))
+    return InputError(
+        f"no step was possible: no usable joint state of robot '{robot.name}' on {JOINT_STATES} (joints "
+        f"found: {found}; needed: {expected}; readable messages: {_readable(bag)}{odd})",
+        where=str(bag.path),
+        do="check joint names, units and robot with `ctr-dynamics info`",
+    )
+
+
+def _readable(bag: Bag) -> int:
+    topic = bag.topics.get(JOINT_STATES)
+    return (topic.messages if topic else 0) - bag.malformed.get(JOINT_STATES, 0)

@@ -1,0 +1,1 @@
+"""Generators of the tables and pages of the documentation."""

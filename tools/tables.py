@@ -1,0 +1,148 @@
+"""Tables of README.md, config/estimator.yaml and docs/reference.md, written from the code's own tables.
+
+`python -m tools.tables` says what is out of date (exit code 1); with `--write` it mends it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from ctr_dynamics.errors import InputError
+from ctr_dynamics.io.messages.topics import TOPICS
+from ctr_dynamics.parameters import PARAMETERS, Parameter
+from tools import reference
+
+ESTIMATOR_YAML = Path("ctr_dynamics/config/estimator.yaml")
+
+
+def _markdown(header: list[str], rows: list[list[str]]) -> str:
+    lines = [header, ["---"] * len(header), *([cell.replace("|", "\\|") for cell in row] for row in rows)]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+
+
+def _shown(value: Any) -> str:
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, tuple):
+        return "[" + ", ".join(f"{v:g}" for v in value) + "]"
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def parameter_table() -> str:
+    """Markdown table of every parameter."""
+    types = {"floats": "float[3]", "str": "string"}
+    rows = [
+        [
+            f"`{p.name}`",
+            types.get(p.type, p.type),
+            f"`{_shown(p.default)}`" if p.default != "" else "empty",
+            p.unit,
+            p.range,
+            p.text + (" Read-only while the node runs." if p.read_only else ""),
+        ]
+        for p in PARAMETERS
+    ]
+    return _markdown(["name", "type", "default", "unit", "range", "what it does"], rows)
+
+
+def topic_table() -> str:
+    """Markdown table of every topic, inputs first."""
+    rows = [
+        [t.direction, f"`{t.name}`", t.ros_type.replace("/msg/", "/"), t.rate, t.meaning]
+        for t in sorted(TOPICS, key=lambda t: t.direction)
+    ]
+    return _markdown(["", "topic", "type", "rate", "meaning"], rows)
+
+
+# Marker in README.md -> what stands between it and its end marker.
+SECTIONS = {"parameters": parameter_table, "topics": topic_table}
+
+
+def render_readme(text: str) -> str:
+    """README text with every generated table brought up to date.
+
+    Raises:
+        InputError: a marker is missing.
+    """
+    for name, table in SECTIONS.items():
+        begin, end = f"<!-- {name}: generated -->", f"<!-- {name}: end -->"
+        head, found, rest = text.partition(begin)
+        _, ended, tail = rest.partition(end)
+        if not found or not ended:
+            raise InputError(f"marker '{begin}' or '{end}' is missing", do="put both in", where="README.md")
+        text = f"{head}{begin}\n{table()}\n{end}{tail}"
+    return text
+
+
+def estimator_yaml() -> str:
+    """A ROS 2 parameter file with every parameter at its default, each with its unit, range and text."""
+    groups: dict[str, list[str]] = {}
+    for p in PARAMETERS:
+        head, dot, leaf = p.name.rpartition(".")
+        indent = "      " if dot else "    "
+        group = groups.setdefault(head, [f"    {head}:"] if dot else [])
+        group += [f"{indent}# {_comment(p)}", f"{indent}{leaf}: {_yaml_value(p.default)}"]
+    lines = [
+        "# Every parameter of the estimator at its default, for the node (--ros-args --params-file) and for",
+        "# `ctr-dynamics replay` (--params).",
+        "/ctr/estimator:",
+        "  ros__parameters:",
+        *(line for group in groups.values() for line in group),
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def _comment(p: Parameter) -> str:
+    notes = [part for part in (p.unit, p.range, "read-only while running" if p.read_only else "") if part]
+    return p.text + (f" ({'; '.join(notes)})" if notes else "")
+
+
+def _yaml_value(value: Any) -> str:
+    if isinstance(value, tuple):
+        return "[" + ", ".join(repr(v) for v in value) + "]"
+    if isinstance(value, float):
+        # ROS reads a number with a point or an exponent after a point as a double, and 1e-09 as text
+        mantissa, e, exponent = repr(value).partition("e")
+        return f"{mantissa if '.' in mantissa else mantissa + '.0'}{e}{exponent}"
+    return yaml.safe_dump(value).splitlines()[0]
+
+
+def outdated(root: Path) -> dict[Path, str]:
+    """Files below `root` whose generated parts are out of date, with the text they should have."""
+    readme = root / "README.md"
+    wanted = {
+        readme: render_readme(readme.read_text(encoding="utf-8")),
+        root / ESTIMATOR_YAML: estimator_yaml(),
+        root / reference.PAGE: reference.render(),
+    }
+    return {
+        path: text
+        for path, text in wanted.items()
+        if not path.is_file() or path.read_text(encoding="utf-8") != text
+    }
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Check or write; 0 when everything is up to date."""
+    parser = argparse.ArgumentParser(prog="python -m tools.tables", description=__doc__)
+    parser.add_argument("--write", action="store_true", help="bring the files up to date")
+    parser.add_argument("--root", type=Path, default=Path(), help="the source tree")
+    options = parser.parse_args(argv)
+    late = outdated(options.root)
+    for path, text in late.items():
+        if options.write:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_text(text, encoding="utf-8")
+            print(f"wrote {path}")
+        else:
+            print(f"{path} is out of date; run python -m tools.tables --write", file=sys.stderr)
+    return 0 if options.write or not late else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())
