@@ -15,8 +15,8 @@ os.environ.setdefault("MPLBACKEND", "Agg")
 
 import pytest
 
-# Before anything imports NumPy: the package asks it for one thread, which counts only while it is loaded.
-import ctr_dynamics  # noqa: F401
+# Before anything imports NumPy: the workers of a run share the cores.
+import ctr_dynamics.one_blas_thread  # noqa: F401
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from typing import Any, Protocol
 
 
 class Writer(Protocol):
-    """What the recorder needs of a bag writer, such as `bagio.writer.LiveRecorder`."""
+    """What the recorder needs of a bag writer, such as `io.bag_writer.LiveRecorder`."""
 
     def write(self, topic: str, log_ns: int, data: bytes) -> None: ...
     def close(self) -> None: ...

@@ -1,17 +1,15 @@
-"""The rolling recording: what it keeps, when it writes, and over DDS that diagnosis can read what a misfit left behind."""
+"""The ring buffer recording: what it keeps, when it writes and what it says."""
 
 import threading
 
 import pytest
 
-from ctr_dynamics.diagnosis.recording import read_recording
 from ctr_dynamics.errors import InputError
 from ctr_dynamics.estimation.step_output import WARN, Status
 from ctr_dynamics.io.bag_reader import open_bag
 from ctr_dynamics.io.messages import topics
 from ctr_dynamics.io.messages.cdr import decode_stamp
 from ctr_dynamics.io.messages.encode import encode_joint_state, encode_wrench_stamped
-from ctr_dynamics.robot import load_robot
 from ctr_dynamics.runtime import ring_buffer_recording as rolling
 from ctr_dynamics.runtime.ring_buffer_recording import RollingRecording
 
@@ -94,33 +92,3 @@ def test_what_cannot_be_written_is_said_and_the_thread_goes_on(made, tmp_path):
 def test_a_path_that_cannot_be_is_refused_at_the_start(tmp_path):
     with pytest.raises(InputError, match=r"record\.rolling_path"):
         RollingRecording(tmp_path / "none" / "a.mcap", 2.0, "r", {}, print)
-
-
-@pytest.mark.ros
-def test_a_misfit_leaves_a_bag_that_diagnosis_reads(start, tmp_path):
-    path = tmp_path / "rolling.mcap"
-    with start({"record.rolling_s": 20.0, "record.rolling_path": str(path)}) as live:
-        robot = live.resting_robot()
-        live.wait_for_more(topics.INNOVATION, 150)
-        answer = live.trigger("save_snapshot")
-        assert answer.success, answer.message
-        live.wait(path.exists, "the recording of the snapshot")
-        asked = read_recording(path, load_robot("till2020_tissue"))
-        assert live.status("misfit").level == bytes([0]), live.status("misfit")
-        agreeing = robot.agreeing_pose
-
-        def shifted():
-            pose = agreeing()
-            x, y, z = pose.position
-            return pose._replace(position=(x + 0.02, y, z))
-
-        robot.agreeing_pose = shifted
-        status = live.wait_for_status("misfit", 1, "2 times written")
-        assert (
-            f"run: ctr-dynamics diagnose {path} --robot till2020_tissue --output findings" in status.message
-        )
-        recording = read_recording(path, load_robot("till2020_tissue"))
-        assert recording.duration > asked.duration
-        assert recording.joints.shape[1] == 5
-        assert set(recording.sha256) == {"rolling.mcap"}
-    assert "exit under an alarm" in live.process.output()
