@@ -1,19 +1,12 @@
-"""What the launch files have in common. Needs `launch` and `launch_ros` of a sourced ROS 2."""
+"""What the launch files have in common.
+
+`launch` and `launch_ros` come with a sourced ROS 2 and not from PyPI: they are imported when a launch file asks for its description.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from typing import Any
-
-from launch.actions import DeclareLaunchArgument, EmitEvent, RegisterEventHandler
-from launch.conditions import IfCondition
-from launch.event_handlers import OnProcessExit
-from launch.events import Shutdown
-from launch.substitutions import LaunchConfiguration
-from launch_ros.actions import Node
-from launch_ros.substitutions import FindPackageShare
-
-from launch import LaunchDescription  # type: ignore[attr-defined]  # a folder of that name is here too
 
 # Name -> what it is; a launch file gives each of its own a default.
 ARGUMENTS = {
@@ -36,7 +29,6 @@ ESTIMATOR_PARAMETERS = {
 DEFAULTS: dict[str, Any] = {
     "robot": "till2020_tissue",
     "policy": "predict",
-    "params": [FindPackageShare("ctr_dynamics"), "/config/estimator.yaml"],
     "record": "",
     "view": "false",
 }
@@ -46,15 +38,28 @@ def description(
     defaults: Mapping[str, Any],
     fixed: Mapping[str, Any] | None = None,
     driver: Mapping[str, Any] | None = None,
-) -> LaunchDescription:
+) -> Any:
     """Estimator and view, and with `driver` a driver that plays the bag of argument `bag` and ends everything at its end.
 
     Args:
         defaults: arguments of this launch file beside those of `DEFAULTS`, or in their stead.
         fixed: parameters of the estimator that are no arguments.
         driver: parameters of the driver; None starts none.
+
+    Returns:
+        A `launch.LaunchDescription`.
     """
-    given = {**DEFAULTS, **defaults}
+    from launch.actions import DeclareLaunchArgument, EmitEvent, RegisterEventHandler
+    from launch.conditions import IfCondition
+    from launch.event_handlers import OnProcessExit
+    from launch.events import Shutdown
+    from launch.substitutions import LaunchConfiguration
+    from launch_ros.substitutions import FindPackageShare
+
+    from launch import LaunchDescription  # type: ignore[attr-defined]  # a folder of that name is here too
+
+    params = [FindPackageShare("ctr_dynamics"), "/config/estimator.yaml"]
+    given = {**DEFAULTS, "params": params, **defaults}
     entities: list[Any] = [
         DeclareLaunchArgument(name, default_value=value, description=ARGUMENTS[name])
         for name, value in given.items()
@@ -79,7 +84,9 @@ def description(
     return LaunchDescription(entities)
 
 
-def _node(executable: str, parameters: Sequence[Any], name: str = "", **options: Any) -> Node:
+def _node(executable: str, parameters: Sequence[Any], name: str = "", **options: Any) -> Any:
+    from launch_ros.actions import Node
+
     return Node(
         package="ctr_dynamics",
         executable=executable,

@@ -45,7 +45,6 @@ def launch_file(monkeypatch):
         for name in names:
             setattr(stub, name, stand_in(name))
         monkeypatch.setitem(sys.modules, module, stub)
-    monkeypatch.delitem(sys.modules, "ctr_dynamics.ros.launch_files", raising=False)
 
     def load(name):
         path = ROOT / "launch" / f"{name}.launch.py"
