@@ -30,8 +30,8 @@ def one(stratum: str, seed: int) -> dict[str, Any]:
             sys.path.insert(0, str(folder))
     from truth.cases import make_case
 
-    from ctr_dynamics.diagnosis.diagnose import diagnose
-    from ctr_dynamics.diagnosis.findings import findings
+    from ctr_dynamics.diagnosis.output.findings import findings
+    from ctr_dynamics.diagnosis.pipeline import diagnose
     from ctr_dynamics.diagnosis.recording import read_recording
     from ctr_dynamics.robot import load_robot
 
@@ -73,10 +73,10 @@ def one(stratum: str, seed: int) -> dict[str, Any]:
 
 def separations(result: Any, answer: dict[str, Any]) -> dict[str, float]:
     """d_sep of every true cause, from the true effects fitted to the data, against the nearest rival."""
-    from ctr_dynamics.diagnosis.candidates import causes_of
-    from ctr_dynamics.diagnosis.explanations import with_nuisances
-    from ctr_dynamics.diagnosis.fit import fit
-    from ctr_dynamics.diagnosis.signatures import linearise, separation
+    from ctr_dynamics.diagnosis.inference.candidates import causes_of
+    from ctr_dynamics.diagnosis.inference.hypotheses import with_nuisances
+    from ctr_dynamics.diagnosis.inference.map_fit import fit
+    from ctr_dynamics.diagnosis.inference.sensitivities import linearise, separation
 
     problem, found = result.problem, result.search
     members, start = [], {}
@@ -112,7 +112,7 @@ def separations(result: Any, answer: dict[str, Any]) -> dict[str, float]:
 
 def removed(result: Any, answer: dict[str, Any]) -> float | None:
     """Share of the removable held-out error that the extension removes: 1 - (ext^2 - floor^2) / (rec^2 - floor^2)."""
-    from ctr_dynamics.diagnosis.noise import noise_floor
+    from ctr_dynamics.diagnosis.whitening import noise_floor
 
     v = result.validation
     if v is None or not answer["hidden"]:

@@ -51,7 +51,7 @@ def diagnose(
     report: Annotated[bool, typer.Option("--report/--no-report", help="Write report.html.")] = True,
 ) -> int:
     """Find what the simulation gets wrong about the recorded robot, name the cause, extend the model and measure the gain."""
-    from ctr_dynamics.diagnosis.command import Request, run
+    from ctr_dynamics.diagnosis.request import Request, run
 
     loaded = load_robot(robot)
     for path in (*bags, *(validate or [])):
@@ -86,7 +86,7 @@ def diagnose(
     else:
         for text in content["notes"]:
             print(f"ctr-dynamics: note: {text}", file=sys.stderr)
-        from ctr_dynamics.diagnosis.sentences import summary
+        from ctr_dynamics.diagnosis.output.summary_text import summary
 
         print("\n".join(summary(content)))
         print(f"findings: {output / 'findings.json'}")
@@ -100,7 +100,7 @@ def _on_cluster(address: str, request: Any) -> dict[str, Any]:
         raise InputError(
             "--cluster needs dask.distributed", do="pip install 'ctr_dynamics[cluster]'"
         ) from None
-    from ctr_dynamics.diagnosis.command import run
+    from ctr_dynamics.diagnosis.request import run
 
     try:
         client = Client(address, timeout="10s")

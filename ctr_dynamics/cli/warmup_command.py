@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 from joblib import Parallel, delayed
 
-from ctr_dynamics.diagnosis.rehearsal import rehearse as rehearse_diagnosis
+from ctr_dynamics.diagnosis.kernel_warm_up import rehearse as rehearse_diagnosis
 from ctr_dynamics.estimation.warm_up import rehearse as rehearse_node
 from ctr_dynamics.kernels.compiler import cache_folder
 from ctr_dynamics.parameters import Settings

@@ -5,14 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ctr_dynamics.diagnosis import numerics
-from ctr_dynamics.diagnosis.candidates import candidates, causes_of
-from ctr_dynamics.diagnosis.experiment import NODES, Experiment
-from ctr_dynamics.diagnosis.explanations import Explanation
-from ctr_dynamics.diagnosis.exploration import _replace, _stand_ins
-from ctr_dynamics.diagnosis.fit import REACH, corrected, fit, make_problem
+from ctr_dynamics.diagnosis.forward_model import NODES, Experiment
+from ctr_dynamics.diagnosis.inference import discretisation_error as numerics
+from ctr_dynamics.diagnosis.inference.candidates import candidates, causes_of
+from ctr_dynamics.diagnosis.inference.hypotheses import Explanation
+from ctr_dynamics.diagnosis.inference.hypothesis_search import _replace, _stand_ins
+from ctr_dynamics.diagnosis.inference.map_fit import REACH, corrected, fit, make_problem
+from ctr_dynamics.diagnosis.inference.sensitivities import far_probes, linearise, screen
 from ctr_dynamics.diagnosis.recording import Recording
-from ctr_dynamics.diagnosis.signatures import far_probes, linearise, screen
 from ctr_dynamics.effects import quantities
 from ctr_dynamics.model import trajectory
 from ctr_dynamics.robot import load_robot

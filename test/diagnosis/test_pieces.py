@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 
 from ctr_dynamics.cli.main import spread
-from ctr_dynamics.diagnosis.candidates import candidates
-from ctr_dynamics.diagnosis.checks import block_bootstrap
-from ctr_dynamics.diagnosis.diagnose import Validation
-from ctr_dynamics.diagnosis.experiment import at_times, play, product, rotate, smooth, to_vectors
-from ctr_dynamics.diagnosis.explanations import along
-from ctr_dynamics.diagnosis.fit import _Descent, posterior
-from ctr_dynamics.diagnosis.noise import Whitener
-from ctr_dynamics.diagnosis.signatures import PROBE_STEP
+from ctr_dynamics.diagnosis.forward_model import at_times, play, product, rotate, smooth, to_vectors
+from ctr_dynamics.diagnosis.inference.candidates import candidates
+from ctr_dynamics.diagnosis.inference.hypotheses import along
+from ctr_dynamics.diagnosis.inference.map_fit import _Descent, posterior
+from ctr_dynamics.diagnosis.inference.sensitivities import PROBE_STEP
+from ctr_dynamics.diagnosis.pipeline import Validation
+from ctr_dynamics.diagnosis.verdict.residual_tests import block_bootstrap
+from ctr_dynamics.diagnosis.whitening import Whitener
 from ctr_dynamics.effects import EFFECTS, Parameter, Quantity, quantities
 from ctr_dynamics.robot import load_robot
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ctr_dynamics.diagnosis.diagnose import measured_axes
+from ctr_dynamics.diagnosis.pipeline import measured_axes
 from ctr_dynamics.diagnosis.recording import GAP, SETTLING, SHORTEST, UNSETTLED, read_recording
 from ctr_dynamics.errors import InputError
 from ctr_dynamics.io.bag_writer import write_bag

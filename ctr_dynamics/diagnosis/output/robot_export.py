@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ctr_dynamics.diagnosis.fit import Fit, Key
+from ctr_dynamics.diagnosis.inference.map_fit import Fit, Key
 from ctr_dynamics.effects import EFFECTS
 from ctr_dynamics.kernels.rotations import from_vector, matrix, multiply, to_vector
 from ctr_dynamics.robot import Robot, robot_from_dict, robot_to_dict

@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import log_ndtr
 
-from ctr_dynamics.diagnosis.candidates import Candidate, keys_of, log_prior, tube_of
-from ctr_dynamics.diagnosis.fit import INSIDE, LOG_INSIDE, Fit, Key, Problem
-from ctr_dynamics.diagnosis.signatures import Linearisation
+from ctr_dynamics.diagnosis.inference.candidates import Candidate, keys_of, log_prior, tube_of
+from ctr_dynamics.diagnosis.inference.map_fit import INSIDE, LOG_INSIDE, Fit, Key, Problem
+from ctr_dynamics.diagnosis.inference.sensitivities import Linearisation
 from ctr_dynamics.effects import Quantity
 
 Floats = NDArray[np.float64]

@@ -11,9 +11,9 @@ from joblib import Parallel, delayed
 from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
-from ctr_dynamics.diagnosis.candidates import Candidate, causes_of, keys_of
-from ctr_dynamics.diagnosis.fit import Fit, Key, Local, Problem, fit, posterior, variances
-from ctr_dynamics.diagnosis.signatures import PROBE_STEP, Linearisation, Scored, strayed
+from ctr_dynamics.diagnosis.inference.candidates import Candidate, causes_of, keys_of
+from ctr_dynamics.diagnosis.inference.map_fit import Fit, Key, Local, Problem, fit, posterior, variances
+from ctr_dynamics.diagnosis.inference.sensitivities import PROBE_STEP, Linearisation, Scored, strayed
 from ctr_dynamics.effects import EFFECTS, Quantity, quantities
 
 Floats = NDArray[np.float64]

@@ -16,8 +16,10 @@ import numpy as np
 from joblib import Parallel, delayed
 from numpy.typing import NDArray
 
-from ctr_dynamics.diagnosis.candidates import Candidate, keys_of, log_prior
-from ctr_dynamics.diagnosis.explanations import (
+from ctr_dynamics.diagnosis.inference.candidates import Candidate, keys_of, log_prior
+from ctr_dynamics.diagnosis.inference.contact_plane import wall
+from ctr_dynamics.diagnosis.inference.discretisation_error import renew_numerics
+from ctr_dynamics.diagnosis.inference.hypotheses import (
     Explanation,
     Job,
     combined,
@@ -27,11 +29,16 @@ from ctr_dynamics.diagnosis.explanations import (
     reduced,
     replaced,
 )
-from ctr_dynamics.diagnosis.fit import Fit, Key, Problem, corrected
-from ctr_dynamics.diagnosis.numerics import renew_numerics
-from ctr_dynamics.diagnosis.sets import rank_sets
-from ctr_dynamics.diagnosis.signatures import Linearisation, Scored, far_probes, linearise, screen, separation
-from ctr_dynamics.diagnosis.wall import wall
+from ctr_dynamics.diagnosis.inference.map_fit import Fit, Key, Problem, corrected
+from ctr_dynamics.diagnosis.inference.pair_ranking import rank_sets
+from ctr_dynamics.diagnosis.inference.sensitivities import (
+    Linearisation,
+    Scored,
+    far_probes,
+    linearise,
+    screen,
+    separation,
+)
 from ctr_dynamics.effects import EFFECTS, quantities
 
 Floats = NDArray[np.float64]

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from ctr_dynamics.diagnosis.fit import Problem
+from ctr_dynamics.diagnosis.inference.map_fit import Problem
 
 Floats = NDArray[np.float64]
 LAGS = 20  # of the Ljung-Box test: half a second at 40 Hz

@@ -10,12 +10,12 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from scipy.signal import periodogram
 
-from ctr_dynamics.diagnosis.checks import by_axis
-from ctr_dynamics.diagnosis.diagnose import Diagnosis
-from ctr_dynamics.diagnosis.fit import Fit
-from ctr_dynamics.diagnosis.noise import noise_floor
-from ctr_dynamics.diagnosis.sentences import summary
-from ctr_dynamics.diagnosis.signatures import separation
+from ctr_dynamics.diagnosis.inference.map_fit import Fit
+from ctr_dynamics.diagnosis.inference.sensitivities import separation
+from ctr_dynamics.diagnosis.output.summary_text import summary
+from ctr_dynamics.diagnosis.pipeline import Diagnosis
+from ctr_dynamics.diagnosis.verdict.residual_tests import by_axis
+from ctr_dynamics.diagnosis.whitening import noise_floor
 from ctr_dynamics.effects import EFFECTS
 from ctr_dynamics.io.atomic_files import atomic_file
 from ctr_dynamics.reporting.figures import Panel, figure_svg, to_svg

@@ -7,15 +7,16 @@ from itertools import combinations
 import numpy as np
 import pytest
 
-from ctr_dynamics.diagnosis import explanations, exploration
-from ctr_dynamics.diagnosis.candidates import Candidate, causes_of
-from ctr_dynamics.diagnosis.diagnose import needed
-from ctr_dynamics.diagnosis.explanations import Explanation
-from ctr_dynamics.diagnosis.exploration import Search, probabilities, weigh
-from ctr_dynamics.diagnosis.fit import fit
-from ctr_dynamics.diagnosis.search import second_opinion
-from ctr_dynamics.diagnosis.sets import rank_sets
-from ctr_dynamics.diagnosis.signatures import Linearisation
+from ctr_dynamics.diagnosis.inference import hypotheses as explanations
+from ctr_dynamics.diagnosis.inference import hypothesis_search as exploration
+from ctr_dynamics.diagnosis.inference.candidates import Candidate, causes_of
+from ctr_dynamics.diagnosis.inference.hypotheses import Explanation
+from ctr_dynamics.diagnosis.inference.hypothesis_search import Search, probabilities, weigh
+from ctr_dynamics.diagnosis.inference.map_fit import fit
+from ctr_dynamics.diagnosis.inference.pair_ranking import rank_sets
+from ctr_dynamics.diagnosis.inference.search_stages import second_opinion
+from ctr_dynamics.diagnosis.inference.sensitivities import Linearisation
+from ctr_dynamics.diagnosis.pipeline import needed
 from ctr_dynamics.effects import EFFECTS, Parameter, Quantity
 
 

@@ -9,9 +9,11 @@ from dataclasses import replace
 import numpy as np
 from joblib import Parallel, delayed
 
-from ctr_dynamics.diagnosis.candidates import Candidate
-from ctr_dynamics.diagnosis.explanations import Explanation, finish, look_closer, with_nuisances
-from ctr_dynamics.diagnosis.exploration import (
+from ctr_dynamics.diagnosis.inference.candidates import Candidate
+from ctr_dynamics.diagnosis.inference.contact_plane import parting
+from ctr_dynamics.diagnosis.inference.discretisation_error import add_numerics
+from ctr_dynamics.diagnosis.inference.hypotheses import Explanation, finish, look_closer, with_nuisances
+from ctr_dynamics.diagnosis.inference.hypothesis_search import (
     CONTENDERS,
     LEFT_SHARE,
     MUCH,
@@ -22,9 +24,7 @@ from ctr_dynamics.diagnosis.exploration import (
     probabilities,
     weigh,
 )
-from ctr_dynamics.diagnosis.fit import Fit, Problem, corrected, fit, make_problem, posterior
-from ctr_dynamics.diagnosis.numerics import add_numerics
-from ctr_dynamics.diagnosis.wall import parting
+from ctr_dynamics.diagnosis.inference.map_fit import Fit, Problem, corrected, fit, make_problem, posterior
 from ctr_dynamics.effects import EFFECTS
 
 EARLY = 1.0  # s after model and measurement part, to which causes are first fitted where there are impacts

@@ -16,11 +16,11 @@ from joblib import Parallel, delayed
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from ctr_dynamics.diagnosis.candidates import Candidate
-from ctr_dynamics.diagnosis.experiment import Experiment
-from ctr_dynamics.diagnosis.fit import Key, Problem
-from ctr_dynamics.diagnosis.noise import noise_floor
+from ctr_dynamics.diagnosis.forward_model import Experiment
+from ctr_dynamics.diagnosis.inference.candidates import Candidate
+from ctr_dynamics.diagnosis.inference.map_fit import Key, Problem
 from ctr_dynamics.diagnosis.recording import Recording
+from ctr_dynamics.diagnosis.whitening import noise_floor
 from ctr_dynamics.effects import Quantity
 from ctr_dynamics.kernels.rotations import matrix
 

@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from scipy.optimize import lsq_linear
 from scipy.special import log_ndtr
 
-from ctr_dynamics.diagnosis.experiment import NODES, Experiment
-from ctr_dynamics.diagnosis.noise import Whitener
+from ctr_dynamics.diagnosis.forward_model import NODES, Experiment
 from ctr_dynamics.diagnosis.recording import Recording
+from ctr_dynamics.diagnosis.whitening import Whitener
 from ctr_dynamics.effects import Quantity
 from ctr_dynamics.errors import InputError
 from ctr_dynamics.robot import Robot

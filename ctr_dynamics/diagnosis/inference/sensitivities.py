@@ -10,8 +10,17 @@ import numpy as np
 from joblib import Parallel, delayed
 from numpy.typing import NDArray
 
-from ctr_dynamics.diagnosis.candidates import Candidate, causes_of, keys_of, tube_of
-from ctr_dynamics.diagnosis.fit import INSIDE, Fit, Key, Problem, inside, posterior, prior_variance, variances
+from ctr_dynamics.diagnosis.inference.candidates import Candidate, causes_of, keys_of, tube_of
+from ctr_dynamics.diagnosis.inference.map_fit import (
+    INSIDE,
+    Fit,
+    Key,
+    Problem,
+    inside,
+    posterior,
+    prior_variance,
+    variances,
+)
 from ctr_dynamics.effects import EFFECTS, Quantity
 
 Floats = NDArray[np.float64]

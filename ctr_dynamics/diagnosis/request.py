@@ -9,12 +9,12 @@ from typing import Any
 
 import yaml
 
-from ctr_dynamics.diagnosis.diagnose import diagnose
-from ctr_dynamics.diagnosis.findings import findings, write
-from ctr_dynamics.diagnosis.planning import Plan, plan
+from ctr_dynamics.diagnosis.kernel_warm_up import rehearse
+from ctr_dynamics.diagnosis.output.findings import findings, write
+from ctr_dynamics.diagnosis.output.findings_report import write_report
+from ctr_dynamics.diagnosis.pipeline import diagnose
 from ctr_dynamics.diagnosis.recording import Recording, read_recording
-from ctr_dynamics.diagnosis.rehearsal import rehearse
-from ctr_dynamics.diagnosis.report import write_report
+from ctr_dynamics.diagnosis.verdict.next_experiment import Plan, plan
 from ctr_dynamics.errors import InputError
 from ctr_dynamics.io.atomic_files import atomic_file, output_folder
 from ctr_dynamics.robot import Robot

@@ -8,13 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ctr_dynamics.diagnosis.candidates import Candidate
-from ctr_dynamics.diagnosis.diagnose import Diagnosis
-from ctr_dynamics.diagnosis.experiment import Experiment
-from ctr_dynamics.diagnosis.fit import prior_variance
-from ctr_dynamics.diagnosis.noise import Whitener
+from ctr_dynamics.diagnosis.forward_model import Experiment
+from ctr_dynamics.diagnosis.inference.candidates import Candidate
+from ctr_dynamics.diagnosis.inference.map_fit import prior_variance
+from ctr_dynamics.diagnosis.inference.sensitivities import left_over, separation
+from ctr_dynamics.diagnosis.pipeline import Diagnosis
 from ctr_dynamics.diagnosis.recording import Recording
-from ctr_dynamics.diagnosis.signatures import left_over, separation
+from ctr_dynamics.diagnosis.whitening import Whitener
 from ctr_dynamics.errors import InputError
 from ctr_dynamics.model.model import Model
 from ctr_dynamics.robot import Robot

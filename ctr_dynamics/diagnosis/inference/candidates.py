@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ctr_dynamics.diagnosis.fit import Key
+from ctr_dynamics.diagnosis.inference.map_fit import Key
 from ctr_dynamics.effects import EFFECTS, Quantity
 
 Floats = NDArray[np.float64]

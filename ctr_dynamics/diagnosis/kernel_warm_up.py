@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ctr_dynamics.diagnosis.experiment import Experiment
+from ctr_dynamics.diagnosis.forward_model import Experiment
 from ctr_dynamics.diagnosis.recording import Recording
 from ctr_dynamics.effects import quantities
 from ctr_dynamics.robot import Robot

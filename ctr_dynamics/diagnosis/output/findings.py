@@ -11,11 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctr_dynamics import __version__
-from ctr_dynamics.diagnosis.checks import rms
-from ctr_dynamics.diagnosis.diagnose import Diagnosis, Member
-from ctr_dynamics.diagnosis.fit import Fit
-from ctr_dynamics.diagnosis.noise import noise_floor
-from ctr_dynamics.diagnosis.robots import robot_of
+from ctr_dynamics.diagnosis.inference.map_fit import Fit
+from ctr_dynamics.diagnosis.output.robot_export import robot_of
+from ctr_dynamics.diagnosis.pipeline import Diagnosis, Member
+from ctr_dynamics.diagnosis.verdict.residual_tests import rms
+from ctr_dynamics.diagnosis.whitening import noise_floor
 from ctr_dynamics.effects import EFFECTS, Quantity
 from ctr_dynamics.io.atomic_files import atomic_file
 from ctr_dynamics.robot import robot_to_yaml

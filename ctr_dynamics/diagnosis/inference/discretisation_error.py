@@ -8,8 +8,8 @@ import numpy as np
 from joblib import Parallel, delayed
 from numpy.typing import NDArray
 
-from ctr_dynamics.diagnosis.experiment import Experiment
-from ctr_dynamics.diagnosis.fit import Key, Problem
+from ctr_dynamics.diagnosis.forward_model import Experiment
+from ctr_dynamics.diagnosis.inference.map_fit import Key, Problem
 
 Floats = NDArray[np.float64]
 NUMERICS_SIGMA = 0.6  # of the difference to a finer solution, which the prediction includes

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import lombscargle
 
-from ctr_dynamics.diagnosis.experiment import Experiment, Point
+from ctr_dynamics.diagnosis.forward_model import Experiment, Point
 from ctr_dynamics.effects import quantities
 
 Floats = NDArray[np.float64]

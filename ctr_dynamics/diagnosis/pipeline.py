@@ -1,7 +1,7 @@
 """From bags and a robot file to findings: the order of the work, and the verdict.
 
 Numerics, re-calibration inside tolerance, screening, joint fits, further causes, whiteness of what is left, validation on other bags, separability
-(docs/diagnosis.md). Nothing here knows files; :mod:`ctr_dynamics.diagnosis.findings` writes them.
+(docs/diagnosis.md). Nothing here knows files; :mod:`ctr_dynamics.diagnosis.output.findings` writes them.
 """
 
 from __future__ import annotations
@@ -14,17 +14,23 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from ctr_dynamics.diagnosis.candidates import Candidate, candidates
-from ctr_dynamics.diagnosis.checks import Whiteness, block_bootstrap, rms, whiteness
-from ctr_dynamics.diagnosis.explanations import Explanation
-from ctr_dynamics.diagnosis.exploration import LEFT_NUMERICAL, LEFT_SHARE, Search, adequate, distinct
-from ctr_dynamics.diagnosis.fit import Fit, Local, Problem, fit, make_problem
-from ctr_dynamics.diagnosis.mistakes import find_mistake
-from ctr_dynamics.diagnosis.numerics import add_numerics
+from ctr_dynamics.diagnosis.configuration_mistakes import find_mistake
+from ctr_dynamics.diagnosis.inference.candidates import Candidate, candidates
+from ctr_dynamics.diagnosis.inference.discretisation_error import add_numerics
+from ctr_dynamics.diagnosis.inference.hypotheses import Explanation
+from ctr_dynamics.diagnosis.inference.hypothesis_search import (
+    LEFT_NUMERICAL,
+    LEFT_SHARE,
+    Search,
+    adequate,
+    distinct,
+)
+from ctr_dynamics.diagnosis.inference.map_fit import Fit, Local, Problem, fit, make_problem
+from ctr_dynamics.diagnosis.inference.search_stages import search, second_opinion
+from ctr_dynamics.diagnosis.inference.sensitivities import Linearisation, linearise, observable, separation
 from ctr_dynamics.diagnosis.recording import Recording
-from ctr_dynamics.diagnosis.search import search, second_opinion
-from ctr_dynamics.diagnosis.signatures import Linearisation, linearise, observable, separation
-from ctr_dynamics.diagnosis.unexplained import Unexplained, unexplained
+from ctr_dynamics.diagnosis.verdict.residual_tests import Whiteness, block_bootstrap, rms, whiteness
+from ctr_dynamics.diagnosis.verdict.unexplained_force import Unexplained, unexplained
 from ctr_dynamics.effects import EFFECTS, quantities
 from ctr_dynamics.errors import InputError
 from ctr_dynamics.robot import Robot

@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from ctr_dynamics.diagnosis.experiment import Experiment
-from ctr_dynamics.diagnosis.noise import noise_floor
+from ctr_dynamics.diagnosis.forward_model import Experiment
 from ctr_dynamics.diagnosis.recording import Recording
+from ctr_dynamics.diagnosis.whitening import noise_floor
 from ctr_dynamics.errors import InputError
 from ctr_dynamics.robot import Robot
 from ctr_dynamics.robot.loader import robot_from_dict, robot_to_dict

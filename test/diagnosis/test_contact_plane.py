@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from truth.cases import make_case
 
-from ctr_dynamics.diagnosis.candidates import Candidate, causes_of
-from ctr_dynamics.diagnosis.explanations import Explanation, look_closer
-from ctr_dynamics.diagnosis.fit import fit, make_problem
+from ctr_dynamics.diagnosis.inference.candidates import Candidate, causes_of
+from ctr_dynamics.diagnosis.inference.contact_plane import wall
+from ctr_dynamics.diagnosis.inference.hypotheses import Explanation, look_closer
+from ctr_dynamics.diagnosis.inference.map_fit import fit, make_problem
 from ctr_dynamics.diagnosis.recording import read_recording
-from ctr_dynamics.diagnosis.wall import wall
 from ctr_dynamics.effects import quantities
 from ctr_dynamics.robot import load_robot
 

@@ -1,0 +1,1 @@
+"""From recordings and a forward model to hypotheses with probabilities: calibration, screening, hypotheses, evidence."""

@@ -1,0 +1,1 @@
+"""From hypotheses with probabilities to a verdict: tests of the residual, what is left unexplained, the next experiment."""
