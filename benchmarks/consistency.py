@@ -29,7 +29,7 @@ def consistency(bag: Path, stamps_s: np.ndarray, realised: np.ndarray) -> tuple[
     from ctr_dynamics.estimation.estimator import Estimator
     from ctr_dynamics.io.bag_reader import open_bag
     from ctr_dynamics.parameters import Settings
-    from ctr_dynamics.robot import load_robot
+    from ctr_dynamics.robot_files import load_robot
     from ctr_dynamics.runtime.replay import Player
 
     robot = load_robot("till2020_tissue")

@@ -228,7 +228,7 @@ def long_run(hours: float) -> dict[str, Any]:
     """The estimator alone on the bag's last second again and again, stamps running on: memory, failures, drift of the step's time."""
     from ctr_dynamics.estimation.estimator import Estimator
     from ctr_dynamics.parameters import Settings
-    from ctr_dynamics.robot import load_robot
+    from ctr_dynamics.robot_files import load_robot
 
     inputs = [
         item

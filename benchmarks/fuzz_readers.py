@@ -39,7 +39,7 @@ from ctr_dynamics.io.messages.schemas import schema
 from ctr_dynamics.model.model import Model
 from ctr_dynamics.model.pose_table import read_poses
 from ctr_dynamics.parameters import read_parameter_file
-from ctr_dynamics.robot import load_robot
+from ctr_dynamics.robot_files import load_robot
 from ctr_dynamics.simulation import load_scenario
 
 LIMIT_S = 20.0

@@ -35,7 +35,7 @@ from ctr_dynamics.io.messages.encode import (
     encode_wrench_stamped,
 )
 from ctr_dynamics.parameters import Settings
-from ctr_dynamics.robot import load_robot
+from ctr_dynamics.robot_files import load_robot
 
 RETURN_NS, JOINTS_NS = 2_000_000_000, 10_000_000  # length of the way back, and between its joint states
 MINUTE_NS = 60_000_000_000

@@ -33,7 +33,7 @@ def one(stratum: str, seed: int) -> dict[str, Any]:
     from ctr_dynamics.diagnosis.output.findings import findings
     from ctr_dynamics.diagnosis.pipeline import diagnose
     from ctr_dynamics.diagnosis.recording import read_recording
-    from ctr_dynamics.robot import load_robot
+    from ctr_dynamics.robot_files import load_robot
 
     with tempfile.TemporaryDirectory() as folder:
         begin = time.time()

@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from ctr_dynamics.errors import InputError
+from ctr_dynamics.io.yaml_files import read_yaml
 from ctr_dynamics.parameter_types import Parameter, Value, axes_mask
-from ctr_dynamics.robot.loader import read_yaml
 
 __all__ = ["PARAMETERS", "Parameter", "Settings", "Value", "axes_mask", "parameter", "parse_assignments"]
 

@@ -2,10 +2,21 @@
 
 from __future__ import annotations
 
+import math
 import re
 
 from ctr_dynamics.errors import InputError
-from ctr_dynamics.robot.quantity import FACTORS
+
+# What is often written instead of the SI unit, as a factor, for the hint in the error message.
+FACTORS: dict[tuple[str, str], float] = {
+    ("mm", "m"): 1e-3, ("cm", "m"): 1e-2, ("um", "m"): 1e-6, ("µm", "m"): 1e-6, ("inch", "m"): 0.0254,
+    ("GPa", "Pa"): 1e9, ("MPa", "Pa"): 1e6, ("kPa", "Pa"): 1e3, ("N/mm^2", "Pa"): 1e6, ("N/m^2", "Pa"): 1.0,
+    ("deg", "rad"): math.pi / 180, ("mrad", "rad"): 1e-3, ("deg/s", "rad/s"): math.pi / 180,
+    ("rpm", "rad/s"): math.pi / 30, ("g", "kg"): 1e-3, ("mg", "kg"): 1e-6, ("g/cm^3", "kg/m^3"): 1e3,
+    ("1/mm", "1/m"): 1e3, ("1/cm", "1/m"): 1e2, ("ms", "s"): 1e-3, ("us", "s"): 1e-6, ("µs", "s"): 1e-6,
+    ("g mm^2", "kg m^2"): 1e-9, ("kg mm^2", "kg m^2"): 1e-6, ("mm/s^2", "m/s^2"): 1e-3, ("%", "1"): 1e-2,
+    ("N mm s/rad", "N m s/rad"): 1e-3,
+}  # fmt: skip
 
 # Beside what people write into robot files: units of logs.
 _MORE: dict[tuple[str, str], float] = {

@@ -124,7 +124,7 @@ def test_sdist_and_wheel_are_complete_and_the_wheel_works(source, tmp_path):
         wheel,
         cwd=tmp_path,
     )
-    code = "import ctr_dynamics.robot as r; print(r.__file__, *map(r.load_robot, r.robot_names()), sep='\\n')"
+    code = "import ctr_dynamics.robot_files as r; print(r.__file__, *map(r.load_robot, r.robot_names()), sep='\\n')"
     shown = run(sys.executable, "-c", code, cwd=tmp_path, PYTHONPATH=str(target))
     assert shown.startswith(str(target))
     assert len(shown.splitlines()) == 1 + len(ROBOTS)

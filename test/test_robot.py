@@ -9,11 +9,11 @@ import pytest
 import yaml
 
 from ctr_dynamics.errors import InputError
-from ctr_dynamics.robot import (
+from ctr_dynamics.robot_files import (
     load_robot,
-    quantities,
     robot_from_dict,
     robot_names,
+    robot_quantities,
     robot_to_dict,
     robot_to_yaml,
     robot_with,
@@ -194,7 +194,7 @@ def test_yaml_text_of_a_robot_loads_as_an_equal_robot(tmp_path):
 def test_robot_with_changes_only_what_is_named():
     robot = load_robot("three_tube")
     changed = robot_with(robot, {"friction.base.coulomb": 0.7, "tracker.lever_arm": [0, 0, 0.0025]})
-    before, after = quantities(robot), quantities(changed)
+    before, after = robot_quantities(robot), robot_quantities(changed)
     assert before.keys() == after.keys()
     differ = {path for path in before if before[path] != after[path]}
     assert differ == {"friction.base.coulomb", "tracker.lever_arm"}

@@ -10,10 +10,10 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from ctr_dynamics.errors import InputError
-from ctr_dynamics.robot import (
+from ctr_dynamics.robot_files import (
     load_robot,
-    quantities,
     robot_from_dict,
+    robot_quantities,
     robot_to_dict,
     robot_to_yaml,
     robot_with,
@@ -132,7 +132,7 @@ def test_junk_anywhere_loads_or_is_refused_in_one_line(path, junk):
         assert str(error).startswith("robot.yaml: ")
         return
     # What is taken holds finite numbers only.
-    for path_, q in quantities(robot).items():
+    for path_, q in robot_quantities(robot).items():
         assert np.isfinite(q.value).all(), path_
         assert np.isfinite(q.tolerance).all(), path_
         assert np.min(q.tolerance) >= 0, path_
@@ -157,7 +157,7 @@ def test_any_text_is_refused_in_one_line(tmp_path_factory, text):
 )
 def test_scaling_a_quantity_scales_it_alone(path, factor):
     robot = load_robot("three_tube")
-    old = quantities(robot)
-    new = quantities(robot_with(robot, {path: factor * old[path].value}))
+    old = robot_quantities(robot)
+    new = robot_quantities(robot_with(robot, {path: factor * old[path].value}))
     assert new[path].value == factor * old[path].value
     assert {p for p in old if new[p] != old[p]} <= {path}

@@ -9,8 +9,8 @@ import pytest
 
 from ctr_dynamics.cli import main as cli
 from ctr_dynamics.errors import InputError
-from ctr_dynamics.robot import load_robot
-from ctr_dynamics.robot.datasheet import Measured, measured, tube_from_text
+from ctr_dynamics.robot_files import load_robot
+from ctr_dynamics.robot_files.datasheet import Measured, measured, tube_from_text
 
 INNER = "name=inner, od=1.244mm, id=1.028mm, straight=301mm, curved=97.1mm, radius=109.0037mm+-0.3%, E=52GPa+-0.4%, density=6493kg/m^3"
 OUTER = "name=outer, od=2.06mm, id=1.6mm, straight=20cm, curved=84.5 mm, radius=99.25558mm, E=75 GPa, density=6.493 g/cm^3"

@@ -18,7 +18,8 @@ PAGE = Path("docs/reference.md")
 
 # Module -> public names of the Python interface.
 API: dict[str, tuple[str, ...]] = {
-    "ctr_dynamics.robot": ("load_robot", "robot_with", "quantities", "robot_to_yaml", "Robot", "Tube"),
+    "ctr_dynamics.robot_files": ("load_robot", "robot_with", "robot_quantities", "robot_to_yaml"),
+    "ctr_dynamics.robot": ("Robot", "Tube"),
     "ctr_dynamics.parameters": ("Settings",),
     "ctr_dynamics.model.model": ("Model",),
     "ctr_dynamics.model.statics": ("Statics", "Equilibrium"),

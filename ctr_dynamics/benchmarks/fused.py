@@ -15,7 +15,7 @@ from ctr_dynamics.estimation.warm_up import rehearse
 from ctr_dynamics.io.bag_reader import open_bag
 from ctr_dynamics.model.model import Model
 from ctr_dynamics.parameters import Settings
-from ctr_dynamics.robot import load_robot
+from ctr_dynamics.robot_files import load_robot
 from ctr_dynamics.runtime.garbage_collection import seldom_collected
 from ctr_dynamics.runtime.replay import Player
 

@@ -15,7 +15,8 @@ from ctr_dynamics.model import trajectory
 from ctr_dynamics.model.model import Model
 from ctr_dynamics.model.simulator import Inputs, Simulator
 from ctr_dynamics.model.time_scheme import make_scheme
-from ctr_dynamics.robot import Robot, load_robot
+from ctr_dynamics.robot import Robot
+from ctr_dynamics.robot_files import load_robot
 from ctr_dynamics.simulation import load_scenario
 from ctr_dynamics.simulation import simulate as run_scenario
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from ctr_dynamics.benchmarks.machine import best_of
 from ctr_dynamics.kernels.snap_newton import back_solve, factorise, residual
-from ctr_dynamics.robot import load_robot
+from ctr_dynamics.robot_files import load_robot
 from ctr_dynamics.snap.experiment import Plan, run
 from ctr_dynamics.snap.solver import SnapSolver
 

@@ -15,7 +15,8 @@ from ctr_dynamics.model.model import Model
 from ctr_dynamics.model.paired_steps import LANES as PAIR
 from ctr_dynamics.model.statics import Statics
 from ctr_dynamics.model.time_scheme import make_scheme
-from ctr_dynamics.robot import Robot, load_robot, robot_from_dict, robot_to_dict
+from ctr_dynamics.robot import Robot
+from ctr_dynamics.robot_files import load_robot, robot_from_dict, robot_to_dict
 
 # one lane; those of two runs at once; packs of eight
 LANES: tuple[tuple[int, ...], ...] = ((), PAIR, (0,), (0,) * 2, (0,) * 4)

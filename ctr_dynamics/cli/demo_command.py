@@ -22,7 +22,7 @@ from ctr_dynamics.io.bag_writer import write_bag
 from ctr_dynamics.io.messages import topics
 from ctr_dynamics.io.messages.cdr import decode_stamp
 from ctr_dynamics.parameters import Settings
-from ctr_dynamics.robot import load_robot
+from ctr_dynamics.robot_files import load_robot
 from ctr_dynamics.runtime import live_report
 from ctr_dynamics.runtime.playback import load
 

@@ -12,7 +12,7 @@ from typing import Annotated, Any
 import typer
 
 from ctr_dynamics.errors import InputError
-from ctr_dynamics.robot import load_robot
+from ctr_dynamics.robot_files import load_robot
 
 EXIT = 0
 

@@ -11,7 +11,8 @@ import typer
 from ctr_dynamics.csv_import import column_layout as layout
 from ctr_dynamics.csv_import import convert
 from ctr_dynamics.errors import InputError
-from ctr_dynamics.robot import Robot, load_robot
+from ctr_dynamics.robot import Robot
+from ctr_dynamics.robot_files import load_robot
 
 
 def import_(

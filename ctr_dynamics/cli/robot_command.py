@@ -11,9 +11,10 @@ import typer
 
 from ctr_dynamics.errors import InputError
 from ctr_dynamics.io.atomic_files import atomic_file
-from ctr_dynamics.robot import Robot, load_robot, robot_names
-from ctr_dynamics.robot import datasheet as sheets
-from ctr_dynamics.robot.summary import doubts, tube_rows
+from ctr_dynamics.robot import Robot
+from ctr_dynamics.robot_files import datasheet as sheets
+from ctr_dynamics.robot_files import load_robot, robot_names
+from ctr_dynamics.robot_files.summary import doubts, tube_rows
 
 # Option -> (SI unit, several values, what is asked, answer that is offered).
 _ASKED: dict[str, tuple[str, bool, str, str]] = {

@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from ctr_dynamics.io.atomic_files import check_targets
-from ctr_dynamics.robot import load_robot
+from ctr_dynamics.robot_files import load_robot
 from ctr_dynamics.simulation import load_scenario, scenario_names, write_recording
 from ctr_dynamics.simulation import simulate as run_scenario
 

@@ -13,7 +13,8 @@ import typer
 from ctr_dynamics import __version__
 from ctr_dynamics.errors import InputError
 from ctr_dynamics.io.atomic_files import output_folder
-from ctr_dynamics.robot import Robot, load_robot
+from ctr_dynamics.robot import Robot
+from ctr_dynamics.robot_files import load_robot
 
 if TYPE_CHECKING:
     from ctr_dynamics.snap.experiment import Plan, Trajectory

@@ -14,7 +14,7 @@ from ctr_dynamics.errors import InputError
 from ctr_dynamics.io.atomic_files import atomic_file, check_targets
 from ctr_dynamics.model.model import Model
 from ctr_dynamics.model.pose_table import output_cells, output_header, read_poses, solve_poses
-from ctr_dynamics.robot import load_robot
+from ctr_dynamics.robot_files import load_robot
 
 SHOWN = 20  # failed rows named one by one
 

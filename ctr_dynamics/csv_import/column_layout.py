@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError
 
 from ctr_dynamics.errors import InputError
-from ctr_dynamics.robot.loader import read_yaml
+from ctr_dynamics.io.yaml_files import read_yaml
 from ctr_dynamics.units import factor, units_of
 
 Kind = Literal["joints", "tracker", "load"]

@@ -14,7 +14,7 @@ from ctr_dynamics.diagnosis.recording import Recording
 from ctr_dynamics.diagnosis.whitening import noise_floor
 from ctr_dynamics.errors import InputError
 from ctr_dynamics.robot import Robot
-from ctr_dynamics.robot.loader import robot_from_dict, robot_to_dict
+from ctr_dynamics.robot_files import robot_from_dict, robot_to_dict
 
 Pair = tuple[Recording, Robot]
 GROSS = 8.0  # times the noise floor: below, no mistake is looked for

@@ -8,7 +8,6 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import Field, PrivateAttr, model_validator
 
-from ctr_dynamics.robot.extensions import check_extensions
 from ctr_dynamics.robot.quantity import Block, Floats, Number, Quantity, VectorQuantity, problem, rule
 from ctr_dynamics.robot.tube import MAX_LENGTH, MILLIMETRES, Tube
 
@@ -138,7 +137,10 @@ class Rest(Block):
 
 
 class Robot(Block):
-    """A concentric tube robot; tubes innermost first, everything in SI units and radians."""
+    """A concentric tube robot; tubes innermost first, everything in SI units and radians.
+
+    ``extensions`` holds values of effects by name and parameter. Which effects there are is not known here; who reads a robot file checks them.
+    """
 
     name: str = Field(min_length=1)
     description: str = ""
@@ -172,7 +174,6 @@ class Robot(Block):
         reason = self.actuator_problem(self.rest.beta.value, self.rest.alpha.value)
         if reason:
             raise problem(f"rest.{reason}")
-        check_extensions(self.extensions, self.n_tubes)
         return self
 
     def __eq__(self, other: object) -> bool:

@@ -34,7 +34,7 @@ from ctr_dynamics.io.messages.cdr import (
 )
 from ctr_dynamics.io.messages.encode import StepEncoder
 from ctr_dynamics.parameters import Settings
-from ctr_dynamics.robot import load_robot
+from ctr_dynamics.robot_files import load_robot
 from ctr_dynamics.ros import diagnostics, qos
 from ctr_dynamics.ros.node_runner import Stopped, apart, run_node
 from ctr_dynamics.ros.parameter_declaration import declare, watch

@@ -8,7 +8,7 @@ from typing import Any
 from rclpy.node import Node
 
 from ctr_dynamics.io.messages import topics
-from ctr_dynamics.robot import load_robot
+from ctr_dynamics.robot_files import load_robot
 from ctr_dynamics.ros import qos
 from ctr_dynamics.ros.node_runner import run_node
 from ctr_dynamics.ros.parameter_declaration import declare_table

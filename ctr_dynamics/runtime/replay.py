@@ -29,7 +29,8 @@ from ctr_dynamics.io.messages.cdr import CdrError, JointStateIn, PoseIn, decode_
 from ctr_dynamics.io.messages.encode import StepEncoder
 from ctr_dynamics.io.messages.topics import JOINT_STATES, STEP_NS, TRACKER_TIP
 from ctr_dynamics.parameters import PARAMETERS, Settings
-from ctr_dynamics.robot import Robot, load_robot
+from ctr_dynamics.robot import Robot
+from ctr_dynamics.robot_files import load_robot
 from ctr_dynamics.runtime.clock_offset import EachOnce, StampClock
 from ctr_dynamics.runtime.garbage_collection import seldom_collected
 

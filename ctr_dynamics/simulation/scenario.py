@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from pydantic import Field, FiniteFloat, PrivateAttr, ValidationError, model_validator
 
 from ctr_dynamics.errors import InputError
-from ctr_dynamics.robot.loader import read_yaml
+from ctr_dynamics.io.yaml_files import read_yaml
 from ctr_dynamics.simulation.motion import AnyPrimitive, Axis, Block, Seconds
 
 Floats = NDArray[np.float64]

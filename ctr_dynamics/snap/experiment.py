@@ -12,7 +12,8 @@ import numpy as np
 
 from ctr_dynamics.errors import InputError
 from ctr_dynamics.model.model import Model
-from ctr_dynamics.robot import Robot, quantities, robot_with
+from ctr_dynamics.robot import Robot
+from ctr_dynamics.robot_files import robot_quantities, robot_with
 from ctr_dynamics.snap.features import Extremum
 from ctr_dynamics.snap.grid import default_cells
 from ctr_dynamics.snap.scurve import SCurve
@@ -39,7 +40,7 @@ def robot_for_snap(robot: Robot, values: Mapping[str, float]) -> Robot:
         InputError: unknown name, or a value that does not fit.
     """
     paths: dict[str, Any] = {}
-    known = quantities(robot)
+    known = robot_quantities(robot)
     for name, value in values.items():
         if not math.isfinite(value):
             raise InputError(

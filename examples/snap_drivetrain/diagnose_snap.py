@@ -25,7 +25,7 @@ from snap_fit import (
     whiteness,
 )
 
-from ctr_dynamics.robot import load_robot
+from ctr_dynamics.robot_files import load_robot
 from ctr_dynamics.snap.features import extrema, frequencies
 
 HERE = Path(__file__).parent

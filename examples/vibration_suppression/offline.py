@@ -20,7 +20,8 @@ from ctr_dynamics.io.messages.cdr import decode_joint_state, decode_pose_stamped
 from ctr_dynamics.model.model import Model
 from ctr_dynamics.model.statics import Statics
 from ctr_dynamics.parameters import Settings
-from ctr_dynamics.robot import Robot, load_robot
+from ctr_dynamics.robot import Robot
+from ctr_dynamics.robot_files import load_robot
 
 sys.path.insert(0, str(Path(__file__).parent))
 from damper import DriveHistory, Estimate, Limits, ModalDamper, Tuning

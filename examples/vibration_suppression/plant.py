@@ -20,7 +20,8 @@ from ctr_dynamics.model.model import Model
 from ctr_dynamics.model.simulator import Inputs, Simulator
 from ctr_dynamics.model.statics import Statics
 from ctr_dynamics.model.time_scheme import make_scheme
-from ctr_dynamics.robot import Robot, quantities, robot_with
+from ctr_dynamics.robot import Robot
+from ctr_dynamics.robot_files import robot_quantities, robot_with
 
 Floats = NDArray[np.float64]
 DT_NS = 3_000_000
@@ -56,7 +57,7 @@ class Hardware:
 
 def real_robot(robot: Robot) -> Robot:
     """The robot as it is: `MISTAKES` times what its file says, where the file has that parameter."""
-    known = quantities(robot)
+    known = robot_quantities(robot)
     values = {}
     for path, factor in MISTAKES.items():
         if path in known:

@@ -24,7 +24,7 @@ from sensor_msgs.msg import JointState
 
 from ctr_dynamics.io.messages import topics
 from ctr_dynamics.io.messages.cdr import CdrError, decode_joint_state, split_stamp
-from ctr_dynamics.robot import load_robot
+from ctr_dynamics.robot_files import load_robot
 from ctr_dynamics.ros import qos
 from ctr_dynamics.ros.node_runner import spin_until, stop_on_signals
 from ctr_dynamics.ros.topic_names import NAMESPACE, message_class

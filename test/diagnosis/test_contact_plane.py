@@ -13,7 +13,7 @@ from ctr_dynamics.diagnosis.inference.hypotheses import Explanation, look_closer
 from ctr_dynamics.diagnosis.inference.map_fit import fit, make_problem
 from ctr_dynamics.diagnosis.recording import read_recording
 from ctr_dynamics.effects import quantities
-from ctr_dynamics.robot import load_robot
+from ctr_dynamics.robot_files import load_robot
 
 STIFFNESS = ("contact", "stiffness_N_per_m")
 NORMAL = [("contact", "n" + axis) for axis in "xyz"]

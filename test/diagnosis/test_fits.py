@@ -15,7 +15,7 @@ from ctr_dynamics.diagnosis.inference.sensitivities import far_probes, linearise
 from ctr_dynamics.diagnosis.recording import Recording
 from ctr_dynamics.effects import quantities
 from ctr_dynamics.model import trajectory
-from ctr_dynamics.robot import load_robot
+from ctr_dynamics.robot_files import load_robot
 
 PAYLOAD = ("payload_mass", "added_kg")
 AIR = ("air_drag", "linear_Ns_per_m2")

@@ -15,7 +15,7 @@ from ctr_dynamics.diagnosis.pipeline import Validation
 from ctr_dynamics.diagnosis.verdict.residual_tests import block_bootstrap
 from ctr_dynamics.diagnosis.whitening import Whitener
 from ctr_dynamics.effects import EFFECTS, Parameter, Quantity, quantities
-from ctr_dynamics.robot import load_robot
+from ctr_dynamics.robot_files import load_robot
 
 
 def test_posterior_is_bayes_rule():

@@ -11,7 +11,7 @@ from ctr_dynamics.errors import InputError
 from ctr_dynamics.io.bag_writer import write_bag
 from ctr_dynamics.io.messages import topics
 from ctr_dynamics.io.messages.encode import encode_joint_state, encode_pose_stamped, encode_wrench_stamped
-from ctr_dynamics.robot import load_robot
+from ctr_dynamics.robot_files import load_robot
 
 START_NS = 1_700_000_000_000_000_000
 

@@ -17,7 +17,7 @@ from ctr_dynamics.io.bag_reader import open_bag
 from ctr_dynamics.io.messages.topics import JOINT_STATES, TIP_LOAD, TRACKER_TIP
 from ctr_dynamics.model.model import Model
 from ctr_dynamics.model.statics import Statics
-from ctr_dynamics.robot import load_robot
+from ctr_dynamics.robot_files import load_robot
 
 TISSUE = load_robot("till2020_tissue")
 

@@ -13,7 +13,7 @@ from ctr_dynamics.effects import EFFECTS, Setup, apply_effects, make_setup, quan
 from ctr_dynamics.model.model import Model
 from ctr_dynamics.model.simulator import Inputs, Simulator
 from ctr_dynamics.model.time_scheme import make_scheme
-from ctr_dynamics.robot import load_robot, robot_from_dict, robot_to_dict
+from ctr_dynamics.robot_files import load_robot, robot_from_dict, robot_to_dict
 
 CONTRACT = json.loads((Path(__file__).parents[1] / "data/effects/parameters.json").read_text())["effects"]
 COMPUTATION = {

@@ -10,7 +10,7 @@ from ctr_dynamics.io import open_bag
 from ctr_dynamics.io.messages.cdr import JointStateIn
 from ctr_dynamics.kernels import backlash as play
 from ctr_dynamics.parameters import Settings
-from ctr_dynamics.robot import load_robot, robot_from_dict, robot_to_dict
+from ctr_dynamics.robot_files import load_robot, robot_from_dict, robot_to_dict
 from ctr_dynamics.runtime.replay import Player
 from ctr_dynamics.sensing.interpolation import Drives
 from ctr_dynamics.simulation import Scenario, simulate

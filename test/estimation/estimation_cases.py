@@ -16,7 +16,7 @@ from ctr_dynamics.estimation.step_output import StepOutput
 from ctr_dynamics.io.bag_reader import open_bag
 from ctr_dynamics.io.messages.cdr import JointStateIn, PoseIn
 from ctr_dynamics.parameters import Settings
-from ctr_dynamics.robot import load_robot
+from ctr_dynamics.robot_files import load_robot
 from ctr_dynamics.runtime.replay import Player
 
 BAGS = Path(__file__).parents[1] / "data" / "bags"

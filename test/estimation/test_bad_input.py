@@ -20,7 +20,7 @@ from estimation_cases import (
 from ctr_dynamics.estimation.estimator import MAX_FAILURES
 from ctr_dynamics.io.messages.encode import StepEncoder
 from ctr_dynamics.io.messages.topics import DIAGNOSTICS
-from ctr_dynamics.robot import load_robot
+from ctr_dynamics.robot_files import load_robot
 from ctr_dynamics.snap.scurve import s_curve
 
 REST = (1.5708, 1.5708, -0.2521, -0.1977)

@@ -24,7 +24,7 @@ from ctr_dynamics.estimation.filter.tip_window import Tip
 from ctr_dynamics.kernels.rotations import conjugate, from_vector, matrix, multiply
 from ctr_dynamics.model.model import Model
 from ctr_dynamics.parameters import PARAMETERS
-from ctr_dynamics.robot import load_robot, robot_from_dict, robot_to_dict
+from ctr_dynamics.robot_files import load_robot, robot_from_dict, robot_to_dict
 from ctr_dynamics.sensing.tracker import STATES, tracker_model
 
 

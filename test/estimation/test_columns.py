@@ -14,7 +14,7 @@ from ctr_dynamics.model.mesh_interpolation import coarse_key, transfer
 from ctr_dynamics.model.model import Model
 from ctr_dynamics.model.simulator import Inputs, Simulator
 from ctr_dynamics.model.statics import Statics
-from ctr_dynamics.robot import load_robot
+from ctr_dynamics.robot_files import load_robot
 
 BETA, ALPHA, ZERO = np.array([-0.2521, -0.1977]), np.array([1.5708, 1.5708]), np.zeros(2)
 DT = 0.003

@@ -8,7 +8,7 @@ from ctr_dynamics.estimation.estimator import DT_NS, MAX_FAILURES
 from ctr_dynamics.model.model import Model
 from ctr_dynamics.model.simulator import StepResult
 from ctr_dynamics.model.statics import Statics
-from ctr_dynamics.robot import load_robot
+from ctr_dynamics.robot_files import load_robot
 
 REST = np.array([1.5708, 1.5708, -0.2521, -0.1977])
 

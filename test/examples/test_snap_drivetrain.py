@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from joblib import Parallel, delayed
 
-from ctr_dynamics.robot import load_robot
+from ctr_dynamics.robot_files import load_robot
 
 ROOT = Path(__file__).parents[2]
 EXAMPLE = ROOT / "examples" / "snap_drivetrain"

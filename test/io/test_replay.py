@@ -25,7 +25,7 @@ from ctr_dynamics.io.bag_writer import write_bag
 from ctr_dynamics.io.messages import cdr, topics
 from ctr_dynamics.io.messages.encode import encode_joint_state, encode_pose_stamped
 from ctr_dynamics.parameters import Settings
-from ctr_dynamics.robot import load_robot
+from ctr_dynamics.robot_files import load_robot
 from ctr_dynamics.runtime.playback import load, shifted
 from ctr_dynamics.runtime.replay import Player, arrivals, plain, replay
 

@@ -8,7 +8,8 @@ import numpy as np
 from ctr_dynamics.model.model import Model
 from ctr_dynamics.model.simulator import Inputs, Simulator
 from ctr_dynamics.model.time_scheme import make_scheme
-from ctr_dynamics.robot import Robot, load_robot, robot_from_dict, robot_to_dict
+from ctr_dynamics.robot import Robot
+from ctr_dynamics.robot_files import load_robot, robot_from_dict, robot_to_dict
 
 
 def make_tube(

@@ -8,7 +8,7 @@ from ctr_dynamics.model.batch import run_many
 from ctr_dynamics.model.model import Model
 from ctr_dynamics.model.time_scheme import make_scheme
 from ctr_dynamics.model.trajectory import run
-from ctr_dynamics.robot import load_robot
+from ctr_dynamics.robot_files import load_robot
 
 ROBOT = load_robot("till2020_tissue")
 BETA = np.array(ROBOT.rest.beta.value)

@@ -17,7 +17,7 @@ from ctr_dynamics.model.model import Model
 from ctr_dynamics.model.simulator import Inputs, Simulator
 from ctr_dynamics.model.statics import Statics
 from ctr_dynamics.model.time_scheme import make_scheme
-from ctr_dynamics.robot import robot_from_dict, robot_to_dict
+from ctr_dynamics.robot_files import robot_from_dict, robot_to_dict
 
 E3 = np.array([0.0, 0.0, 1.0])
 INNER = {"inner": 0.514e-3, "outer": 0.622e-3}

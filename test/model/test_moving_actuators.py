@@ -14,7 +14,7 @@ from ctr_dynamics.model.model import Model
 from ctr_dynamics.model.simulator import Inputs, Simulator, remap_fields
 from ctr_dynamics.model.statics import Statics
 from ctr_dynamics.model.time_scheme import RATES, make_scheme
-from ctr_dynamics.robot import load_robot
+from ctr_dynamics.robot_files import load_robot
 
 DT = 0.003
 

@@ -8,7 +8,7 @@ from ctr_dynamics.model.model import Model
 from ctr_dynamics.model.paired_steps import Pair
 from ctr_dynamics.model.simulator import Inputs, Simulator
 from ctr_dynamics.model.time_scheme import make_scheme
-from ctr_dynamics.robot import load_robot
+from ctr_dynamics.robot_files import load_robot
 
 DT, TOLERANCE = 0.003, 1e-9
 ROBOT = load_robot("till2020_tissue")

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from ctr_dynamics.cli.main import main
-from ctr_dynamics.robot import load_robot, robot_from_dict, robot_to_dict, robot_to_yaml
+from ctr_dynamics.robot_files import load_robot, robot_from_dict, robot_to_dict, robot_to_yaml
 
 DATA = Path(__file__).parents[1] / "data" / "static"
 

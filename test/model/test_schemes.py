@@ -8,7 +8,7 @@ from ctr_dynamics.errors import InputError
 from ctr_dynamics.kernels.tangent import by_fields
 from ctr_dynamics.model.model import Model
 from ctr_dynamics.model.time_scheme import RATE_NOW, RATES, Y_BEFORE, Y_NOW, make_scheme
-from ctr_dynamics.robot import load_robot
+from ctr_dynamics.robot_files import load_robot
 
 ORDERS = {"backward_euler": 1, "bdf2": 2, "trapezoid": 2, "bdf_alpha": 2, "sdirk2": 2, "sdirk3": 3}
 

@@ -12,7 +12,7 @@ from ctr_dynamics.model.model import Model
 from ctr_dynamics.model.simulator import Simulator
 from ctr_dynamics.model.statics import Statics
 from ctr_dynamics.model.time_scheme import make_scheme
-from ctr_dynamics.robot import load_robot
+from ctr_dynamics.robot_files import load_robot
 
 DATA = Path(__file__).parents[1] / "data" / "static"
 CASES = {"A2_tissueTableIII": ("till2020_tissue", 2), "B3_TIMC": ("three_tube", 3)}

@@ -11,7 +11,7 @@ from ctr_dynamics.kernels.tangent import step_tangent
 from ctr_dynamics.model.model import Model
 from ctr_dynamics.model.simulator import Inputs, Simulator
 from ctr_dynamics.model.time_scheme import RATES, make_scheme
-from ctr_dynamics.robot import load_robot
+from ctr_dynamics.robot_files import load_robot
 
 DT, STEPS, COLUMNS = 0.003, 12, 8
 BETA, STILL = np.array([-0.2521, -0.1977]), np.zeros(2)

@@ -10,7 +10,7 @@ from ctr_dynamics.model.model import Model
 from ctr_dynamics.model.simulator import Simulator
 from ctr_dynamics.model.time_scheme import make_scheme
 from ctr_dynamics.model.trajectory import TIP_ROWS, run, to_inputs
-from ctr_dynamics.robot import load_robot, robot_from_dict, robot_to_dict
+from ctr_dynamics.robot_files import load_robot, robot_from_dict, robot_to_dict
 
 DT = 0.003
 ROBOT = load_robot("till2020_tissue")

@@ -68,7 +68,7 @@ def test_nothing_in_a_file_is_executed(tmp_path):
     from ctr_dynamics.csv_import.column_layout import read_layout
     from ctr_dynamics.errors import InputError
     from ctr_dynamics.parameters import read_parameter_file
-    from ctr_dynamics.robot import load_robot
+    from ctr_dynamics.robot_files import load_robot
 
     mark = tmp_path / "executed"
     path = tmp_path / "file.yaml"

@@ -20,7 +20,7 @@ from std_srvs.srv import SetBool, Trigger
 from ctr_dynamics.io.messages import topics
 from ctr_dynamics.io.messages.cdr import decode_pose_stamped, decode_stamp
 from ctr_dynamics.io.messages.encode import encode_joint_state, encode_pose_stamped
-from ctr_dynamics.robot import load_robot
+from ctr_dynamics.robot_files import load_robot
 from ctr_dynamics.ros import qos
 from ctr_dynamics.ros.listener import Listener
 from ctr_dynamics.ros.topic_names import message_class

@@ -10,7 +10,7 @@ from ctr_dynamics.io.bag_writer import write_bag
 from ctr_dynamics.io.messages import topics
 from ctr_dynamics.io.messages.cdr import CdrError, decode_joint_state, decode_stamp
 from ctr_dynamics.io.messages.encode import encode_joint_state, encode_pose_stamped
-from ctr_dynamics.robot import load_robot, robot_with
+from ctr_dynamics.robot_files import load_robot, robot_with
 from ctr_dynamics.ros.listener import Heard
 from ctr_dynamics.runtime.live_report import (
     Trace,

@@ -4,7 +4,7 @@ import pytest
 
 from ctr_dynamics.diagnosis.recording import read_recording
 from ctr_dynamics.io.messages import topics
-from ctr_dynamics.robot import load_robot
+from ctr_dynamics.robot_files import load_robot
 
 
 @pytest.mark.ros

@@ -9,7 +9,7 @@ sys.path.insert(0, str(Path(__file__).parent.parent / "model"))
 import pytest
 from snap_cases import EXAMPLE, START
 
-from ctr_dynamics.robot import load_robot
+from ctr_dynamics.robot_files import load_robot
 from ctr_dynamics.snap.experiment import Plan, run
 from ctr_dynamics.snap.scurve import s_curve
 

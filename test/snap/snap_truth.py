@@ -17,7 +17,8 @@ from truth.kernels import TIP, integrate
 from truth.machine import Machine
 from truth.nuisances import truncated
 
-from ctr_dynamics.robot import Robot, load_robot
+from ctr_dynamics.robot import Robot
+from ctr_dynamics.robot_files import load_robot
 from ctr_dynamics.snap.experiment import robot_for_snap
 from ctr_dynamics.snap.features import crossing
 from ctr_dynamics.snap.scurve import s_curve

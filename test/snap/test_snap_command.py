@@ -11,7 +11,7 @@ from snap_cases import EXAMPLE
 from ctr_dynamics.cli.main import main
 from ctr_dynamics.errors import InputError
 from ctr_dynamics.io.bag_info import inspect
-from ctr_dynamics.robot import load_robot, robot_to_dict
+from ctr_dynamics.robot_files import load_robot, robot_to_dict
 from ctr_dynamics.snap.experiment import Plan, Trajectory, robot_for_snap, run
 
 SHORT = ("--duration", "1e-4", "--points", "120", "--cells", "4,4,3,6,4,2")

@@ -8,7 +8,7 @@ from ctr_dynamics.errors import InputError
 from ctr_dynamics.kernels import snap_newton as newton
 from ctr_dynamics.kernels.snap_equations import body, slope, state_size
 from ctr_dynamics.model.model import Model
-from ctr_dynamics.robot import load_robot
+from ctr_dynamics.robot_files import load_robot
 from ctr_dynamics.snap.grid import build_grid, default_cells
 from ctr_dynamics.snap.solver import SnapSolver
 

@@ -6,7 +6,7 @@ import scipy.sparse as sp
 from scipy.sparse.linalg import LinearOperator, eigs, splu
 from snap_cases import error_of
 
-from ctr_dynamics.robot import load_robot, robot_with
+from ctr_dynamics.robot_files import load_robot, robot_with
 from ctr_dynamics.snap.experiment import MARGIN, Plan, overshoot, robot_for_snap, run
 from ctr_dynamics.snap.features import after_snap, crossing, extrema, frequencies
 from ctr_dynamics.snap.scurve import s_curve

@@ -5,7 +5,7 @@ import pytest
 from scipy.interpolate import CubicSpline
 from snap_cases import EXAMPLE, START, table
 
-from ctr_dynamics.robot import load_robot, robot_with
+from ctr_dynamics.robot_files import load_robot, robot_with
 from ctr_dynamics.snap.experiment import Plan, refined_cells, robot_for_snap, run
 from ctr_dynamics.snap.features import after_snap, crossing, extrema
 from ctr_dynamics.snap.scurve import s_curve

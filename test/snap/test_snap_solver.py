@@ -9,7 +9,7 @@ from ctr_dynamics.model.model import Model
 from ctr_dynamics.model.simulator import Inputs, Simulator
 from ctr_dynamics.model.statics import Statics
 from ctr_dynamics.model.time_scheme import make_scheme
-from ctr_dynamics.robot import load_robot, robot_with
+from ctr_dynamics.robot_files import load_robot, robot_with
 from ctr_dynamics.snap.solver import SnapSolver
 
 

@@ -6,7 +6,7 @@ import pytest
 from ctr_dynamics.model.model import Model
 from ctr_dynamics.model.stability import StabilityWatch, time_to_snap
 from ctr_dynamics.model.statics import Statics
-from ctr_dynamics.robot import load_robot
+from ctr_dynamics.robot_files import load_robot
 
 BETA = np.array([-0.112, 0.0])
 

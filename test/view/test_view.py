@@ -28,7 +28,7 @@ from ctr_dynamics.io.messages.encode import encode_step
 from ctr_dynamics.io.messages.schemas import typestore
 from ctr_dynamics.kernels.rotations import matrix
 from ctr_dynamics.parameters import Settings
-from ctr_dynamics.robot import load_robot
+from ctr_dynamics.robot_files import load_robot
 from ctr_dynamics.runtime.replay import Player
 from ctr_dynamics.view.markers import CHI_95, MARKER_ARRAY, TUBES_TOPIC, ellipsoid, encode_tubes, tube_lines
 from ctr_dynamics.view.scene import Scene

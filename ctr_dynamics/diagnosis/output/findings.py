@@ -18,7 +18,7 @@ from ctr_dynamics.diagnosis.verdict.residual_tests import rms
 from ctr_dynamics.diagnosis.whitening import noise_floor
 from ctr_dynamics.effects import EFFECTS, Quantity
 from ctr_dynamics.io.atomic_files import atomic_file
-from ctr_dynamics.robot import robot_to_yaml
+from ctr_dynamics.robot_files import robot_to_yaml
 from ctr_dynamics.runtime.replay import plain
 
 Floats = NDArray[np.float64]

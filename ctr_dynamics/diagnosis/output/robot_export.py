@@ -11,7 +11,8 @@ import numpy as np
 from ctr_dynamics.diagnosis.inference.map_fit import Fit, Key
 from ctr_dynamics.effects import EFFECTS
 from ctr_dynamics.kernels.rotations import from_vector, matrix, multiply, to_vector
-from ctr_dynamics.robot import Robot, robot_from_dict, robot_to_dict
+from ctr_dynamics.robot import Robot
+from ctr_dynamics.robot_files import robot_from_dict, robot_to_dict
 
 _PLAIN = {
     ("base_coulomb", "mu_base"): ("friction", "base", "coulomb"),

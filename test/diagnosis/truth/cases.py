@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from ctr_dynamics.robot import load_robot
 from ctr_dynamics.robot.schema import Robot
+from ctr_dynamics.robot_files import load_robot
 
 from . import nuisances, sensors
 from .effects import CATALOGUE, NEAR_TIES, OUTSIDE, UNSEEN_AT_REST, Hide

@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from ctr_dynamics.errors import InputError
-from ctr_dynamics.robot.loader import robot_from_dict, robot_to_yaml
 from ctr_dynamics.robot.schema import Robot
+from ctr_dynamics.robot_files.loader import robot_from_dict, robot_to_yaml
 from ctr_dynamics.units import measure
 
 # Friction of a robot that nobody has measured: Till et al. 2020, Table III, with wide deviations.

@@ -14,55 +14,13 @@ from typing import Any
 import yaml
 from pydantic import BaseModel, ValidationError
 
+from ctr_dynamics.effects.extension_check import check_extensions
 from ctr_dynamics.errors import InputError
+from ctr_dynamics.io.yaml_files import read_yaml
 from ctr_dynamics.robot.quantity import Quantity, VectorQuantity
 from ctr_dynamics.robot.schema import Robot
 
 MAX_BYTES = 1_000_000
-
-
-class _Loader(yaml.SafeLoader):
-    """SafeLoader that reads 52e9 as a number and refuses a key given twice."""
-
-    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
-        seen = set()
-        for key_node, _ in node.value:
-            if not isinstance(key_node, yaml.ScalarNode):
-                raise yaml.constructor.ConstructorError(
-                    None, None, "a key must be a word, not a list or a mapping", key_node.start_mark
-                )
-            key = key_node.value
-            if key in seen:
-                raise yaml.constructor.ConstructorError(
-                    None, None, f"key '{key}' is given twice", key_node.start_mark
-                )
-            seen.add(key)
-        return super().construct_mapping(node, deep)
-
-
-# YAML 1.1 takes 52e9 and 1e-3 for text; robot files follow YAML 1.2.
-_Loader.add_implicit_resolver(
-    "tag:yaml.org,2002:float",
-    re.compile(r"^[-+]?(\d+(\.\d*)?|\.\d+)([eE][-+]?\d+)$"),
-    list("-+0123456789."),
-)
-
-
-def read_yaml(text: str, where: str) -> Any:
-    """Parse YAML 1.2 numbers and unique keys.
-
-    Raises:
-        InputError: with `where` and the line.
-    """
-    try:
-        return yaml.load(text, Loader=_Loader)
-    except yaml.YAMLError as error:
-        mark = getattr(error, "problem_mark", None)
-        line = f" in line {mark.line + 1}" if mark else ""
-        what = getattr(error, "problem", None) or str(error)
-        raise InputError(f"not valid YAML{line}: {what}", do="mend the file", where=where) from None
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"not valid YAML: {error}", do="mend the file", where=where) from None
 
 
 def robot_names() -> tuple[str, ...]:
@@ -127,9 +85,14 @@ def robot_from_dict(data: Any, where: str = "robot") -> Robot:
             f"robot file is {kind}, not a mapping", do="see config/robots for examples", where=where
         )
     try:
-        return Robot.model_validate(data)
+        robot = Robot.model_validate(data)
     except ValidationError as error:
         raise InputError(_one_line(error), where=where) from None
+    try:
+        check_extensions(robot.extensions, robot.n_tubes)
+    except InputError as error:
+        raise InputError(str(error), where=where) from None
+    return robot
 
 
 def _one_line(error: ValidationError) -> str:
@@ -152,7 +115,7 @@ def _one_line(error: ValidationError) -> str:
     return line + (f" (and {len(errors) - 1} more)" if len(errors) > 1 else "")
 
 
-def quantities(robot: Robot) -> dict[str, Quantity | VectorQuantity]:
+def robot_quantities(robot: Robot) -> dict[str, Quantity | VectorQuantity]:
     """Every quantity of the robot by its key path, e.g. "tubes[0].youngs_modulus"."""
     found: dict[str, Quantity | VectorQuantity] = {}
 
@@ -175,7 +138,7 @@ def robot_with(robot: Robot, values: Mapping[str, Any]) -> Robot:
 
     Args:
         robot: where to start.
-        values: key path of a quantity (as in `quantities`, or "rest.beta") to its new value in the same unit.
+        values: key path of a quantity (as in `robot_quantities`, or "rest.beta") to its new value in the same unit.
 
     Raises:
         InputError: unknown path or a value that does not fit.
