@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ctr_dynamics.diagnosis.forward_model import Experiment
+from ctr_dynamics.diagnosis.forward_model import ForwardModel
 from ctr_dynamics.diagnosis.recording import Recording
 from ctr_dynamics.diagnosis.whitening import noise_floor
 from ctr_dynamics.errors import InputError
@@ -106,13 +106,13 @@ MISTAKES: dict[str, Callable[[Recording, Robot], Pair]] = {
 def misfit(recording: Recording, robot: Robot) -> float:
     """3-D rms in m of the reading against the nominal model, with the rotation's share in units of its noise; infinity where it fails."""
     try:
-        experiment = Experiment(recording, robot, nodes=16)
-        prediction = experiment.predict({})
+        forward_model = ForwardModel(recording, robot, nodes=16)
+        prediction = forward_model.predict({})
     except InputError:
         return math.inf
     if prediction.failure:
         return math.inf
-    residual = experiment.residual(prediction)
+    residual = forward_model.residual(prediction)
     noise = robot.tracker.noise
     rotation = residual[:, 3:] * (noise.position.value / max(noise.rotation.value, 1e-6))
     squares = np.sum(residual[:, :3] ** 2, axis=1) + np.sum(rotation**2, axis=1)

@@ -49,7 +49,7 @@ class Prediction:
     failure: str
 
 
-class Experiment:
+class ForwardModel:
     """A recording and a robot.
 
     Args:
@@ -69,10 +69,10 @@ class Experiment:
         bends = load.bends(-np.inf, np.inf, self._models[False].load_kink / dt)
         self._load_events = 1e-9 * np.array(bends, dtype=float)
 
-    def resolved(self, nodes: int, dt: float) -> Experiment:
+    def resolved(self, nodes: int, dt: float) -> ForwardModel:
         """The same at another resolution."""
         same = nodes == self.nodes and dt == self.scheme.dt
-        return self if same else Experiment(self.recording, self.robot, nodes, dt)
+        return self if same else ForwardModel(self.recording, self.robot, nodes, dt)
 
     # -- the chain --
 

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ctr_dynamics.diagnosis.forward_model import Experiment
+from ctr_dynamics.diagnosis.forward_model import ForwardModel
 from ctr_dynamics.diagnosis.recording import Recording
 from ctr_dynamics.effects import quantities
 from ctr_dynamics.robot import Robot
@@ -30,11 +30,11 @@ def rehearse(robot: Robot, models: Sequence[str] = ("plain", "extended")) -> Non
         (),
     )
     known = {q.key: q for q in quantities(robot)}
-    experiment = Experiment(still, robot)
+    forward_model = ForwardModel(still, robot)
     if "plain" in models:
-        experiment.predict({})
-        experiment.jacobian({}, [known["youngs_modulus", "tube1.scale"]])
+        forward_model.predict({})
+        forward_model.jacobian({}, [known["youngs_modulus", "tube1.scale"]])
     if "extended" in models:
         air = known["air_drag", "linear_Ns_per_m2"]
-        experiment.predict({air.key: 0.01})
-        experiment.jacobian({air.key: 0.01}, [air])
+        forward_model.predict({air.key: 0.01})
+        forward_model.jacobian({air.key: 0.01}, [air])

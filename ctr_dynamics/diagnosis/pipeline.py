@@ -198,7 +198,7 @@ def diagnose(
         raise InputError("the recalibrated model cannot be linearised", do="check the robot file and the bag")
     held_out = None
     if validation:
-        nodes = problem.experiments[0].nodes
+        nodes = problem.forward_models[0].nodes
         held_out = make_problem(robot, validation, nuisances, mask, nodes)
         if any(not _plain(problem, e) for e in found.explanations):
             note("second opinion of the validation bags")
@@ -229,7 +229,7 @@ def measured_axes(recordings: Sequence[Recording], notes: list[str]) -> NDArray[
 def _residuals(problem: Problem, fit: Fit | None) -> list[Floats]:
     """Residuals (s, 6) of every recording; ``fit`` None: of the nominal model."""
     point = fit.point if fit else {}
-    return [e.residual(e.predict(point)) for e in problem.experiments]
+    return [e.residual(e.predict(point)) for e in problem.forward_models]
 
 
 def _decide(
@@ -258,7 +258,7 @@ def _decide(
     if not noise and (not best.members or _plain(problem, best) or (unexplained_part and not predicted)):
         result.verdict = "unknown"
         result.members = [Member(None, "unknown", 0.95, None, [])]
-        result.unexplained = unexplained(problem.experiments[0], clean.fit.point)
+        result.unexplained = unexplained(problem.forward_models[0], clean.fit.point)
         if result.unexplained is not None:
             result.notes.append(result.unexplained.text)
         rest = [(s, 0.05 * p) for s, p in result.sets[:2] if s] if best.members else []
@@ -367,22 +367,24 @@ def validate(held_out: Problem, clean: Fit, best: Fit) -> Validation | None:
     before, after, stamps, bags = [], [], [], []
     nis = [0.0, 0.0, 0]
     shift = 0.0
-    for experiment, finer, whiten in zip(
-        held_out.experiments, held_out.finer.experiments, held_out.whiteners, strict=True
+    for forward_model, finer, whiten in zip(
+        held_out.forward_models, held_out.finer.forward_models, held_out.whiteners, strict=True
     ):
         points = (clean.point, best.point)
         residuals = [left for point in points if (left := finer.residual_at(point)) is not None]
         if len(residuals) < len(points):
-            residuals = [experiment.residual(experiment.predict(point)) for point in points]
+            residuals = [forward_model.residual(forward_model.predict(point)) for point in points]
         if not all(np.isfinite(r).any() for r in residuals):
             continue
         good = np.isfinite(residuals[0]).all(axis=1) & np.isfinite(residuals[1]).all(axis=1)
         squares = [np.sum(r[good, :3] ** 2, axis=1) for r in residuals]
         before.append(squares[0])
         after.append(squares[1])
-        stamps.append(experiment.recording.stamps[good] + shift)
-        shift += experiment.recording.duration + 1.0
-        bags.append((experiment.recording.name, math.sqrt(squares[0].mean()), math.sqrt(squares[1].mean())))
+        stamps.append(forward_model.recording.stamps[good] + shift)
+        shift += forward_model.recording.duration + 1.0
+        bags.append(
+            (forward_model.recording.name, math.sqrt(squares[0].mean()), math.sqrt(squares[1].mean()))
+        )
         if good.all():
             for i, r in enumerate(residuals):
                 w = whiten(r)

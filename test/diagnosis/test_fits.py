@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ctr_dynamics.diagnosis.forward_model import NODES, Experiment
+from ctr_dynamics.diagnosis.forward_model import NODES, ForwardModel
 from ctr_dynamics.diagnosis.inference import discretisation_error as numerics
 from ctr_dynamics.diagnosis.inference.candidates import candidates, causes_of
 from ctr_dynamics.diagnosis.inference.hypotheses import Explanation
@@ -41,31 +41,32 @@ def recording(robot):
     stamps = np.arange(40) / 40.0
     empty = np.tile([1.0, 0.0, 0.0, 0.0], (40, 1))
     blind = Recording("truth", "", {}, joints, np.zeros((0, 7)), stamps, np.zeros((40, 3)), empty, ())
-    seen = Experiment(blind, robot).predict({PAYLOAD: 3e-4})
+    seen = ForwardModel(blind, robot).predict({PAYLOAD: 3e-4})
     assert not seen.failure
     return Recording("seen", "", {}, joints, np.zeros((0, 7)), stamps, seen.position, seen.quaternion, ())
 
 
 def test_columns_together_are_those_apart(recording, robot, known, monkeypatch):
     """With a cause that needs the extended model, plain columns go through that one too."""
-    experiment = Experiment(recording, robot)
+    forward_model = ForwardModel(recording, robot)
 
     def apart():
         """Largest difference of the stiffness' columns, of their size on each axis; and all columns."""
-        alone = experiment.jacobian({}, [known[STIFFNESS]])[1][:, :, 0]
-        together = experiment.jacobian({}, [known[STIFFNESS], known[AIR]])[1]
+        alone = forward_model.jacobian({}, [known[STIFFNESS]])[1][:, :, 0]
+        together = forward_model.jacobian({}, [known[STIFFNESS], known[AIR]])[1]
         return np.abs((together[:, :, 0] - alone) / np.abs(alone).max(axis=0)).max(), together
 
     difference, together = apart()
     assert difference < 1e-3  # rounding: changes are as small as strong friction needs
     with monkeypatch.context() as patch:
         patch.setattr(trajectory, "EPSILON", 1e-6)
-        for model in experiment._models.values():
+        for model in forward_model._models.values():
             patch.setattr(model, "tangent_step", 0.1 * model.step)
         assert apart()[0] < 1e-5
     step = 0.01
     shifted = [
-        experiment.predict({AIR: known[AIR].off + side * step * known[AIR].scale}).position for side in (0, 1)
+        forward_model.predict({AIR: known[AIR].off + side * step * known[AIR].scale}).position
+        for side in (0, 1)
     ]
     slope = (shifted[1] - shifted[0]) / step
     assert np.abs(together[:, :3, 1] - slope).max() < 0.03 * np.abs(slope).max()
@@ -91,10 +92,10 @@ def test_a_fit_finds_the_payload_and_a_hopeless_one_does_not_move(recording, rob
 def test_more_nodes_where_the_data_can_see_them(recording, robot, monkeypatch):
     problem = make_problem(robot, [recording], [], np.ones(6, bool))
     errors = numerics.add_numerics(problem, {}, 1)
-    assert problem.experiments[0].nodes == NODES
+    assert problem.forward_models[0].nodes == NODES
     monkeypatch.setattr(numerics, "SPACE_LIMIT", 0.0)
     finer = numerics.add_numerics(problem, {}, 1)
-    assert problem.experiments[0].nodes == numerics.MOST_NODES
+    assert problem.forward_models[0].nodes == numerics.MOST_NODES
     assert finer["space_error_m"] < 0.3 * errors["space_error_m"]
     assert finer["time_error_m"] == pytest.approx(errors["time_error_m"], rel=0.2)
 
@@ -126,22 +127,22 @@ def test_the_error_of_the_solver_is_that_of_the_point(recording, robot, known, m
 
 
 def test_a_shorter_step_that_fails_is_followed_by_a_longer_one(recording, robot, monkeypatch):
-    experiment = Experiment(recording, robot)
-    half = numerics._shorter(experiment, {})
-    plain = Experiment.residual_at
+    forward_model = ForwardModel(recording, robot)
+    half = numerics._shorter(forward_model, {})
+    plain = ForwardModel.residual_at
 
     def failing(other, point):
-        return None if other.scheme.dt < 0.6 * experiment.scheme.dt else plain(other, point)
+        return None if other.scheme.dt < 0.6 * forward_model.scheme.dt else plain(other, point)
 
-    monkeypatch.setattr(Experiment, "residual_at", failing)
-    longer = numerics._shorter(experiment, {})
-    base = plain(experiment, {})
+    monkeypatch.setattr(ForwardModel, "residual_at", failing)
+    longer = numerics._shorter(forward_model, {})
+    base = plain(forward_model, {})
     errors = [factor * (base - found) for found, factor in (half, longer)]
     assert half[1] == 1.0 < longer[1]
     sizes = [np.linalg.norm(e[5:]) for e in errors]
     assert sizes[1] == pytest.approx(sizes[0], rel=0.5)
-    monkeypatch.setattr(Experiment, "residual_at", lambda *_: None)
-    assert numerics._shorter(experiment, {})[0] is None
+    monkeypatch.setattr(ForwardModel, "residual_at", lambda *_: None)
+    assert numerics._shorter(forward_model, {})[0] is None
 
 
 def test_the_misfit_is_a_smooth_function_of_delays(robot, known):
@@ -159,11 +160,11 @@ def test_the_misfit_is_a_smooth_function_of_delays(robot, known):
     recording = Recording(
         "", "", {}, joints, load, stamps, nothing, np.tile([1.0, 0, 0, 0], (len(stamps), 1)), ()
     )
-    experiment = Experiment(recording, robot)
+    forward_model = ForwardModel(recording, robot)
 
     def seen(drives, tracker):
         later = {("actuator_latency", "delay_s"): drives, ("load_time", "delay_s"): drives}
-        return experiment.predict({**later, ("tracker_latency", "delay_s"): tracker}).position
+        return forward_model.predict({**later, ("tracker_latency", "delay_s"): tracker}).position
 
     base, moved = seen(0.0, 0.004), seen(0.0, 0.0)
     shifts = [seen(d, 0.004 - d) for d in (0.0003, 0.0007, 0.0013, 0.0019, 0.0026, 0.004)]
@@ -186,7 +187,7 @@ def test_nuisances_stay_near_their_tolerances_unless_they_may_go_far(recording, 
 
 def test_large_sizes_are_looked_at_where_the_misfit_is_large(recording, robot, known):
     heavy = ("payload_inertia", "scale")
-    seen = Experiment(recording, robot).predict({heavy: 0.5})
+    seen = ForwardModel(recording, robot).predict({heavy: 0.5})
     there = replace(recording, position=seen.position, quaternion=seen.quaternion)
     problem = make_problem(robot, [there], [known["encoder_offset", "tube1.offset_rad"]], np.ones(6, bool))
     pool = [

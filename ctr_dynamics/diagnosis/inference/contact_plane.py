@@ -16,7 +16,7 @@ from joblib import Parallel, delayed
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from ctr_dynamics.diagnosis.forward_model import Experiment
+from ctr_dynamics.diagnosis.forward_model import ForwardModel
 from ctr_dynamics.diagnosis.inference.candidates import Candidate
 from ctr_dynamics.diagnosis.inference.map_fit import Key, Problem
 from ctr_dynamics.diagnosis.recording import Recording
@@ -44,11 +44,11 @@ EVALUATIONS = 12  # of the residual's derivatives, a span
 def wall(problem: Problem, known: Sequence[Quantity], workers: int) -> Candidate | None:
     """A candidate whose plane explains the first moments after measurement and nominal model part; None where no wall does."""
     own = [q for q in known if q.effect == EFFECT]
-    for experiment in problem.experiments:
-        residual = experiment.residual_at({})
+    for forward_model in problem.forward_models:
+        residual = forward_model.residual_at({})
         found = None
         if residual is not None:
-            found = _search(experiment, residual[:, :3], noise_floor(problem.robot), workers)
+            found = _search(forward_model, residual[:, :3], noise_floor(problem.robot), workers)
         if found is not None:
             start = {(EFFECT, name): value for name, value in _values(found).items()}
             shapes = tuple(replace(q, off=start[q.key]) for q in own if q.parameter.shape)
@@ -64,13 +64,13 @@ def wall(problem: Problem, known: Sequence[Quantity], workers: int) -> Candidate
     return None
 
 
-def parting(experiment: Experiment) -> float | None:
+def parting(forward_model: ForwardModel) -> float | None:
     """s at which measurement and nominal model part; None where they do not, or the model cannot be simulated."""
-    residual = experiment.residual_at({})
+    residual = forward_model.residual_at({})
     if residual is None:
         return None
-    parted = _parted(_sizes(experiment.recording, residual[:, :3]), noise_floor(experiment.robot))
-    return None if parted is None else float(experiment.recording.stamps[parted])
+    parted = _parted(_sizes(forward_model.recording, residual[:, :3]), noise_floor(forward_model.robot))
+    return None if parted is None else float(forward_model.recording.stamps[parted])
 
 
 def _sizes(recording: Recording, residual: Floats) -> Floats:
@@ -85,9 +85,9 @@ def _parted(sizes: Floats, floor: float) -> int | None:
     return int(np.argmax(large)) if large.any() else None
 
 
-def _search(experiment: Experiment, residual: Floats, floor: float, workers: int) -> Floats | None:
+def _search(forward_model: ForwardModel, residual: Floats, floor: float, workers: int) -> Floats | None:
     """Logarithm of the stiffness (N/m), normal (3,) and offset (cm) of a wall; None where there is none."""
-    recording = experiment.recording
+    recording = forward_model.recording
     sizes = _sizes(recording, residual)
     parted = _parted(sizes, floor)
     if parted is None:
@@ -97,7 +97,7 @@ def _search(experiment: Experiment, residual: Floats, floor: float, workers: int
         first -= 1
     if recording.stamps[parted] - recording.stamps[first] > SUDDEN:
         return None
-    back = matrix(experiment.nominal.rotation).T  # tracker's axes to base axes
+    back = matrix(forward_model.nominal.rotation).T  # tracker's axes to base axes
     calm = residual[max(first - 3, 0)] if first else np.zeros(3)
     begin = recording.stamps[parted]
 
@@ -105,11 +105,11 @@ def _search(experiment: Experiment, residual: Floats, floor: float, workers: int
         normal = back @ (residual[k] - calm)
         normal = normal / max(float(np.linalg.norm(normal)), 1e-12)
         near = slice(max(first - 1, 0), parted + 3)
-        places = (recording.position[near] - experiment.nominal.translation) @ back.T @ normal
+        places = (recording.position[near] - forward_model.nominal.translation) @ back.T @ normal
         x = np.array([math.log(stiffness), *normal, 1e2 * (np.nanmin(places) + INSIDE_M)])
         left = math.inf
         for span in FIRST_SPANS:
-            x, left = _fitted(experiment, x, begin, span, floor)
+            x, left = _fitted(forward_model, x, begin, span, floor)
             if left > NO_WALL:
                 break
         return left, x
@@ -125,7 +125,7 @@ def _search(experiment: Experiment, residual: Floats, floor: float, workers: int
         return None
     left, x = best
     for span in SPANS:
-        longer, left = _fitted(experiment, x, begin, span, floor)
+        longer, left = _fitted(forward_model, x, begin, span, floor)
         if left > 1.0 - EXPLAINED:
             break
         x = longer
@@ -133,11 +133,14 @@ def _search(experiment: Experiment, residual: Floats, floor: float, workers: int
 
 
 def _fitted(
-    experiment: Experiment, x: Floats, begin: float, span: float, floor: float
+    forward_model: ForwardModel, x: Floats, begin: float, span: float, floor: float
 ) -> tuple[Floats, float]:
     """The wall near ``x`` that leaves least from ``LEAD`` before ``begin`` (s) to ``span`` behind it, and the share of the squares that it leaves."""
-    short = Experiment(
-        experiment.recording.until(begin + span), experiment.robot, experiment.nodes, experiment.scheme.dt
+    short = ForwardModel(
+        forward_model.recording.until(begin + span),
+        forward_model.robot,
+        forward_model.nodes,
+        forward_model.scheme.dt,
     )
     stamps = short.recording.stamps
     counted = (stamps > begin - LEAD) & np.isfinite(short.recording.position).all(axis=1)

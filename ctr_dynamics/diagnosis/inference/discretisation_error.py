@@ -8,7 +8,7 @@ import numpy as np
 from joblib import Parallel, delayed
 from numpy.typing import NDArray
 
-from ctr_dynamics.diagnosis.forward_model import Experiment
+from ctr_dynamics.diagnosis.forward_model import ForwardModel
 from ctr_dynamics.diagnosis.inference.map_fit import Key, Problem
 
 Floats = NDArray[np.float64]
@@ -27,9 +27,9 @@ def add_numerics(problem: Problem, point: Mapping[Key, float], workers: int) -> 
     Returns rms differences in m: ``time_error_m`` (half the step), ``space_error_m`` (twice the nodes).
     """
     D, squares = differences(problem, point, workers)
-    nodes = 2 * problem.experiments[0].nodes
+    nodes = 2 * problem.forward_models[0].nodes
     if float(np.linalg.norm(D[:, 1])) > SPACE_LIMIT and nodes <= MOST_NODES:
-        problem.experiments = [e.resolved(nodes, e.scheme.dt) for e in problem.experiments]
+        problem.forward_models = [e.resolved(nodes, e.scheme.dt) for e in problem.forward_models]
         return add_numerics(problem, point, workers)
     _put(problem, D)
     rms = np.sqrt(squares / max(sum(len(w.used) for w in problem.whiteners), 1))
@@ -54,8 +54,8 @@ def differences(problem: Problem, point: Mapping[Key, float], workers: int) -> t
     where a recording cannot be simulated so."""
     jobs = [
         delayed(residual)(e, point)
-        for e in problem.experiments
-        for residual in (Experiment.residual_at, _shorter, _denser)
+        for e in problem.forward_models
+        for residual in (ForwardModel.residual_at, _shorter, _denser)
     ]
     done = Parallel(workers, prefer="threads")(jobs)
     parts: list[list[Floats]] = [[], []]
@@ -75,13 +75,15 @@ def _put(problem: Problem, D: Floats) -> None:
     problem.numerics = NUMERICS_SIGMA * D
 
 
-def _shorter(experiment: Experiment, point: Mapping[Key, float]) -> tuple[Floats | None, float]:
+def _shorter(forward_model: ForwardModel, point: Mapping[Key, float]) -> tuple[Floats | None, float]:
     for share, factor in SHORTER:
-        found = experiment.resolved(experiment.nodes, share * experiment.scheme.dt).residual_at(point)
+        found = forward_model.resolved(forward_model.nodes, share * forward_model.scheme.dt).residual_at(
+            point
+        )
         if found is not None:
             return found, factor
     return None, 0.0
 
 
-def _denser(experiment: Experiment, point: Mapping[Key, float]) -> tuple[Floats | None, float]:
-    return experiment.resolved(2 * experiment.nodes, experiment.scheme.dt).residual_at(point), 1.0
+def _denser(forward_model: ForwardModel, point: Mapping[Key, float]) -> tuple[Floats | None, float]:
+    return forward_model.resolved(2 * forward_model.nodes, forward_model.scheme.dt).residual_at(point), 1.0

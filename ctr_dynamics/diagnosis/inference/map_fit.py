@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.optimize import lsq_linear
 from scipy.special import log_ndtr
 
-from ctr_dynamics.diagnosis.forward_model import NODES, Experiment
+from ctr_dynamics.diagnosis.forward_model import NODES, ForwardModel
 from ctr_dynamics.diagnosis.recording import Recording
 from ctr_dynamics.diagnosis.whitening import Whitener
 from ctr_dynamics.effects import Quantity
@@ -90,14 +90,14 @@ class Problem:
     """Recordings of one robot, prepared for fits.
 
     Attributes:
-        experiments, whiteners: one for each recording.
+        forward_models, whiteners: one for each recording.
         nuisances: quantities with a tolerance. numerics: (m, d) whitened directions of the solver's own error.
         offset: (m,) whitened correction of the residual towards the finer solution.
         reach: tolerances that fits take a nuisance at most.
     """
 
     robot: Robot
-    experiments: list[Experiment]
+    forward_models: list[ForwardModel]
     whiteners: list[Whitener]
     nuisances: tuple[Quantity, ...]
     numerics: Floats
@@ -111,18 +111,18 @@ class Problem:
 
     def with_step(self, dt: float) -> Problem:
         """The same with another time step (s)."""
-        return replace(self, experiments=[e.resolved(e.nodes, dt) for e in self.experiments])
+        return replace(self, forward_models=[e.resolved(e.nodes, dt) for e in self.forward_models])
 
     @property
     def finer(self) -> Problem:
         """The same with half the time step."""
-        return self.with_step(0.5 * self.experiments[0].scheme.dt)
+        return self.with_step(0.5 * self.forward_models[0].scheme.dt)
 
     def residual(self, point: Mapping[Key, float]) -> Floats | None:
         """(m,) whitened residual at ``point``; None where a simulation fails."""
         parts = []
-        for experiment, whiten in zip(self.experiments, self.whiteners, strict=True):
-            left = experiment.residual_at(point)
+        for forward_model, whiten in zip(self.forward_models, self.whiteners, strict=True):
+            left = forward_model.residual_at(point)
             if left is None:
                 return None
             parts.append(whiten(left))
@@ -133,14 +133,14 @@ class Problem:
     ) -> tuple[Floats, Floats] | None:
         """Whitened residual (m,) at ``point`` and derivatives (m, len(wanted)) of the prediction, each by its coordinate."""
         residuals, columns = [], []
-        for experiment, whiten in zip(self.experiments, self.whiteners, strict=True):
+        for forward_model, whiten in zip(self.forward_models, self.whiteners, strict=True):
             try:
-                prediction, jacobian = experiment.jacobian(point, wanted)
+                prediction, jacobian = forward_model.jacobian(point, wanted)
             except InputError:
                 return None
             if prediction.failure:
                 return None
-            residuals.append(whiten(experiment.residual(prediction)))
+            residuals.append(whiten(forward_model.residual(prediction)))
             columns.append(whiten(jacobian))
         scale = np.array([q.scale for q in wanted])
         return np.concatenate(residuals) - self.offset, np.concatenate(columns) / scale
@@ -154,13 +154,13 @@ def make_problem(
     nodes: int = NODES,
 ) -> Problem:
     """Problem of ``recordings``; axes that are not finite or not in ``mask`` (6,) are left out."""
-    experiments = [Experiment(r, robot, nodes) for r in recordings]
+    forward_models = [ForwardModel(r, robot, nodes) for r in recordings]
     whiteners = []
     for r in recordings:
         used = np.isfinite(r.position).all(axis=1) & (r.stamps >= 0.0)
         whiteners.append(Whitener(robot, r.stamps, mask, used))
     size = sum(w.size for w in whiteners)
-    return Problem(robot, experiments, whiteners, tuple(nuisances), np.zeros((size, 0)), np.zeros(size))
+    return Problem(robot, forward_models, whiteners, tuple(nuisances), np.zeros((size, 0)), np.zeros(size))
 
 
 def prior_variance(quantity: Quantity, cause: bool) -> float:

@@ -90,7 +90,7 @@ def _from_early(
 
     Over a whole recording a wall a little off is out of step for good, and so is one beside a further cause that is not there yet.
     """
-    partings = [parting(e) for e in problem.experiments]
+    partings = [parting(e) for e in problem.forward_models]
     begins = [begin for begin in partings if begin is not None]
     if len(begins) < len(partings):
         return []
@@ -118,9 +118,9 @@ def _from_early(
 def _until(problem: Problem, begins: Sequence[float], span: float) -> Problem:
     """``problem`` up to ``span`` (s) after the time ``begins`` of each recording."""
     recordings = [
-        e.recording.until(begin + span) for e, begin in zip(problem.experiments, begins, strict=True)
+        e.recording.until(begin + span) for e, begin in zip(problem.forward_models, begins, strict=True)
     ]
-    nodes = problem.experiments[0].nodes
+    nodes = problem.forward_models[0].nodes
     return make_problem(problem.robot, recordings, problem.nuisances, problem.whiteners[0].mask, nodes)
 
 

@@ -135,7 +135,10 @@ def findings(diagnosis: Diagnosis, command: str, experiment: dict[str, Any] | No
             "inputs": [
                 {"name": name, "sha256": digest} for r in d.recordings for name, digest in r.sha256.items()
             ],
-            "parameters": {"nodes": problem.experiments[0].nodes, "dt_s": problem.experiments[0].scheme.dt}
+            "parameters": {
+                "nodes": problem.forward_models[0].nodes,
+                "dt_s": problem.forward_models[0].scheme.dt,
+            }
             if problem
             else {},
         }

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ctr_dynamics.diagnosis.forward_model import Experiment
+from ctr_dynamics.diagnosis.forward_model import ForwardModel
 from ctr_dynamics.diagnosis.inference.candidates import Candidate
 from ctr_dynamics.diagnosis.inference.map_fit import prior_variance
 from ctr_dynamics.diagnosis.inference.sensitivities import left_over, separation
@@ -57,7 +57,7 @@ def planned(scenario: Scenario, robot: Robot) -> Recording:
 
 
 def plan(diagnosis: Diagnosis) -> Plan | None:
-    """The most telling experiment; None where nothing is left to tell apart."""
+    """The most informative experiment; None where nothing is left to tell apart."""
     d = diagnosis
     if d.verdict == "not_excited":
         scenario = load_scenario(START)
@@ -97,10 +97,10 @@ def _separation(d: Diagnosis, scenario: Scenario, own: Candidate, rival: Candida
     assert d.at_best is not None
     fit = d.best
     recording = planned(scenario, d.robot)
-    experiment = Experiment(recording, d.robot, d.problem.experiments[0].nodes)
+    forward_model = ForwardModel(recording, d.robot, d.problem.forward_models[0].nodes)
     rivals = [q for q in rival.quantities if q.key not in {x.key for x in fit.active}]
     point = {**fit.point, **dict(rival.start)}
-    prediction, jacobian = experiment.jacobian(point, (*fit.active, *rivals))
+    prediction, jacobian = forward_model.jacobian(point, (*fit.active, *rivals))
     if prediction.failure:
         return None
     mask = d.problem.whiteners[0].mask

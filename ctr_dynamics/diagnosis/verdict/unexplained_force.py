@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import lombscargle
 
-from ctr_dynamics.diagnosis.forward_model import Experiment, Point
+from ctr_dynamics.diagnosis.forward_model import ForwardModel, Point
 from ctr_dynamics.effects import quantities
 
 Floats = NDArray[np.float64]
@@ -46,15 +46,15 @@ class Unexplained:
         )
 
 
-def unexplained(experiment: Experiment, point: Point) -> Unexplained | None:
+def unexplained(forward_model: ForwardModel, point: Point) -> Unexplained | None:
     """Describe what the model at ``point`` leaves of a recording; None where it cannot be simulated or hardly anything is left.
 
     The tip's compliance is that of a constant force: right below the first resonance, and a description above it.
     """
-    pushes = [q for q in quantities(experiment.robot) if q.effect == "tip_force"]
-    prediction, jacobian = experiment.jacobian(point, pushes)
-    residual = experiment.residual(prediction)[:, :3]
-    stamps = experiment.recording.stamps
+    pushes = [q for q in quantities(forward_model.robot) if q.effect == "tip_force"]
+    prediction, jacobian = forward_model.jacobian(point, pushes)
+    residual = forward_model.residual(prediction)[:, :3]
+    stamps = forward_model.recording.stamps
     good = np.isfinite(residual).all(axis=1) & (stamps >= stamps[0] + 0.5)
     if prediction.failure or good.sum() < 20:
         return None
