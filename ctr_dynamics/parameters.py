@@ -1,4 +1,4 @@
-"""The one table of parameters: it drives declaration, replay's --set, checks, README and YAML."""
+"""The table of parameters. The node's declaration, replay's --set, the checks, docs/parameters.md and config/estimator.yaml come from it."""
 
 from __future__ import annotations
 
@@ -21,37 +21,66 @@ ZEROS = (0.0, 0.0, 0.0)
 
 PARAMETERS: tuple[Parameter, ...] = (
     Parameter(
-        "robot", "str", "till2020_tissue", "", "Shipped robot or path of a robot file.", read_only=True
+        "robot",
+        "str",
+        "till2020_tissue",
+        "",
+        "Name of a shipped robot, or path of a robot file.",
+        read_only=True,
     ),
     Parameter(
         "input_timeout_s",
         "float",
         0.1,
         "s",
-        "Longest wait for, or extrapolation of, the joints.",
+        "Longest time to wait for joint states, or to extrapolate them.",
         0.003,
         10.0,
     ),
-    Parameter("model.scheme", "str", "sdirk3", "", "Time scheme.", choices=SCHEMES, read_only=True),
-    Parameter("model.alpha", "float", -0.45, "", "Alpha of scheme bdf_alpha.", -0.5, 0.5, read_only=True),
-    Parameter("model.dt_s", "float", 0.003, "s", "Step of the output grid.", 0.003, 0.003, read_only=True),
-    Parameter("model.nodes", "int", 12, "", "Arc-length nodes in all.", 8, 1000, read_only=True),
+    Parameter(
+        "model.scheme", "str", "sdirk3", "", "Time integration scheme.", choices=SCHEMES, read_only=True
+    ),
+    Parameter(
+        "model.alpha",
+        "float",
+        -0.45,
+        "",
+        "Parameter alpha of the scheme bdf_alpha.",
+        -0.5,
+        0.5,
+        read_only=True,
+    ),
+    Parameter(
+        "model.dt_s",
+        "float",
+        0.003,
+        "s",
+        "Time step of the model and of the outputs.",
+        0.003,
+        0.003,
+        read_only=True,
+    ),
+    Parameter(
+        "model.nodes", "int", 12, "", "Number of arc-length nodes along the robot.", 8, 1000, read_only=True
+    ),
     Parameter(
         "model.tolerance",
         "float",
         1e-4,
         "",
-        "Scaled imbalance at the tip at which the shooting ends.",
+        "Scaled residual at the tip below which the shooting has converged.",
         1e-11,
         1e-3,
     ),
-    Parameter("filter.enabled", "bool", True, "", "Fuse the tracker; false runs the model alone."),
+    Parameter(
+        "filter.enabled", "bool", True, "", "Whether the tracker is fused; false runs the open-loop model."
+    ),
     Parameter(
         "filter.rank",
         "int",
         24,
         "",
-        "Columns of the covariance's square root, at least; two tubes have 16, 24, 32 or 40.",
+        "Least number of columns of the covariance factor. It is rounded up to 16, 24, 32 or 40 for two tubes.",
         4,
         40,
         read_only=True,
@@ -61,7 +90,7 @@ PARAMETERS: tuple[Parameter, ...] = (
         "float",
         0.9999,
         "",
-        "Chi-square probability beyond which a tracker sample is rejected.",
+        "Chi-square probability of the gate; a measurement outside it is rejected.",
         0.9,
         0.999999,
     ),
@@ -70,7 +99,7 @@ PARAMETERS: tuple[Parameter, ...] = (
         "float",
         0.00005,
         "N",
-        "Least deviation per axis of the unknown tip force; next to none at the low end.",
+        "Smallest standard deviation per axis of the unknown tip force. The low end of the range practically switches the force off.",
         1e-6,
         10.0,
     ),
@@ -79,7 +108,8 @@ PARAMETERS: tuple[Parameter, ...] = (
         "float",
         0.2,
         "N",
-        "Largest deviation per axis of the unknown tip force: innovations decide between the two; the same as the least fixes it.",
+        "Largest standard deviation per axis of the unknown tip force. "
+        "The innovations decide between the smallest and the largest; equal values fix it.",
         1e-6,
         10.0,
     ),
@@ -88,7 +118,7 @@ PARAMETERS: tuple[Parameter, ...] = (
         "float",
         20.0,
         "s",
-        "Mean time between two changes of that deviation.",
+        "Mean time between two changes of the standard deviation of the unknown tip force.",
         0.01,
         1e6,
     ),
@@ -106,7 +136,7 @@ PARAMETERS: tuple[Parameter, ...] = (
         "float",
         0.2,
         "s",
-        "How late a sample may come and still be fused at its own stamp.",
+        "Largest age at which a measurement is still fused at its own stamp.",
         0.0,
         2.0,
     ),
@@ -115,7 +145,7 @@ PARAMETERS: tuple[Parameter, ...] = (
         "float",
         10.0,
         "s",
-        "Window over which the innovations are watched for a misfit of the model.",
+        "Window of the consistency monitor.",
         1.0,
         600.0,
     ),
@@ -124,7 +154,7 @@ PARAMETERS: tuple[Parameter, ...] = (
         "float",
         1.3,
         "",
-        "Mean NIS per degree of freedom over the window beyond which misfit is reported.",
+        "Largest mean NIS per degree of freedom over the window without a warning.",
         1.0,
         100.0,
     ),
@@ -133,7 +163,7 @@ PARAMETERS: tuple[Parameter, ...] = (
         "float",
         0.5,
         "",
-        "Excess of the NIS per degree of freedom that its CUSUM lets pass.",
+        "Slack of the CUSUM: excess of the NIS per degree of freedom that it does not count.",
         0.0,
         10.0,
     ),
@@ -142,7 +172,7 @@ PARAMETERS: tuple[Parameter, ...] = (
         "float",
         60.0,
         "",
-        "CUSUM of the NIS beyond which misfit is reported.",
+        "Largest CUSUM of the NIS without a warning.",
         1.0,
         1e6,
     ),
@@ -151,7 +181,7 @@ PARAMETERS: tuple[Parameter, ...] = (
         "float",
         2.5,
         "",
-        "Ljung-Box statistic of the innovations per degree of freedom beyond which misfit is reported.",
+        "Largest Ljung-Box statistic of the innovations per degree of freedom without a warning.",
         1.0,
         1000.0,
     ),
@@ -160,7 +190,7 @@ PARAMETERS: tuple[Parameter, ...] = (
         "float",
         0.0,
         "s",
-        "Added to the robot file's delay; above 0: poses are older than their stamps.",
+        "Delay added to that of the robot file. It is positive when poses are older than their stamps.",
         -0.2,
         0.2,
     ),
@@ -169,7 +199,7 @@ PARAMETERS: tuple[Parameter, ...] = (
         "floats",
         ZEROS,
         "m",
-        "Sensor position in the tip frame, added to the robot file's.",
+        "Position of the sensor in the tip frame, added to that of the robot file.",
         -1.0,
         1.0,
         size=3,
@@ -179,7 +209,7 @@ PARAMETERS: tuple[Parameter, ...] = (
         "floats",
         ZEROS,
         "rad",
-        "Rotation vector of ctr_base in the tracker's frame, composed on top of the robot file's.",
+        "Rotation vector of ctr_base in the tracker's frame, composed with the registration of the robot file.",
         -2 * math.pi,
         2 * math.pi,
         size=3,
@@ -189,7 +219,7 @@ PARAMETERS: tuple[Parameter, ...] = (
         "floats",
         ZEROS,
         "m",
-        "Origin of ctr_base in the tracker's frame, composed on top of the robot file's.",
+        "Origin of ctr_base in the tracker's frame, composed with the registration of the robot file.",
         -100.0,
         100.0,
         size=3,
@@ -199,7 +229,7 @@ PARAMETERS: tuple[Parameter, ...] = (
         "str",
         "xyzrpy",
         "",
-        "Measured axes: positions, then rotations about the tip's x (r), y (p) and z (y).",
+        "Axes that the tracker measures: positions, then rotations about the tip's x (r), y (p) and z (y).",
         syntax=axes_mask,
         syntax_text="subset of xyzrpy, in that order",
     ),
@@ -208,16 +238,26 @@ PARAMETERS: tuple[Parameter, ...] = (
         "str",
         "predict",
         "",
-        "Step when the covering joints are in (wait; replay's default), or on time (predict).",
+        "When a step is taken. wait: after a joint state with its stamp or a later one has arrived (default of replay). "
+        "predict: on time, with extrapolated joints.",
         choices=("wait", "predict"),
     ),
-    Parameter("output.backbone_every", "int", 11, "", "Steps per backbone path.", 1, 1000, read_only=True),
+    Parameter(
+        "output.backbone_every",
+        "int",
+        11,
+        "",
+        "Steps between two messages of the backbone path.",
+        1,
+        1000,
+        read_only=True,
+    ),
     Parameter(
         "output.frame_id",
         "str",
         "ctr_base",
         "",
-        "Frame of every output, and the one that poses and loads must name (or none).",
+        "Frame of every output. Poses and loads must name this frame or none.",
         read_only=True,
     ),
     Parameter(
@@ -225,28 +265,40 @@ PARAMETERS: tuple[Parameter, ...] = (
         "str",
         "best_effort",
         "",
-        "Reliability asked of publishers.",
+        "Reliability that the node requests from publishers.",
         choices=RELIABILITY,
         read_only=True,
     ),
-    Parameter("qos.subscription_depth", "int", 50, "", "Inputs kept, each topic.", 1, 10000, read_only=True),
+    Parameter(
+        "qos.subscription_depth", "int", 50, "", "Queue depth of each input topic.", 1, 10000, read_only=True
+    ),
     Parameter(
         "qos.publisher_reliability",
         "str",
         "reliable",
         "",
-        "Reliability offered to subscribers.",
+        "Reliability that the node offers to subscribers.",
         choices=RELIABILITY,
         read_only=True,
     ),
-    Parameter("qos.publisher_depth", "int", 10, "", "Outputs kept, each topic.", 1, 10000, read_only=True),
-    Parameter("record.path", "str", "", "", "MCAP file to record to; empty: none.", read_only=True),
+    Parameter(
+        "qos.publisher_depth", "int", 10, "", "Queue depth of each output topic.", 1, 10000, read_only=True
+    ),
+    Parameter(
+        "record.path",
+        "str",
+        "",
+        "",
+        "MCAP file for a recording of inputs and outputs; empty for none.",
+        read_only=True,
+    ),
     Parameter(
         "record.rolling_s",
         "float",
         0.0,
         "s",
-        "Inputs of this length are kept in memory and written when misfit is reported, by `~/save_snapshot`, and at exit under an alarm; 0: none.",
+        "Length of the ring buffer of inputs. It is written when the consistency monitor warns, by `~/save_snapshot`, "
+        "and at exit during a warning; 0 for none.",
         0.0,
         600.0,
         read_only=True,
@@ -256,7 +308,7 @@ PARAMETERS: tuple[Parameter, ...] = (
         "str",
         "",
         "",
-        "MCAP file for them, replaced each time; empty: `ctr_estimator_rolling.mcap` in the folder of the logs.",
+        "MCAP file for the ring buffer, replaced each time. Empty: `ctr_estimator_rolling.mcap` in the ROS log folder.",
         read_only=True,
     ),
     Parameter(
@@ -264,7 +316,7 @@ PARAMETERS: tuple[Parameter, ...] = (
         "str",
         "",
         "",
-        "JSON file for the punctuality of the steps, written at exit; empty: none.",
+        "JSON file for the punctuality of the steps, written at exit; empty for none.",
         read_only=True,
     ),
 )
@@ -284,7 +336,7 @@ def parameter(name: str) -> Parameter:
         return _BY_NAME[name]
     except KeyError:
         near = get_close_matches(name, _BY_NAME, 1)
-        hint = f"did you mean '{near[0]}'?" if near else "see the parameter table in README.md"
+        hint = f"did you mean '{near[0]}'?" if near else "see docs/parameters.md"
         raise InputError(f"unknown parameter '{name}'", do=hint) from None
 
 

@@ -23,6 +23,7 @@ PAGES = [
     ROOT / "CONTRIBUTING.md",
     ROOT / "CHANGELOG.md",
     *sorted((ROOT / "docs").glob("*.md")),
+    *sorted((ROOT / "msg_docs").glob("*.md")),
 ]
 SNAP_VALUES = {"tube_coulomb", "tube_viscous", "epsilon", "beta1"}  # what `snap --set` takes
 TEXT = {
@@ -49,9 +50,9 @@ def test_every_command_and_option_is_explained(commands):
 
 
 def test_every_parameter_is_documented():
-    readme, page = TEXT[ROOT / "README.md"], TEXT[ROOT / reference.PAGE]
+    parameters, page = TEXT[ROOT / "docs" / "parameters.md"], TEXT[ROOT / reference.PAGE]
     for parameter in PARAMETERS:
-        assert f"`{parameter.name}`" in readme
+        assert f"`{parameter.name}`" in parameters
         assert parameter.text
     for table in NODES.values():
         for parameter in table:
@@ -60,9 +61,9 @@ def test_every_parameter_is_documented():
 
 
 def test_every_topic_and_field_is_documented():
-    readme = TEXT[ROOT / "README.md"]
+    page = TEXT[ROOT / "docs" / "topics.md"]
     for topic in TOPICS:
-        assert f"`{topic.name}`" in readme
+        assert f"`{topic.name}`" in page
         assert (ROOT / "msg_docs" / topic.page).is_file()
         assert undocumented(topic) == []
     assert TUBES_TOPIC in TEXT[ROOT / "docs" / "view.md"]
@@ -152,7 +153,19 @@ def test_citation_is_a_citation_file():
     assert data["references"][0]["year"] == 2020
 
 
-def test_readme_leads_to_every_page():
-    readme = TEXT[ROOT / "README.md"]
+def test_index_leads_to_every_page():
+    index = TEXT[ROOT / "docs" / "index.md"]
+    assert "(docs/index.md)" in TEXT[ROOT / "README.md"]
     for page in (ROOT / "docs").glob("*.md"):
-        assert f"(docs/{page.name})" in readme, page.name
+        assert f"({page.name})" in index or page.name == "index.md", page.name
+
+
+@pytest.mark.slow
+def test_the_lines_of_python_in_the_readme_run(tmp_path, monkeypatch, capsys):
+    [code] = re.findall(r"```python\n(.*?)```", TEXT[ROOT / "README.md"], re.DOTALL)
+    assert len(code.strip().splitlines()) <= 10
+    (tmp_path / "ctr_dynamics").symlink_to(ROOT / "ctr_dynamics")
+    monkeypatch.chdir(tmp_path)
+    exec(compile(code, "README.md", "exec"), {})
+    assert "2 tubes" in capsys.readouterr().out
+    assert (tmp_path / "report.html").stat().st_size > 10_000

@@ -175,7 +175,7 @@ def test_any_value_is_taken_or_refused_in_one_line(p, value):
 # --- generated documents ------------------------------------------------------------------------------------
 
 
-def test_readme_and_estimator_yaml_are_up_to_date():
+def test_generated_tables_and_estimator_yaml_are_up_to_date():
     late = [str(path.relative_to(ROOT)) for path in tables.outdated(ROOT)]
     assert not late, f"run python -m tools.tables --write: {late}"
 
@@ -206,14 +206,15 @@ def test_a_least_deviation_above_the_largest_is_refused():
     Settings({"filter.tip_force_sigma_N": 0.3, "filter.tip_force_sigma_max_N": 0.3})
 
 
-def test_outdated_readme_is_found_and_mended(tmp_path, capsys):
-    (tmp_path / tables.ESTIMATOR_YAML).parent.mkdir(parents=True)
-    readme = (ROOT / "README.md").read_text().replace("`model.nodes`", "`model.knots`")
-    (tmp_path / "README.md").write_text(readme)
+def test_outdated_tables_are_found_and_brought_up_to_date(tmp_path, capsys):
+    (tmp_path / "docs").mkdir()
+    for page in tables.SECTIONS:
+        (tmp_path / page).write_text((ROOT / page).read_text().replace("`model.nodes`", "`model.knots`"))
     assert tables.main(["--root", str(tmp_path)]) == 1
-    assert "README.md is out of date" in capsys.readouterr().err
+    assert "parameters.md is out of date" in capsys.readouterr().err
     assert tables.main(["--root", str(tmp_path), "--write"]) == 0
     assert tables.main(["--root", str(tmp_path)]) == 0
-    assert (tmp_path / "README.md").read_text() == (ROOT / "README.md").read_text()
+    for page in tables.SECTIONS:
+        assert (tmp_path / page).read_text() == (ROOT / page).read_text()
     with pytest.raises(InputError, match="marker"):
-        tables.render_readme("# no markers")
+        tables.render(Path("docs/topics.md"), "# no markers")

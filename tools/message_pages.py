@@ -37,7 +37,7 @@ def _prefixes(path: str) -> tuple[str, ...]:
 def page(topic: Topic) -> str:
     """The page of one topic, in Markdown."""
     qos = topic.qos
-    direction = "heard by the estimator" if topic.direction == "in" else "published by the estimator"
+    direction = "subscribed by the estimator" if topic.direction == "in" else "published by the estimator"
     parameters = "qos.subscription_*" if topic.direction == "in" else "qos.publisher_*"
     lines = [
         f"# {topic.name}",

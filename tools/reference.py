@@ -214,13 +214,13 @@ def render() -> str:
     lines = [
         "# Reference",
         "",
-        "Written by `python -m tools.tables --write` from the code. Topics: [msg_docs](../msg_docs/README.md); parameters of the",
-        "estimator: [README](../README.md#parameters).",
+        "This page is written by `python -m tools.tables --write` from the code. Topics are in [msg_docs](../msg_docs/README.md), parameters of the",
+        "estimator in [parameters](parameters.md).",
         "",
         "## Commands",
         "",
-        "Exit codes: 0 finished, 1 finished but some rows or steps failed (they are named), 2 bad arguments or input (one line says what), 130",
-        "interrupted.",
+        "Exit codes: 0 finished; 1 finished, but some rows or steps failed, and they are named; 2 bad arguments or input, with one line that says",
+        "what; 130 interrupted.",
         "",
     ]
     for name, command in commands():

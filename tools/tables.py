@@ -1,4 +1,4 @@
-"""Tables of README.md, config/estimator.yaml and docs/reference.md, written from the code's own tables.
+"""Generated parts of the documentation and config/estimator.yaml, written from the tables of the code.
 
 `python -m tools.tables` says what is out of date (exit code 1); with `--write` it mends it.
 """
@@ -15,7 +15,7 @@ import yaml
 from ctr_dynamics.errors import InputError
 from ctr_dynamics.io.messages.topics import TOPICS
 from ctr_dynamics.parameters import PARAMETERS, Parameter
-from tools import reference
+from tools import message_pages, reference, words
 
 ESTIMATOR_YAML = Path("ctr_dynamics/config/estimator.yaml")
 
@@ -33,8 +33,26 @@ def _shown(value: Any) -> str:
     return f"{value:g}" if isinstance(value, float) else str(value)
 
 
-def parameter_table() -> str:
-    """Markdown table of every parameter."""
+GROUPS = {
+    "": "General",
+    "model": "Model",
+    "filter": "Filter",
+    "misfit": "Consistency monitor",
+    "tracker": "Tracker",
+    "output": "Outputs",
+    "qos": "Quality of service",
+    "record": "Recordings",
+}
+"""Heading of the parameters by the first part of their names."""
+
+
+def parameter_tables() -> str:
+    """A heading and a Markdown table for every group of parameters."""
+    parts = [f"## {title}\n\n{_parameter_table(group)}" for group, title in GROUPS.items()]
+    return "\n\n".join(parts)
+
+
+def _parameter_table(group: str) -> str:
     types = {"floats": "float[3]", "str": "string"}
     rows = [
         [
@@ -46,6 +64,7 @@ def parameter_table() -> str:
             p.text + (" Read-only while the node runs." if p.read_only else ""),
         ]
         for p in PARAMETERS
+        if p.name.rpartition(".")[0] == group
     ]
     return _markdown(["name", "type", "default", "unit", "range", "what it does"], rows)
 
@@ -59,24 +78,27 @@ def topic_table() -> str:
     return _markdown(["", "topic", "type", "rate", "meaning"], rows)
 
 
-# Marker in README.md -> what stands between it and its end marker.
-SECTIONS = {"parameters": parameter_table, "topics": topic_table}
+# Page -> name of its markers, and what stands between them.
+SECTIONS = {
+    Path("docs/topics.md"): ("topics", topic_table),
+    Path("docs/parameters.md"): ("parameters", parameter_tables),
+    Path("docs/glossary.md"): ("vocabulary", words.table),
+}
 
 
-def render_readme(text: str) -> str:
-    """README text with every generated table brought up to date.
+def render(page: Path, text: str) -> str:
+    """Text of a page with its generated part brought up to date.
 
     Raises:
         InputError: a marker is missing.
     """
-    for name, table in SECTIONS.items():
-        begin, end = f"<!-- {name}: generated -->", f"<!-- {name}: end -->"
-        head, found, rest = text.partition(begin)
-        _, ended, tail = rest.partition(end)
-        if not found or not ended:
-            raise InputError(f"marker '{begin}' or '{end}' is missing", do="put both in", where="README.md")
-        text = f"{head}{begin}\n{table()}\n{end}{tail}"
-    return text
+    name, table = SECTIONS[page]
+    begin, end = f"<!-- {name}: generated -->", f"<!-- {name}: end -->"
+    head, found, rest = text.partition(begin)
+    _, ended, tail = rest.partition(end)
+    if not found or not ended:
+        raise InputError(f"marker '{begin}' or '{end}' is missing", do="put both in", where=str(page))
+    return f"{head}{begin}\n{table()}\n{end}{tail}"
 
 
 def estimator_yaml() -> str:
@@ -114,9 +136,9 @@ def _yaml_value(value: Any) -> str:
 
 def outdated(root: Path) -> dict[Path, str]:
     """Files below `root` whose generated parts are out of date, with the text they should have."""
-    readme = root / "README.md"
     wanted = {
-        readme: render_readme(readme.read_text(encoding="utf-8")),
+        **{root / page: render(page, (root / page).read_text(encoding="utf-8")) for page in SECTIONS},
+        **{root / "msg_docs" / name: text for name, text in message_pages.pages().items()},
         root / ESTIMATOR_YAML: estimator_yaml(),
         root / reference.PAGE: reference.render(),
     }

@@ -113,11 +113,15 @@ def page(result: Result) -> str:
     """The figures as a page of documentation, Markdown."""
     return (
         "# Performance\n\n"
-        "Written by `ctr-dynamics bench --page FILE`; do not edit by hand. The machine and its load are part of the figures: compare ratios to a\n"
-        "plain sweep (one pass from base to tip), which the same run has measured, rather than times. `ctr-dynamics bench --output DIR` writes the\n"
-        "same figures as JSON and as plots: real-time ratio over step and spacing (Till et al. 2020, Fig. 13), error over spacing (Fig. 14),\n"
-        "the histogram of the steps' times. Where something else may have been running meanwhile, the fastest of some repetitions counts.\n\n"
-        "The default time scheme, `sdirk3`, is the one with the smallest error at 3 ms below.\n\n"
+        "This page is written by `ctr-dynamics bench --page FILE`; do not edit it by hand.\n\n"
+        "The machine and its load are part of the figures. Compare ratios to a plain sweep, which the same run has measured, rather than times.\n"
+        "A sweep is one integration of the rod equations from base to tip. Where something else may have run at the same time, the fastest of\n"
+        "some repetitions counts.\n\n"
+        "`ctr-dynamics bench --output DIR` writes the same figures as JSON and as plots:\n\n"
+        "- real-time ratio over step and spacing (Till et al. 2020, Fig. 13);\n"
+        "- error over spacing (Fig. 14);\n"
+        "- histogram of the times of the steps.\n\n"
+        "The default time scheme, `sdirk3`, has the smallest error at 3 ms below.\n\n"
         f"```text\n{text(result)}\n```\n"
     )
 

@@ -1,4 +1,4 @@
-"""The tracker's measurement: registration, lever arm, delay and drift between the model's tip and a reported pose (docs/ekf.md).
+"""The tracker's measurement: registration, lever arm, delay and drift between the model's tip and a reported pose (docs/filter.md).
 
 reading = R_reg (p + R lever) + t_reg + drift, R_reading = R_reg R, both of the time stamp - delay. What effects add (a scale, a steady drift, a
 clock of another rate) is taken off the readings first, an average over a window counts as a delay by half of it.

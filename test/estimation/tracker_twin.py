@@ -1,4 +1,4 @@
-"""The measurement in plain NumPy: what a tip and tracker states predict, and how a reading differs from it (docs/ekf.md)."""
+"""The measurement in plain NumPy: what a tip and tracker states predict, and how a reading differs from it (docs/filter.md)."""
 
 import math
 

@@ -1,6 +1,6 @@
 """The extended Kalman filter on the fields of the rod: predict with the tangent of the step, update with filterpy at the sample's own stamp.
 
-Numbered steps, as in docs/ekf.md: (1) columns follow the tangent of the step, or of up to three at once; (2) the tip force decays and is driven, the
+Numbered steps (docs/filter.md): (1) columns follow the tangent of the step, or of up to three at once; (2) the tip force decays and is driven, the
 drift likewise; (3) columns are reduced to the rank; (4) a sample is compared with the tip of its own time, whose columns have been kept;
 (5) gate; (6) filterpy's update of (a, b); (7) fields, parameters, kept tips and the shooting unknowns move by the columns.
 """

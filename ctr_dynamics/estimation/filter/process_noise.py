@@ -1,4 +1,4 @@
-"""How strongly the unknown tip force is driven: a distribution over its size, from how large the innovations are (docs/ekf.md).
+"""How strongly the unknown tip force is driven: a distribution over its size, from how large the innovations are (docs/filter.md).
 
 With the gains that the filter has used, its covariance is affine in the force's variance: P = F + c D, where F comes from the prior, the other
 noise and the readings' noise, D from the force's randomness, and c is the variance by the one assumed so far. D goes through the filter beside P. So

@@ -1,4 +1,4 @@
-"""The one table of topics: what the estimator hears and says, with types, rates and the meaning of every
+"""The table of topics: what the estimator subscribes to and publishes, with types, rates and the meaning of every
 field.
 
 The node, replay, the recorder and the pages in ``msg_docs/`` all follow this table. SI units and radians;
@@ -99,7 +99,7 @@ TOPICS: tuple[Topic, ...] = (
         "in",
         INPUT_QOS,
         "50 Hz or more (100 Hz in the shipped bags)",
-        "Actuator angles and positions of all tubes.",
+        "Rotation and translation of the actuators of all tubes.",
         (
             Field("header.stamp", "time at which the encoders were read", "s, ns"),
             Field("header.frame_id", "not used"),
@@ -117,10 +117,9 @@ TOPICS: tuple[Topic, ...] = (
             Field("effort", "not used; may be empty"),
         ),
         (
-            "Joints are matched by name, never by place. Other names in the message are ignored; a message "
-            "in which a tube's rotation or translation is missing is not used and is counted in "
-            "`/diagnostics`.",
-            "Values are linear between two stamps.",
+            "Joints are matched by name, not by index. Other names in the message are ignored. A message without the rotation or "
+            "translation of a tube is rejected and counted in `/diagnostics`.",
+            "Values are interpolated linearly between two stamps.",
         ),
     ),
     Topic(
@@ -141,9 +140,9 @@ TOPICS: tuple[Topic, ...] = (
             Field("pose.orientation", "orientation of the sensor, unit quaternion in ROS order x, y, z, w"),
         ),
         (
-            "Samples up to 0.2 s late and out of order are fused at their own stamp. Samples with numbers "
-            "that are not finite, or with a quaternion whose norm is far from one, are rejected and "
-            "counted.",
+            "A pose that is late or out of order is fused at its own stamp while it is at most `filter.window_s` (0.2 s) old.",
+            "A pose with numbers that are not finite, or with a quaternion whose norm is far from one, is rejected and counted in "
+            "`/diagnostics`.",
         ),
     ),
     Topic(
@@ -160,8 +159,8 @@ TOPICS: tuple[Topic, ...] = (
             Field("wrench.torque", "torque about the tip point, base axes", "N m"),
         ),
         (
-            "Before the first stamp the load is that first one if it comes within 0.1 s of the first joint "
-            "state, else zero.",
+            "The first value also holds before its stamp, if it comes within 0.1 s of the first joint state. Otherwise the load "
+            "before the first stamp is zero.",
         ),
     ),
     Topic(
@@ -215,7 +214,7 @@ TOPICS: tuple[Topic, ...] = (
         "out",
         OUTPUT_QOS,
         PER_STEP,
-        "Tip pose of the model alone: a second, open-loop run that the tracker never corrects.",
+        "Tip pose of the open-loop model: a second run that the tracker never corrects.",
         (
             _STAMP,
             _FRAME,
@@ -223,8 +222,7 @@ TOPICS: tuple[Topic, ...] = (
             Field("pose.orientation", _ORIENTATION),
         ),
         (
-            "It is not the filter's prior. Its distance from the tracker shows what the simulation gets "
-            "wrong.",
+            "It is not the prior of the filter. Its distance from the tracker is the error of the simulation.",
             _NOT_INVALID,
         ),
     ),
@@ -243,7 +241,7 @@ TOPICS: tuple[Topic, ...] = (
             Field("poses[].pose.position", "point of the backbone, from the base to the tip", "m"),
             Field("poses[].pose.orientation", "orientation of tube 1's frame there, x, y, z, w"),
         ),
-        (_NOT_INVALID, "Controllers read `/ctr/estimator/backbone_state`, which holds more and costs less."),
+        (_NOT_INVALID, "Controllers use `/ctr/estimator/backbone_state`, which holds more and costs less."),
     ),
     Topic(
         BACKBONE_STATE,
@@ -251,7 +249,7 @@ TOPICS: tuple[Topic, ...] = (
         "out",
         OUTPUT_QOS,
         PER_STEP,
-        "Fused backbone with velocity, curvature and deviation, base to tip.",
+        "Fused backbone with velocity, curvature and standard deviation, from base to tip.",
         (
             _STAMP,
             _FRAME,
@@ -259,7 +257,7 @@ TOPICS: tuple[Topic, ...] = (
             Field("width", "number of points"),
             Field(
                 "fields",
-                "15 fields of type FLOAT32 (7), count 1, offsets 0, 4, ... 56, named as in the layout",
+                "15 fields of type FLOAT32 (7), count 1, offsets 0, 4, ... 56, named as in the notes",
             ),
             Field("is_bigendian", "false"),
             Field("point_step", "60", "byte"),
@@ -268,10 +266,11 @@ TOPICS: tuple[Topic, ...] = (
             Field("is_dense", "true: every number is finite"),
         ),
         (
-            "Layout of a point: `s` arc length from the base plate (m); `x`, `y`, `z` position (m); `qx`, "
-            "`qy`, `qz`, `qw` orientation of tube 1's frame; `vx`, `vy`, `vz` velocity, base axes (m/s); "
-            "`ux`, `uy`, `uz` curvature and twist of tube 1 in its own frame (1/m); `sd` deviation (1 "
-            "sigma) of the position, root of the trace of its covariance (m).",
+            "`s` is the arc length from the base plate (m).",
+            "`x`, `y`, `z` are the position (m), and `qx`, `qy`, `qz`, `qw` the orientation of tube 1's frame.",
+            "`vx`, `vy`, `vz` are the velocity in base axes (m/s).",
+            "`ux`, `uy`, `uz` are curvature and twist of tube 1 in its own frame (1/m).",
+            "`sd` is the standard deviation of the position, the root of the trace of its covariance (m).",
             "Read it with `numpy.frombuffer(msg.data, numpy.float32).reshape(msg.width, 15)`.",
             _NOT_INVALID,
         ),
@@ -302,7 +301,7 @@ TOPICS: tuple[Topic, ...] = (
         (
             "Modes are ordered by frequency, the slowest first. With M = len(name) / 3 the controller's "
             "state is `position[:M]` and `velocity[:M]`.",
-            "Not published before modes have been found.",
+            "Not published before the first modes have been computed.",
             _NOT_INVALID,
         ),
     ),
@@ -311,26 +310,25 @@ TOPICS: tuple[Topic, ...] = (
         "sensor_msgs/msg/JointState",
         "out",
         OUTPUT_QOS,
-        "once for every tracker sample, accepted or not",
-        "What the filter made of a tracker sample: innovation, its variance, NIS, degrees of freedom, "
-        "verdict, delay.",
+        "once for every tracker pose, fused or rejected",
+        "Result of one tracker measurement: innovation, variance, NIS, degrees of freedom, acceptance and delay.",
         (
-            Field("header.stamp", "stamp of the tracker sample", "s, ns"),
+            Field("header.stamp", "stamp of the tracker pose", "s, ns"),
             _FRAME,
-            Field("name", "names of the numbers, see the layout"),
-            Field("position", "the numbers", "see the layout"),
+            Field("name", "names of the numbers, see the notes"),
+            Field("position", "the numbers", "see the notes"),
             Field("velocity", "empty"),
             Field("effort", "empty"),
         ),
         (
-            "Layout, found by name: `residual.x`, `.y`, `.z` measured minus expected position (m), "
-            "`residual.rx`, `.ry`, `.rz` the rotation from the expected to the measured orientation about "
-            "the base axes (rad); `variance.x` .. `variance.rz` variances of these (m^2, rad^2); `nis` the "
-            "normalised innovation squared and `dof` its degrees of freedom; `accepted` 1 or 0; `delay_s` "
-            "how long after its stamp the sample was taken in (s); for a sample that was not used "
-            "`reason.WORDS` with value 1.",
-            "A number that does not exist (a masked axis, a sample with a NaN) is left out: no NaN is "
-            "published.",
+            "Find a number by its name, not by its index.",
+            "`residual.x`, `.y`, `.z`: measured minus expected position (m).",
+            "`residual.rx`, `.ry`, `.rz`: rotation from the expected to the measured orientation, about the base axes (rad).",
+            "`variance.x` to `variance.rz`: variances of the residuals (m^2, rad^2).",
+            "`nis`: normalised innovation squared. `dof`: its degrees of freedom.",
+            "`accepted`: 1 if the pose was fused, else 0. `reason.WORDS`, with value 1, says why it was not.",
+            "`delay_s`: time from the stamp of the pose to its use (s).",
+            "A number that does not exist is left out, for example of an axis that is not measured. No NaN is published.",
         ),
     ),
     Topic(
@@ -339,13 +337,13 @@ TOPICS: tuple[Topic, ...] = (
         "out",
         OUTPUT_QOS,
         PER_STEP,
-        "Estimated unknown force on the tip, beside the known one of `/ctr/tip_load`.",
+        "Estimated unknown force on the tip, in addition to the known load of `/ctr/tip_load`.",
         (
             _STAMP,
             _FRAME,
             Field(
                 "wrench.force",
-                "estimated force, base axes; its deviation is in `/ctr/estimator/disturbance_sigma`",
+                "estimated force, base axes; its standard deviation is in `/ctr/estimator/disturbance_sigma`",
                 "N",
             ),
             Field("wrench.torque", "zero: the unknown load is modelled as a force at the tip point", "N m"),
@@ -358,11 +356,11 @@ TOPICS: tuple[Topic, ...] = (
         "out",
         OUTPUT_QOS,
         PER_STEP,
-        "Deviation of the force in `/ctr/estimator/disturbance`.",
+        "Standard deviation of the force in `/ctr/estimator/disturbance`.",
         (
             _STAMP,
             _FRAME,
-            Field("vector", "1-sigma deviation of the estimated force, per base axis", "N"),
+            Field("vector", "standard deviation (1 sigma) of the estimated force, per base axis", "N"),
         ),
         (_NOT_INVALID,),
     ),
@@ -385,24 +383,24 @@ TOPICS: tuple[Topic, ...] = (
         "diagnostic_msgs/msg/DiagnosticArray",
         "out",
         OUTPUT_QOS,
-        "2 Hz in the node, 1 Hz in a replay, and at once when validity or the warning of a snap changes",
-        "Health of solver, timing, tracker, joints, consistency, misfit and elastic stability.",
+        "2 Hz in the node, 1 Hz in a replay, and at once when validity or the snap warning changes",
+        "Health of solver, timing, tracker, joints, consistency of the filter and elastic stability.",
         (
             Field("header.stamp", "model time of the step it belongs to", "s, ns"),
             Field("header.frame_id", "empty"),
             Field("status[].level", "0 ok, 1 warning, 2 error, 3 stale"),
             Field("status[].name", "`ctr_estimator: ` and the subject"),
-            Field("status[].message", "what is the matter, with value, limit and unit"),
+            Field("status[].message", "the problem, with value, limit and unit"),
             Field("status[].hardware_id", "name of the robot"),
             Field("status[].values[].key", "name of a number, with its unit"),
             Field("status[].values[].value", "the number as text"),
         ),
         (
             "`ctr_estimator: output` is ERROR with the reason while `/ctr/estimator/valid` is false.",
-            "`ctr_estimator: misfit` is WARN while mean NIS, CUSUM of the NIS or autocorrelation of the innovations were beyond their limits "
-            "(parameters `misfit.*`) within the last window. It lists the two or three likeliest causes by their effect IDs "
-            "(`ctr_dynamics.effects`), or says that none of the list explains it. With `record.rolling_s` it names the recording of the "
-            "last seconds and the `ctr-dynamics diagnose` command to run on it.",
+            "`ctr_estimator: misfit` is WARN while mean NIS, CUSUM of the NIS or autocorrelation of the innovations exceeded their limits "
+            "(parameters `misfit.*`) within the last window.",
+            "It lists the two or three most likely causes by their effect IDs (`ctr_dynamics.effects`), or reports that none of them fits.",
+            "With `record.rolling_s` it names the recording of the last seconds and the `ctr-dynamics diagnose` command for it.",
             "In a replay no value depends on the wall clock.",
         ),
     ),
