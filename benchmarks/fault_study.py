@@ -39,10 +39,10 @@ from ctr_dynamics.io.bag_reader import RawMessage, open_bag
 from ctr_dynamics.io.messages import cdr, topics
 from ctr_dynamics.ros import qos
 from ctr_dynamics.ros.listener import Listener
+from ctr_dynamics.ros.node_processes import ESTIMATOR, NodeProcess, free_domain
 from ctr_dynamics.ros.topic_names import message_class
 from ctr_dynamics.runtime import live_report
 from ctr_dynamics.runtime.playback import load, pace, shifted
-from ctr_dynamics.runtime.processes import ESTIMATOR, NodeProcess, free_domain
 
 sys.path.insert(0, str(Path(__file__).parent))
 from fault_messages import END_S, FAULTS, NEEDS_RESET, WHOLE_RUN, Messages

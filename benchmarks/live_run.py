@@ -25,8 +25,8 @@ from typing import Any
 
 from ctr_dynamics.io.messages import topics
 from ctr_dynamics.ros.listener import Listener
+from ctr_dynamics.ros.node_processes import DRIVER, ESTIMATOR, NodeProcess, free_domain
 from ctr_dynamics.runtime.playback import load
-from ctr_dynamics.runtime.processes import DRIVER, ESTIMATOR, NodeProcess, free_domain
 
 STEP_NS = 3_000_000
 LIMITS = {"late_fraction": 0.001, "late_over_20ms": 0, "skipped": 0}

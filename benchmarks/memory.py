@@ -28,14 +28,10 @@ from ctr_dynamics.io.bag_reader import InputMessage, open_bag
 from ctr_dynamics.io.bag_writer import write_bag
 from ctr_dynamics.io.messages import topics
 from ctr_dynamics.io.messages.cdr import JointStateIn, PoseIn, WrenchIn
-from ctr_dynamics.io.messages.encode import (
-    StepEncoder,
-    encode_joint_state,
-    encode_pose_stamped,
-    encode_wrench_stamped,
-)
+from ctr_dynamics.io.messages.encode import encode_joint_state, encode_pose_stamped, encode_wrench_stamped
 from ctr_dynamics.parameters import Settings
 from ctr_dynamics.robot_files import load_robot
+from ctr_dynamics.runtime.step_encoder import StepEncoder
 
 RETURN_NS, JOINTS_NS = 2_000_000_000, 10_000_000  # length of the way back, and between its joint states
 MINUTE_NS = 60_000_000_000

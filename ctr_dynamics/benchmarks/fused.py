@@ -11,13 +11,13 @@ import numpy as np
 
 from ctr_dynamics.benchmarks.sweeps import sweep_cost
 from ctr_dynamics.estimation.estimator import DT_NS, Estimator
-from ctr_dynamics.estimation.warm_up import rehearse
 from ctr_dynamics.io.bag_reader import open_bag
 from ctr_dynamics.model.model import Model
 from ctr_dynamics.parameters import Settings
 from ctr_dynamics.robot_files import load_robot
 from ctr_dynamics.runtime.garbage_collection import seldom_collected
 from ctr_dynamics.runtime.replay import Player
+from ctr_dynamics.runtime.warm_up import rehearse
 
 EDGES_MS = tuple(float(x) for x in np.round(np.geomspace(0.1, 30.0, 51), 4))
 

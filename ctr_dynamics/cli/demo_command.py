@@ -28,7 +28,7 @@ from ctr_dynamics.runtime.playback import load
 
 if TYPE_CHECKING:
     from ctr_dynamics.ros.listener import Listener
-    from ctr_dynamics.runtime.processes import NodeProcess
+    from ctr_dynamics.ros.node_processes import NodeProcess
 
 SHIPPED = "clean_release"
 SHORTEST_S = 2.0
@@ -51,7 +51,7 @@ def demo(
     console = Console()
     try:
         from ctr_dynamics.ros.listener import Listener
-        from ctr_dynamics.runtime.processes import DRIVER, ESTIMATOR, NodeProcess, free_domain
+        from ctr_dynamics.ros.node_processes import DRIVER, ESTIMATOR, NodeProcess, free_domain
     except ImportError as error:
         raise InputError(
             f"the demo needs rclpy ({error})", do="source ROS 2 or pip install 'ctr_dynamics[ros]'"

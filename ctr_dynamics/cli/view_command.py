@@ -14,9 +14,9 @@ from ctr_dynamics.cli.replay_command import settings_for_replay
 from ctr_dynamics.errors import InputError
 from ctr_dynamics.io.bag_reader import open_bag
 from ctr_dynamics.io.messages import topics
-from ctr_dynamics.io.messages.encode import StepEncoder
 from ctr_dynamics.robot import Robot
 from ctr_dynamics.robot_files import load_robot
+from ctr_dynamics.runtime.step_encoder import StepEncoder
 from ctr_dynamics.view.server import Pace, ViewServer
 
 LAYOUT = "ctr_dynamics/config/view/foxglove.json"

@@ -9,10 +9,10 @@ import typer
 from joblib import Parallel, delayed
 
 from ctr_dynamics.diagnosis.kernel_warm_up import rehearse as rehearse_diagnosis
-from ctr_dynamics.estimation.warm_up import rehearse as rehearse_node
 from ctr_dynamics.kernels.compiler import cache_folder
 from ctr_dynamics.parameters import Settings
 from ctr_dynamics.robot_files import load_robot
+from ctr_dynamics.runtime.warm_up import rehearse as rehearse_node
 
 
 def warmup(

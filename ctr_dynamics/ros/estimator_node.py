@@ -22,7 +22,6 @@ from std_srvs.srv import SetBool, Trigger
 from ctr_dynamics import __version__
 from ctr_dynamics.errors import InputError
 from ctr_dynamics.estimation.estimator import Estimator
-from ctr_dynamics.estimation.warm_up import rehearse
 from ctr_dynamics.io.atomic_files import atomic_file, check_targets
 from ctr_dynamics.io.bag_writer import LiveRecorder
 from ctr_dynamics.io.messages import topics
@@ -32,19 +31,21 @@ from ctr_dynamics.io.messages.cdr import (
     decode_pose_stamped,
     decode_wrench_stamped,
 )
-from ctr_dynamics.io.messages.encode import StepEncoder
 from ctr_dynamics.parameters import Settings
 from ctr_dynamics.robot_files import load_robot
-from ctr_dynamics.ros import diagnostics, qos
+from ctr_dynamics.ros import qos
 from ctr_dynamics.ros.node_runner import Stopped, apart, run_node
 from ctr_dynamics.ros.parameter_declaration import declare, watch
 from ctr_dynamics.ros.publishers import Outputs
 from ctr_dynamics.ros.topic_names import NAME, NAMESPACE, message_class, node_topic
+from ctr_dynamics.runtime import node_diagnostics
 from ctr_dynamics.runtime.memory import keep_memory
 from ctr_dynamics.runtime.recorder import Recorder
 from ctr_dynamics.runtime.ring_buffer_recording import RollingRecording
+from ctr_dynamics.runtime.step_encoder import StepEncoder
 from ctr_dynamics.runtime.step_loop import StepLoop
 from ctr_dynamics.runtime.timing import StepTiming
+from ctr_dynamics.runtime.warm_up import rehearse
 
 DIAGNOSTICS_NS = 500_000_000
 DIAGNOSTICS_WAIT_NS = 100_000_000  # how long they wait for a pause between steps
@@ -260,16 +261,16 @@ class EstimatorNode(Node):
             health = [self.rolling.describe(s) if s.name == "misfit" else s for s in health]
         return [
             *health,
-            diagnostics.timing_status(
+            node_diagnostics.timing_status(
                 self.timing, self.loop.faults, self.loop.last_fault, self.outputs.stamps.behind_ns
             ),
-            diagnostics.clock_status(
+            node_diagnostics.clock_status(
                 self.loop.stamp_clock,
                 now_ns,
                 self._use_sim_time,
                 self.timing.input_timeout_ns if self.timing.policy == "predict" else None,
             ),
-            diagnostics.topics_status(self._qos_faults.by_topic, self._undecodable, self.loop.refused),
+            node_diagnostics.topics_status(self._qos_faults.by_topic, self._undecodable, self.loop.refused),
         ]
 
     # In the executor.

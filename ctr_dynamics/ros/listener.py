@@ -7,7 +7,7 @@ import time
 from collections import defaultdict
 from collections.abc import Callable, Iterable
 from types import TracebackType
-from typing import Any, NamedTuple
+from typing import Any
 
 import rclpy
 from rclpy.context import Context
@@ -19,13 +19,7 @@ from ctr_dynamics.io.messages import topics
 from ctr_dynamics.ros import qos
 from ctr_dynamics.ros.node_runner import make_executor, turn
 from ctr_dynamics.ros.topic_names import NAMESPACE, message_class
-
-
-class Heard(NamedTuple):
-    """A message with its moment of arrival (ns, system clock)."""
-
-    arrival_ns: int
-    data: bytes
+from ctr_dynamics.runtime.live_report import Received
 
 
 class Listener:
@@ -46,7 +40,7 @@ class Listener:
         depth: int = 1000,
         name: str = "listener",
     ) -> None:
-        self.heard: dict[str, list[Heard]] = defaultdict(list)
+        self.heard: dict[str, list[Received]] = defaultdict(list)
         self.context = Context()
         rclpy.init(context=self.context, domain_id=domain_id, signal_handler_options=SignalHandlerOptions.NO)
         self.node = Node(name, namespace=NAMESPACE, context=self.context, start_parameter_services=False)
@@ -65,7 +59,7 @@ class Listener:
         messages = self.heard[topic]
 
         def keep(data: bytes) -> None:
-            messages.append(Heard(time.time_ns(), data))
+            messages.append(Received(time.time_ns(), data))
 
         return keep
 

@@ -10,10 +10,11 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile
 
 from ctr_dynamics.io.messages import topics
-from ctr_dynamics.io.messages.encode import StepEncoder, encode_diagnostics
+from ctr_dynamics.io.messages.encode import encode_diagnostics
 from ctr_dynamics.ros.qos import QosFaults
 from ctr_dynamics.ros.topic_names import message_class, node_topic
 from ctr_dynamics.runtime.clock_offset import EachOnce
+from ctr_dynamics.runtime.step_encoder import StepEncoder
 
 
 class Outputs:

@@ -7,24 +7,29 @@ import zipfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ctr_dynamics.errors import InputError
 from ctr_dynamics.io.bag_reader import open_bag
-from ctr_dynamics.io.messages import topics
-from ctr_dynamics.io.messages.cdr import PoseIn, decode_pose_stamped
+from ctr_dynamics.io.messages.cdr import PoseIn, decode_point_cloud, decode_pose_stamped
 from ctr_dynamics.model.model import Model
 from ctr_dynamics.robot import Robot
-from ctr_dynamics.ros.listener import Heard
 from ctr_dynamics.sensing.tracker import TrackerModel, tracker_model
 
 SETTLE_S = 0.5
 """Left out at the start of comparisons with the truth."""
 
 Floats = NDArray[np.float64]
+
+
+class Received(NamedTuple):
+    """A serialised message with its moment of arrival (ns, system clock)."""
+
+    arrival_ns: int
+    data: bytes
 
 
 @dataclass(frozen=True)
@@ -51,7 +56,7 @@ class Comparison:
     fused_max: float
 
 
-def trace_of(messages: Sequence[Heard], start_ns: int) -> Trace:
+def trace_of(messages: Sequence[Received], start_ns: int) -> Trace:
     """Positions in pose messages (with or without covariance) relative to `start_ns`, in order of stamp."""
     poses = sorted(decode_pose_stamped(message.data) for message in messages)
     return Trace(
@@ -134,20 +139,15 @@ def _rms(distances: Floats) -> float:
     return float(np.sqrt(np.mean(distances**2)))
 
 
-def backbones(messages: Sequence[Heard], start_ns: int, count: int) -> list[tuple[float, Floats]]:
+def backbones(messages: Sequence[Received], start_ns: int, count: int) -> list[tuple[float, Floats]]:
     """Up to `count` evenly spaced backbones: time in s and points (n, 3) in m."""
-    from rclpy.serialization import deserialize_message
-    from sensor_msgs.msg import PointCloud2
-
     if not messages:
         return []
     chosen = np.unique(np.linspace(0, len(messages) - 1, count).astype(int))
     shapes = []
     for index in chosen:
-        cloud: Any = deserialize_message(messages[index].data, PointCloud2)
-        rows = np.frombuffer(cloud.data, np.float32).reshape(cloud.width, len(topics.BACKBONE_FIELDS))
-        stamp_ns = cloud.header.stamp.sec * 1_000_000_000 + cloud.header.stamp.nanosec
-        shapes.append(((stamp_ns - start_ns) * 1e-9, rows[:, 1:4].astype(float)))
+        cloud = decode_point_cloud(messages[index].data)
+        shapes.append(((cloud.stamp_ns - start_ns) * 1e-9, cloud.rows[:, 1:4].astype(float)))
     return shapes
 
 

@@ -26,13 +26,13 @@ from ctr_dynamics.io.atomic_files import atomic_file, check_targets
 from ctr_dynamics.io.bag_reader import Bag, InputMessage, open_bag
 from ctr_dynamics.io.bag_writer import BagWriter, write_bag
 from ctr_dynamics.io.messages.cdr import CdrError, JointStateIn, PoseIn, decode_stamp
-from ctr_dynamics.io.messages.encode import StepEncoder
 from ctr_dynamics.io.messages.topics import JOINT_STATES, STEP_NS, TRACKER_TIP
 from ctr_dynamics.parameters import PARAMETERS, Settings
 from ctr_dynamics.robot import Robot
 from ctr_dynamics.robot_files import load_robot
 from ctr_dynamics.runtime.clock_offset import EachOnce, StampClock
 from ctr_dynamics.runtime.garbage_collection import seldom_collected
+from ctr_dynamics.runtime.step_encoder import StepEncoder
 
 if TYPE_CHECKING:
     from ctr_dynamics.estimation.estimator import Estimator, StepOutput
@@ -266,7 +266,7 @@ def _rehearsed_estimator(robot: Robot, settings: Settings) -> MakeEstimator:
     """The estimator, with everything compiled and loaded before the clock starts."""
     # Imported late: it brings the compiled model, which reading and checking a bag do not need.
     from ctr_dynamics.estimation.estimator import Estimator
-    from ctr_dynamics.estimation.warm_up import rehearse
+    from ctr_dynamics.runtime.warm_up import rehearse
 
     rehearse(robot, settings)
     return Estimator

@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from ctr_dynamics.runtime.processes import ESTIMATOR, NodeProcess, free_domain
+from ctr_dynamics.ros.node_processes import ESTIMATOR, NodeProcess, free_domain
 
 sys.path.insert(0, str(Path(__file__).parent))
 from plant import Hardware, Truth, settling_time

@@ -18,9 +18,9 @@ from estimation_cases import (
 )
 
 from ctr_dynamics.estimation.estimator import MAX_FAILURES
-from ctr_dynamics.io.messages.encode import StepEncoder
 from ctr_dynamics.io.messages.topics import DIAGNOSTICS
 from ctr_dynamics.robot_files import load_robot
+from ctr_dynamics.runtime.step_encoder import StepEncoder
 from ctr_dynamics.snap.scurve import s_curve
 
 REST = (1.5708, 1.5708, -0.2521, -0.1977)

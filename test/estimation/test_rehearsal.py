@@ -2,11 +2,11 @@
 
 import pytest
 
-from ctr_dynamics.estimation.warm_up import rehearse
 from ctr_dynamics.model.paired_steps import Pair
 from ctr_dynamics.model.simulator import Simulator
 from ctr_dynamics.parameters import Settings
 from ctr_dynamics.robot_files import load_robot
+from ctr_dynamics.runtime.warm_up import rehearse
 
 
 @pytest.mark.parametrize("policy", ["predict", "wait"])

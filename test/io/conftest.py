@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from ctr_dynamics.io.messages import topics
-from ctr_dynamics.io.messages.encode import innovation_entries, mode_names
 from ctr_dynamics.io.messages.schemas import typestore
+from ctr_dynamics.runtime.step_encoder import innovation_entries, mode_names
 
 T0_NS = 1_700_000_000_000_000_000
 BAGS = Path(__file__).parents[1] / "data" / "bags"

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from ctr_dynamics.io.messages import cdr, encode, topics
 from ctr_dynamics.io.messages.schemas import leaf_fields, schema, typestore
 from ctr_dynamics.io.messages.templates import NotFiniteError
+from ctr_dynamics.runtime import step_encoder
 
 STORE = typestore()
 OUTPUT_TOPICS = [topic.name for topic in topics.OUTPUTS if topic.name != topics.DIAGNOSTICS]
@@ -28,7 +29,7 @@ def by_topic(messages: list[encode.Encoded]) -> dict[str, encode.Encoded]:
 def test_output_is_byte_equal_to_rosbags(step, reference, topic, frame_id, points, modes):
     reference.frame_id = frame_id
     out = step(k=22, points=points, modes=modes)
-    encoder = encode.StepEncoder(frame_id)
+    encoder = step_encoder.StepEncoder(frame_id)
     encoder.encode(step(k=0, points=points, modes=modes, seed=5))  # the templates hold another step's numbers
     message = by_topic(encoder.encode(out))[topic]
     expected = reference.step(out)[topic]
@@ -38,7 +39,7 @@ def test_output_is_byte_equal_to_rosbags(step, reference, topic, frame_id, point
 
 
 def test_every_output_topic_is_encoded(step):
-    messages = encode.StepEncoder().encode(step(k=0), list)
+    messages = step_encoder.StepEncoder().encode(step(k=0), list)
     assert {message.topic for message in messages} == {topic.name for topic in topics.OUTPUTS}
     assert messages[-1].topic == topics.VALID
     stamps = {message.topic: message.stamp_ns for message in messages}
@@ -48,13 +49,13 @@ def test_every_output_topic_is_encoded(step):
 
 
 def test_header_stamp_is_the_stamp_of_the_entry(step):
-    for message in encode.StepEncoder().encode(step(k=0), list):
+    for message in step_encoder.StepEncoder().encode(step(k=0), list):
         if topics.TOPIC[message.topic].has_header:
             assert cdr.decode_stamp(message.data) == message.stamp_ns
 
 
 def test_display_backbone_every_eleventh_step(step):
-    encoder = encode.StepEncoder()
+    encoder = step_encoder.StepEncoder()
     ks = [k for k in range(45) if topics.BACKBONE in by_topic(encoder.encode(step(k=k, points=3)))]
     assert ks == [0, 11, 22, 33, 44]
 
@@ -62,20 +63,20 @@ def test_display_backbone_every_eleventh_step(step):
 def test_invalid_step_publishes_valid_false_and_the_reason(step, innovation):
     out = step(valid=False, reason="joint gap of 2.1 s, limit 0.1 s")
     out.tip_position[:] = np.nan
-    encoder = encode.StepEncoder(hardware_id="robot")
+    encoder = step_encoder.StepEncoder(hardware_id="robot")
     messages = by_topic(encoder.encode(out, list))
     assert set(messages) == {topics.VALID, topics.DIAGNOSTICS, topics.INNOVATION}
     assert messages[topics.VALID].data == b"\x00\x01\x00\x00\x00"
     diagnostics = STORE.deserialize_cdr(
         messages[topics.DIAGNOSTICS].data, "diagnostic_msgs/msg/DiagnosticArray"
     )
-    assert diagnostics.status[0].level == encode.ERROR
+    assert diagnostics.status[0].level == step_encoder.ERROR
     assert diagnostics.status[0].message == "joint gap of 2.1 s, limit 0.1 s"
     assert diagnostics.status[0].hardware_id == "robot"
 
 
 def test_diagnostics_once_a_second_and_at_changes_of_validity_or_alarm(step):
-    encoder = encode.StepEncoder()
+    encoder = step_encoder.StepEncoder()
     due = []
     for k in range(700):
         out = step(k=k, points=2, valid=not 100 <= k < 103, reason="x")
@@ -120,11 +121,11 @@ def test_a_valid_step_never_carries_nan(step, path, topic, bad):
     for parent in parents:
         holder = getattr(holder, parent)
     getattr(holder, name).reshape(-1)[-1] = bad
-    encoder = encode.StepEncoder()
+    encoder = step_encoder.StepEncoder()
     with pytest.raises(NotFiniteError, match=topic):
         encoder.encode(out)
     # The encoder is usable afterwards: nothing of the bad step is left in its templates.
-    assert encoder.encode(step()) == encode.StepEncoder().encode(step())
+    assert encoder.encode(step()) == step_encoder.StepEncoder().encode(step())
 
 
 def test_innovation_of_a_sample_with_nan_leaves_the_missing_numbers_out(step, innovation):
@@ -137,7 +138,7 @@ def test_innovation_of_a_sample_with_nan_leaves_the_missing_numbers_out(step, in
         accepted=False,
         reason="not finite: position.x",
     )
-    message = encode.StepEncoder().encode(step(innovations=[item]))[0]
+    message = step_encoder.StepEncoder().encode(step(innovations=[item]))[0]
     decoded = cdr.decode_joint_state(message.data)
     entries = dict(zip(decoded.names, decoded.positions, strict=True))
     assert not any(name.startswith("residual") for name in entries)
@@ -285,7 +286,7 @@ def test_rclpy_reads_every_output(step):
 
     from rclpy.serialization import deserialize_message
 
-    for message in encode.StepEncoder().encode(step(k=0), list):
+    for message in step_encoder.StepEncoder().encode(step(k=0), list):
         package, _, name = topics.TOPIC[message.topic].ros_type.split("/")
         kind = getattr(importlib.import_module(f"{package}.msg"), name)
         decoded = deserialize_message(message.data, kind)

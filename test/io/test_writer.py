@@ -16,8 +16,8 @@ from ctr_dynamics.errors import InputError
 from ctr_dynamics.io.bag_reader import open_bag
 from ctr_dynamics.io.bag_writer import LiveRecorder, write_bag
 from ctr_dynamics.io.messages import topics
-from ctr_dynamics.io.messages.encode import StepEncoder
 from ctr_dynamics.io.messages.schemas import schema, typestore
+from ctr_dynamics.runtime.step_encoder import StepEncoder
 
 META = {"version": "1.2.3", "parameters": '{"a": 1}'}
 

@@ -23,8 +23,8 @@ from ctr_dynamics.io.messages.encode import encode_joint_state, encode_pose_stam
 from ctr_dynamics.robot_files import load_robot
 from ctr_dynamics.ros import qos
 from ctr_dynamics.ros.listener import Listener
+from ctr_dynamics.ros.node_processes import ESTIMATOR, NodeProcess
 from ctr_dynamics.ros.topic_names import message_class
-from ctr_dynamics.runtime.processes import ESTIMATOR, NodeProcess
 
 PATIENCE_S = 120.0  # of every wait: nothing is asserted about how long anything takes
 BAGS = Path(__file__).parents[1] / "data" / "bags"

@@ -16,8 +16,8 @@ from std_srvs.srv import SetBool
 from ctr_dynamics.io.bag_reader import open_bag
 from ctr_dynamics.io.messages import topics
 from ctr_dynamics.robot_files import load_robot, robot_to_yaml
+from ctr_dynamics.ros.node_processes import DRIVER, ESTIMATOR, NodeProcess
 from ctr_dynamics.ros.qos import profile
-from ctr_dynamics.runtime.processes import DRIVER, ESTIMATOR, NodeProcess
 
 VIEW = "ctr_dynamics.ros.view_node"
 pytestmark = pytest.mark.ros

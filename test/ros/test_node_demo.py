@@ -8,7 +8,7 @@ from ctr_dynamics.cli import demo_command as demo_file
 from ctr_dynamics.errors import InputError
 from ctr_dynamics.io.bag_reader import open_bag
 from ctr_dynamics.io.messages import topics
-from ctr_dynamics.runtime import processes
+from ctr_dynamics.ros import node_processes as processes
 
 pytestmark = pytest.mark.ros
 

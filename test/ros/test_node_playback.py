@@ -11,8 +11,8 @@ from ctr_dynamics.io.messages import topics
 from ctr_dynamics.io.messages.cdr import CdrError, decode_joint_state, decode_stamp
 from ctr_dynamics.io.messages.encode import encode_joint_state, encode_pose_stamped
 from ctr_dynamics.robot_files import load_robot, robot_with
-from ctr_dynamics.ros.listener import Heard
 from ctr_dynamics.runtime.live_report import (
+    Received,
     Trace,
     compare,
     compare_truth,
@@ -113,7 +113,7 @@ def test_comparison_is_over_the_samples_within_the_run():
 
 def test_traces_of_messages_bag_and_truth(bags):
     heard = [
-        Heard(0, encode_pose_stamped(stamp, "ctr_base", (stamp, 0, 0), (0, 0, 0, 1))) for stamp in (30, 10)
+        Received(0, encode_pose_stamped(stamp, "ctr_base", (stamp, 0, 0), (0, 0, 0, 1))) for stamp in (30, 10)
     ]
     trace = trace_of(heard, 10)
     np.testing.assert_allclose(trace.t, [0.0, 20e-9])

@@ -9,8 +9,8 @@ from types import SimpleNamespace
 import pytest
 
 from ctr_dynamics.estimation.step_output import ERROR, OK, WARN
-from ctr_dynamics.ros.diagnostics import clock_status, topics_status
 from ctr_dynamics.runtime.clock_offset import StampClock
+from ctr_dynamics.runtime.node_diagnostics import clock_status, topics_status
 from ctr_dynamics.runtime.step_loop import (
     CATCH_UP_NS,
     INBOX_LIMIT,

@@ -24,12 +24,12 @@ from ctr_dynamics.estimation.estimator import Estimator
 from ctr_dynamics.io.bag_reader import open_bag
 from ctr_dynamics.io.messages import topics
 from ctr_dynamics.io.messages.cdr import CdrError, decode_point_cloud
-from ctr_dynamics.io.messages.encode import encode_step
 from ctr_dynamics.io.messages.schemas import typestore
 from ctr_dynamics.kernels.rotations import matrix
 from ctr_dynamics.parameters import Settings
 from ctr_dynamics.robot_files import load_robot
 from ctr_dynamics.runtime.replay import Player
+from ctr_dynamics.runtime.step_encoder import StepEncoder
 from ctr_dynamics.view.markers import CHI_95, MARKER_ARRAY, TUBES_TOPIC, ellipsoid, encode_tubes, tube_lines
 from ctr_dynamics.view.scene import Scene
 
@@ -43,7 +43,7 @@ def step():
     estimator = Estimator(ROBOT, Settings({"output.policy": "wait"}))
     for out in Player(estimator).play(open_bag(BAG)):
         if out.k == 110:
-            return out, {m.topic: m.data for m in encode_step(out)}
+            return out, {m.topic: m.data for m in StepEncoder().encode(out)}
     raise AssertionError("no step")
 
 
@@ -248,8 +248,8 @@ def test_node_draws_what_the_estimator_says(step, tmp_path):
     pytest.importorskip("rclpy")
     from ctr_dynamics.ros import qos
     from ctr_dynamics.ros.listener import Listener
+    from ctr_dynamics.ros.node_processes import NodeProcess
     from ctr_dynamics.ros.topic_names import message_class
-    from ctr_dynamics.runtime.processes import NodeProcess
 
     _, messages = step
     domain = int(os.environ["ROS_DOMAIN_ID"])

@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 
 from ctr_dynamics.estimation.estimator import Estimator
-from ctr_dynamics.io.messages.encode import StepEncoder
 from ctr_dynamics.parameters import Settings
 from ctr_dynamics.robot import Robot
+from ctr_dynamics.runtime.step_encoder import StepEncoder
 
 START_NS = 1_000_000_000_000
 JOINT_PERIOD_NS = 10_000_000

@@ -1,0 +1,177 @@
+"""From the estimator's numbers to serialised messages: the one place where outputs get their ROS form.
+
+Replay, the view and the node all use `StepEncoder`; rclpy publishes the bytes as they are.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from ctr_dynamics.estimation.step_output import ERROR, OK, Innovation, StepOutput
+from ctr_dynamics.io.messages import templates, topics
+from ctr_dynamics.io.messages.cdr import ENCAPSULATION
+from ctr_dynamics.io.messages.encode import Encoded, StatusLike, encode_diagnostics
+
+_TRUE = ENCAPSULATION + b"\x01"
+_FALSE = ENCAPSULATION + b"\x00"
+_XYZW = [1, 2, 3, 0]
+_INNOVATION = [f"{label}.{axis}" for label in ("residual", "variance") for axis in topics.AXES]
+_INNOVATION += ["nis", "dof", "accepted", "delay_s"]
+_NO_TORQUE = np.zeros(3)
+
+
+class OutputStatus(NamedTuple):
+    """Status of the outputs themselves: ERROR with the reason while they are invalid."""
+
+    name: str
+    level: int
+    message: str
+    values: dict[str, str]
+
+
+def mode_names(count: int) -> list[str]:
+    """Names in the modes message, see the topic table."""
+    modes = [f"mode{number}" for number in range(1, count + 1)]
+    return [*modes, *(f"{mode}.frequency_hz" for mode in modes), *(f"{mode}.damping_ratio" for mode in modes)]
+
+
+def innovation_entries(innovation: Innovation) -> dict[str, float]:
+    """Named numbers of the innovation message; what is not finite is left out."""
+    i = innovation
+    values = [*i.residual.tolist(), *i.variance.tolist(), i.nis, i.dof, i.accepted, i.delay_s]
+    entries = {name: float(x) for name, x in zip(_INNOVATION, values, strict=True) if math.isfinite(x)}
+    if not innovation.accepted:
+        words = re.sub(r"[^a-z0-9]+", "_", innovation.reason.lower()).strip("_")
+        entries[f"reason.{words or 'unknown'}"] = 1.0
+    return entries
+
+
+class StepEncoder:
+    """Turns each `StepOutput` into messages, and says when /diagnostics is due. One per stream of steps.
+
+    Args:
+        frame_id: frame of all outputs.
+        hardware_id: name of the robot in /diagnostics.
+        backbone_every: steps per display backbone.
+    """
+
+    def __init__(
+        self,
+        frame_id: str = "ctr_base",
+        hardware_id: str = "",
+        backbone_every: int = topics.BACKBONE_EVERY,
+    ) -> None:
+        self.frame_id = frame_id
+        self.backbone_every = backbone_every
+        self.hardware_id = hardware_id
+        self._was: tuple[bool, bool] | None = None  # validity and alarm of the step before
+        # of a step: those that hold float64 numbers, filled together, by the number of modes; points by their number
+        self._numbers: dict[int, templates.Template] = {}
+        self._clouds: dict[int, templates.Template] = {}
+        self._paths: dict[int, templates.Template] = {}
+        self._innovations: dict[tuple[str, ...], templates.Template] = {}
+
+    def encode(
+        self,
+        out: StepOutput,
+        statuses: Callable[[], Sequence[StatusLike]] | None = None,
+        alarm: bool = False,
+    ) -> list[Encoded]:
+        """All messages of one step, `valid` last.
+
+        Args:
+            out: the step.
+            statuses: asked for the health lines when /diagnostics is due (1 Hz and at changes of validity or alarm);
+                None leaves /diagnostics to the caller.
+            alarm: whether a warning stands that must not wait for its turn, such as of a snap.
+
+        Raises:
+            NotFiniteError: a valid step holds a NaN or an infinity.
+        """
+        stamp = out.stamp_ns
+        messages = [self._innovation(item) for item in out.innovations]
+        if out.valid:
+            messages += self._outputs(out)
+        now = bool(out.valid), alarm
+        if statuses is not None and (out.k % topics.DIAGNOSTICS_EVERY == 0 or now != self._was):
+            messages.append(Encoded(topics.DIAGNOSTICS, stamp, self.diagnostics(out, statuses())))
+        self._was = now
+        messages.append(Encoded(topics.VALID, stamp, _TRUE if out.valid else _FALSE))
+        return messages
+
+    def diagnostics(self, out: StepOutput, statuses: Sequence[StatusLike]) -> bytes:
+        """The /diagnostics message of a step, led by the status of the outputs."""
+        if out.valid:
+            output = OutputStatus("output", OK, "valid", {})
+        else:
+            output = OutputStatus("output", ERROR, out.reason or "outputs are invalid", {})
+        return encode_diagnostics(out.stamp_ns, [output, *statuses], self.hardware_id)
+
+    def _outputs(self, out: StepOutput) -> list[Encoded]:
+        stamp, modes = out.stamp_ns, out.modes
+        count = len(modes.frequency_hz)
+        backbone = np.asarray(out.backbone)
+        points = len(backbone)
+        template = self._template(count)
+        filled = template.fill(
+            stamp,
+            out.tip_position, out.tip_quaternion_wxyz[_XYZW], out.tip_covariance,
+            out.tip_velocity, out.tip_velocity_covariance,
+            out.predicted_position, out.predicted_quaternion_wxyz[_XYZW],
+            out.disturbance_force, _NO_TORQUE, out.disturbance_sigma,
+            modes.amplitude, modes.frequency_hz, modes.damping, modes.rate, np.zeros(2 * count),
+        )  # fmt: skip
+        messages = [Encoded(topic, stamp, data) for topic, data in zip(template.topics, filled, strict=True)]
+        messages.append(Encoded(topics.BACKBONE_STATE, stamp, *self._cloud(points).fill(stamp, backbone)))
+        if out.k % self.backbone_every == 0:
+            messages.append(
+                Encoded(
+                    topics.BACKBONE, stamp, *self._path(points).fill(stamp, backbone[:, 1:8].astype(float))
+                )
+            )
+        return messages
+
+    def _template(self, count: int) -> templates.Template:
+        """Of the messages of numbers with ``count`` modes."""
+        if count not in self._numbers:
+            frame = self.frame_id
+            layouts = [
+                templates.stamped_numbers(topics.TIP_POSE, frame, 43),
+                templates.stamped_numbers(topics.TIP_TWIST, frame, 42),
+                templates.stamped_numbers(topics.TIP_POSE_PREDICTED, frame, 7),
+                templates.stamped_numbers(topics.DISTURBANCE, frame, 6),
+                templates.stamped_numbers(topics.DISTURBANCE_SIGMA, frame, 3),
+            ]
+            if count:
+                layouts.append(templates.joint_state(topics.MODES, frame, mode_names(count), velocities=True))
+            self._numbers[count] = templates.Template(*layouts)
+        return self._numbers[count]
+
+    def _cloud(self, points: int) -> templates.Template:
+        if points not in self._clouds:
+            self._clouds[points] = templates.PointCloudTemplate(
+                topics.BACKBONE_STATE, self.frame_id, topics.BACKBONE_FIELDS, points
+            )
+        return self._clouds[points]
+
+    def _path(self, points: int) -> templates.Template:
+        if points not in self._paths:
+            self._paths[points] = templates.Template(templates.path(topics.BACKBONE, self.frame_id, points))
+        return self._paths[points]
+
+    def _innovation(self, item: Innovation) -> Encoded:
+        entries = innovation_entries(item)
+        names = tuple(entries)
+        template = self._innovations.get(names)
+        if template is None:
+            if len(self._innovations) > 64:  # reasons are few; a stream of new ones must not fill the memory
+                self._innovations.clear()
+            layout = templates.joint_state(topics.INNOVATION, self.frame_id, names, velocities=False)
+            template = self._innovations[names] = templates.Template(layout)
+        values = np.fromiter(entries.values(), dtype=float, count=len(entries))
+        return Encoded(topics.INNOVATION, item.stamp_ns, *template.fill(item.stamp_ns, values))
