@@ -96,9 +96,9 @@ setup(
     entry_points={
         "console_scripts": [
             "ctr-dynamics = ctr_dynamics.cli.main:main",
-            "estimator = ctr_dynamics.ros.estimator_node:main",
-            "driver = ctr_dynamics.ros.driver_node:main",
-            "tube_markers = ctr_dynamics.ros.view_node:main",
+            "estimator = ctr_dynamics.ros.programs:estimator",
+            "driver = ctr_dynamics.ros.programs:driver",
+            "tube_markers = ctr_dynamics.ros.programs:tube_markers",
         ],
     },
 )

@@ -1,10 +1,13 @@
-"""Imported first by the package's own processes (commands and nodes), before numpy: one BLAS thread.
-
-The filter's matrices are small: a second thread gains nothing and, on a busy machine, waits for its time slice for up to 100 ms. A program that
-only uses the package keeps its own setting.
-"""
+"""One BLAS thread for the package's own processes: its commands and nodes."""
 
 import os
 
-for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
-    os.environ.setdefault(_name, "1")
+
+def one_blas_thread() -> None:
+    """Ask for one thread, unless the environment says otherwise. It counts only before NumPy is imported for the first time.
+
+    The filter's matrices are small. A second thread gains nothing and, on a busy machine, waits for its time slice for up to 100 ms. A program
+    that only uses the package keeps its own setting.
+    """
+    for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
+        os.environ.setdefault(name, "1")

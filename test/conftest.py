@@ -16,7 +16,9 @@ os.environ.setdefault("MPLBACKEND", "Agg")
 import pytest
 
 # Before anything imports NumPy: the workers of a run share the cores.
-import ctr_dynamics.one_blas_thread  # noqa: F401
+from ctr_dynamics.one_blas_thread import one_blas_thread
+
+one_blas_thread()
 
 
 @dataclass(frozen=True)

@@ -6,16 +6,18 @@ import functools
 import inspect
 import os
 import sys
+import warnings
 from collections.abc import Callable, Sequence
 from importlib import import_module
 from importlib.util import find_spec
 from keyword import iskeyword
-from typing import Annotated, Any
+from typing import Annotated, Any, TextIO
 
 import typer
 
 from ctr_dynamics import __version__
 from ctr_dynamics.errors import InputError
+from ctr_dynamics.one_blas_thread import one_blas_thread
 
 # Shown by --help without importing the command's file.
 COMMANDS = {
@@ -152,6 +154,21 @@ def _unwritable(error: OSError) -> int:
     return BAD_INPUT
 
 
+def _warn(
+    message: Warning | str,
+    category: type[Warning],
+    filename: str,
+    lineno: int,
+    file: TextIO | None = None,
+    line: str | None = None,
+) -> None:
+    """The package's own warnings in one line; others as Python shows them."""
+    if category.__module__.startswith("ctr_dynamics"):
+        print(f"ctr-dynamics: warning: {message}", file=sys.stderr)
+    else:
+        sys.stderr.write(warnings.formatwarning(message, category, filename, lineno))
+
+
 def main(argv: list[str] | None = None) -> int:
     """Run the command line.
 
@@ -164,11 +181,14 @@ def main(argv: list[str] | None = None) -> int:
     for stream in (sys.stdout, sys.stderr):
         # terminals of few characters, and names of files that are not UTF-8
         getattr(stream, "reconfigure", lambda **_: None)(errors="backslashreplace")
+    one_blas_thread()
     arguments = sys.argv[1:] if argv is None else argv
     requested = next((a for a in arguments if not a.startswith("-")), None)
     arguments = spread(arguments, MANY.get(requested or "", ()))
     try:
-        build_app(requested)(args=arguments, prog_name="ctr-dynamics")
+        with warnings.catch_warnings():
+            warnings.showwarning = _warn
+            build_app(requested)(args=arguments, prog_name="ctr-dynamics")
     except SystemExit as end:
         code = end.code if isinstance(end.code, int) else (FINISHED if end.code is None else BAD_INPUT)
     except KeyboardInterrupt:

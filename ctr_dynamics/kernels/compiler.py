@@ -1,8 +1,11 @@
 """``njit`` for the kernels of this package: compiled code is kept on disk under what it is compiled from.
 
-Numba's own cache looks at the file of a kernel alone, and at its date; a kernel whose callee has changed would run as it was. Here a kernel's
-cache is named by the contents of its module and of all modules of this package that the module imports, directly or not. So a change of a kernel
-compiles again what calls it, and a change of anything else compiles nothing. Two checkouts with the same kernels share one cache.
+Numba's own cache looks at the file of a kernel alone, and at its date: a kernel whose callee has changed would run as it was. Here a kernel's
+cache folder is named by the contents of its module and of all modules of this package that the module imports, directly or not. So a change of a
+kernel compiles again what calls it, and a change of anything else compiles nothing. Two checkouts with the same kernels share one cache.
+
+Within the folder each compiled signature is one file, named by the types of the arguments, with the fields of named tuples and the source of
+functions that are passed as arguments. So processes that compile at the same time cannot mix up their results.
 """
 
 from __future__ import annotations
@@ -11,19 +14,31 @@ import ast
 import functools
 import hashlib
 import os
+import pickle
+import re
 import shutil
 import sys
 import tempfile
 import time
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numba
-from numba.core import caching
+from numba.core import caching, types
+from numba.core.serialize import dumps
 
 PACKAGE = Path(__file__).resolve().parents[1]
-KEPT_DAYS = 30.0  # caches of other versions of a kernel that nobody has used for so long are removed
+LAYOUT = 2  # of what is stored; another number begins a new cache
+KEPT_DAYS = 30.0  # caches that nobody has used for so long are removed
+
+
+class KernelsNotKept(RuntimeWarning):
+    """Compiled kernels cannot be stored."""
+
+
+_FOLDER = re.compile(r"ctr_dynamics\..+-[0-9a-f]{16}")
 
 
 @functools.cache
@@ -41,23 +56,34 @@ def cache_folder() -> Path:
     return Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser() / "ctr_dynamics"
 
 
+def _package_of(path: Path) -> list[str]:
+    """Dotted parts of the package that the module at ``path`` lies in; empty outside this package."""
+    return [PACKAGE.name, *path.parent.relative_to(PACKAGE).parts] if path.is_relative_to(PACKAGE) else []
+
+
 @functools.cache
 def _imported(path: Path) -> frozenset[Path]:
-    """Files of this package that the module at ``path`` imports itself."""
+    """Files of this package that the module at ``path`` imports itself, outside of functions: compiled functions cannot import."""
     found = set()
-    for node in ast.walk(ast.parse(path.read_bytes())):
+    waiting: list[ast.stmt] = ast.parse(path.read_bytes()).body
+    while waiting:
+        node = waiting.pop()
         names: list[str] = []
-        if isinstance(node, ast.Import):
+        if isinstance(node, (ast.If, ast.Try)):
+            waiting += [*node.body, *node.orelse, *getattr(node, "finalbody", [])]
+        elif isinstance(node, ast.Import):
             names = [alias.name for alias in node.names]
-        elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
-            names = [node.module, *(f"{node.module}.{alias.name}" for alias in node.names)]
+        elif isinstance(node, ast.ImportFrom):
+            within = _package_of(path)
+            above = within[: len(within) - node.level + 1] if node.level else []
+            base = ".".join([*above, *([node.module] if node.module else [])])
+            names = [base, *(f"{base}.{alias.name}" for alias in node.names)]
         for name in names:
             parts = name.split(".")
-            if parts[0] != PACKAGE.name:
-                continue
-            file = PACKAGE.joinpath(*parts[1:]).with_suffix(".py")
-            if file.is_file():
-                found.add(file)
+            if parts[0] == PACKAGE.name:
+                file = PACKAGE.joinpath(*parts[1:]).with_suffix(".py")
+                if file.is_file():
+                    found.add(file)
     return frozenset(found)
 
 
@@ -70,76 +96,160 @@ def source_digest(path: Path) -> str:
         if file not in reached:
             reached.add(file)
             waiting.extend(_imported(file))
-    digest = hashlib.sha256(numba.__version__.encode())
+    digest = hashlib.sha256(f"{numba.__version__} {LAYOUT}".encode())
     for file in sorted(reached):
         digest.update(os.path.relpath(file, PACKAGE).encode() + b"\0" + file.read_bytes() + b"\0")
     return digest.hexdigest()[:16]
 
 
-def _remove_old(folder: Path) -> None:
-    """Remove caches of earlier versions of a module beside its new ``folder``."""
+def _remove_unused(folder: Path) -> None:
+    """Remove the cache folders beside ``folder`` that nobody has used for ``KEPT_DAYS``."""
     limit = time.time() - KEPT_DAYS * 86400.0
-    stem = folder.name.rpartition("-")[0]
-    for other in folder.parent.glob(f"{stem}-*"):
+    for other in folder.parent.iterdir():
         try:
-            if other.name.rpartition("-")[0] == stem and other != folder and other.stat().st_mtime < limit:
+            if _FOLDER.fullmatch(other.name) and other != folder and other.stat().st_mtime < limit:
                 shutil.rmtree(other, ignore_errors=True)
         except OSError:
             continue  # another process removes it too
 
 
-class _Locator:
-    """Where numba keeps the compiled code of one kernel, and what tells that it is still of use."""
+@functools.cache
+def _note_use(folder: Path) -> None:
+    """Date the folder by its use, as :func:`_remove_unused` reads it."""
+    try:
+        if folder.stat().st_mtime < time.time() - 86400.0:
+            os.utime(folder)
+    except OSError:
+        pass  # of another user, or read-only
 
-    def __init__(self, function: Callable[..., Any]) -> None:
-        file = Path(function.__code__.co_filename).resolve()
-        self._py_file = str(file)
-        self._line = function.__code__.co_firstlineno
-        self._stamp = source_digest(file)
-        name = os.path.relpath(file, PACKAGE) if file.is_relative_to(PACKAGE) else file.name
-        stem = name.removesuffix(".py").replace(os.sep, ".")
-        self._folder = cache_folder() / f"{stem}-{self._stamp}"
+
+def _described(kind: Any) -> str:
+    """A type of an argument, by everything that compiled code depends on."""
+    if isinstance(kind, types.Dispatcher):
+        function = kind.dispatcher.py_func
+        return f"{source_digest(Path(function.__code__.co_filename).resolve())}:{function.__qualname__}"
+    if isinstance(kind, types.BaseTuple):
+        parts = ", ".join(map(_described, getattr(kind, "types", ())))
+        named = getattr(kind, "instance_class", None)
+        name = "" if named is None else f"{named.__module__}.{named.__qualname__}{named._fields}"
+        return f"{name}({parts})"
+    return str(kind)
+
+
+@functools.cache
+def _say_not_kept(folder: Path, reason: str) -> None:
+    """Warn once that what is compiled is lost at the end of the process."""
+    warnings.warn(
+        f"compiled kernels cannot be kept in {folder} ({reason}): every start compiles them again; "
+        "set NUMBA_CACHE_DIR to a folder that can be written",
+        KernelsNotKept,
+        stacklevel=2,
+    )
+
+
+class _Files:
+    """Compiled code of one kernel: a file for each key, written whole or not at all."""
+
+    def __init__(self, folder: Path, base: str) -> None:
+        self._folder, self._base = folder, base
+
+    def _path(self, key: str) -> Path:
+        return self._folder / f"{self._base}.{key}.nbc"
+
+    def load(self, key: str) -> Any:
+        """What is stored under ``key``; None without it, or where it cannot be read."""
+        try:
+            data = self._path(key).read_bytes()
+        except OSError:
+            return None
+        _note_use(self._folder)
+        try:
+            return pickle.loads(data)
+        except Exception:  # damaged: pickle raises whatever the bytes lead to
+            return None
+
+    def save(self, key: str, data: Any) -> None:
+        """Store it; a folder that cannot be written is said once, and computing goes on."""
+        try:
+            new = not self._folder.is_dir()
+            self._folder.mkdir(parents=True, exist_ok=True)
+            number, name = tempfile.mkstemp(dir=self._folder)
+            with os.fdopen(number, "wb") as stream:
+                stream.write(dumps(data))
+            os.chmod(name, 0o644)
+            os.replace(name, self._path(key))
+        except OSError as error:
+            _say_not_kept(cache_folder(), error.strerror or str(error))
+            return
+        if new:
+            _remove_unused(self._folder)
+
+    def flush(self) -> None:
+        """Remove everything that is stored of this kernel."""
+        for path in self._folder.glob(f"{self._base}.*.nbc"):
+            path.unlink(missing_ok=True)
+
+
+class _Locator:
+    """What numba asks of the place of a kernel's compiled code."""
+
+    def __init__(self, folder: Path, digest: str, line: int) -> None:
+        self._folder, self._digest, self._line = folder, digest, line
 
     def get_cache_path(self) -> str:
         return str(self._folder)
 
     def get_source_stamp(self) -> str:
-        return self._stamp
+        return self._digest
 
     def get_disambiguator(self) -> str:
         return str(self._line)
 
     def ensure_cache_path(self) -> None:
-        new = not self._folder.is_dir()
-        self._folder.mkdir(parents=True, exist_ok=True)
-        tempfile.TemporaryFile(dir=self._folder).close()  # it must be writable
-        if new:
-            _remove_old(self._folder)
+        """Nothing: the folder is made when something is stored in it."""
 
 
 class _CacheContents(caching.FunctionCache._impl_class):  # type: ignore[misc, valid-type]
     """Numba's way to write a compiled function, with the package's own place for it."""
 
     def __init__(self, function: Callable[..., Any]) -> None:
+        file = Path(function.__code__.co_filename).resolve()
+        digest = source_digest(file)
+        name = file.relative_to(PACKAGE) if file.is_relative_to(PACKAGE) else Path(file.name)
+        stem = ".".join(("ctr_dynamics", *name.with_suffix("").parts))
         self._lineno = function.__code__.co_firstlineno
-        self._locator = _Locator(function)
+        self._locator = _Locator(cache_folder() / f"{stem}-{digest}", digest, self._lineno)
         self._filename_base = self.get_filename_base(function.__qualname__, getattr(sys, "abiflags", ""))
 
 
 class _KernelCache(caching.FunctionCache):
     _impl_class = _CacheContents
 
+    def __init__(self, function: Callable[..., Any]) -> None:
+        super().__init__(function)
+        self._cache_file: Any = _Files(Path(self._cache_path), self._impl.filename_base)
+
+    def _index_key(self, sig: Any, codegen: Any) -> str:
+        """Name of the file of this signature, on this processor."""
+        result = _described(sig.return_type) if hasattr(sig, "args") else ""
+        kinds = [_described(kind) for kind in getattr(sig, "args", sig)]
+        text = repr((kinds, result, codegen.magic_tuple()))
+        return hashlib.sha256(text.encode()).hexdigest()[:24]
+
 
 def njit(*, cache: bool = True, **options: Any) -> Callable[[Callable[..., Any]], Any]:
     """:func:`numba.njit` with the cache of this module.
 
-    Raises:
-        OSError: the cache's folder cannot be written (when something is compiled).
+    Kernels have no closures: what they use stands in their module or in one that it imports.
     """
 
     def decorate(function: Callable[..., Any]) -> Any:
         compiled = numba.njit(**options)(function)
-        if cache:
+        if cache and Path(function.__code__.co_filename).is_file():
+            if function.__closure__:
+                raise TypeError(
+                    f"{function.__qualname__} is a closure: the cache would not see what it holds"
+                )
             compiled._cache = _KernelCache(function)
         return compiled
 

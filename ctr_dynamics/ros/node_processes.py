@@ -24,6 +24,7 @@ def free_domain() -> int:
 def environment(domain_id: int) -> dict[str, str]:
     """The present environment on that domain, seen on this machine only."""
     return {
+        "OPENBLAS_NUM_THREADS": "1",  # as the executables set it
         **os.environ,  # whole: the ROS wheels keep their library path in it
         "ROS_DOMAIN_ID": str(domain_id),
         "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",

@@ -4,6 +4,7 @@ import os
 import subprocess
 import sys
 import types
+import warnings
 from pathlib import Path
 
 import pytest
@@ -11,6 +12,7 @@ import pytest
 import ctr_dynamics
 from ctr_dynamics.cli import main as cli
 from ctr_dynamics.errors import InputError
+from ctr_dynamics.kernels.compiler import _say_not_kept
 
 
 @pytest.fixture
@@ -129,3 +131,27 @@ def test_output_that_cannot_be_written_is_one_line_and_exit_code_2(buffered):
     assert done.returncode == 2
     assert len(done.stderr.splitlines()) == 1
     assert "standard output cannot be written (No space left on device)" in done.stderr
+
+
+def test_a_command_prepares_its_process_before_numpy_is_imported():
+    code = (
+        "import os, sys; from ctr_dynamics.cli.main import main; assert 'numpy' not in sys.modules; "
+        "assert main(['--version']) == 0; print(os.environ['OPENBLAS_NUM_THREADS'])"
+    )
+    env = {name: value for name, value in os.environ.items() if not name.endswith("_NUM_THREADS")}
+    shown = subprocess.check_output([sys.executable, "-c", code], env=env, text=True)
+    assert shown.split()[-1] == "1"
+
+
+def test_warnings_of_the_package_are_one_line_and_those_of_others_keep_their_place(command, capsys):
+    def info() -> None:
+        _say_not_kept(Path("cache"), "Read-only file system")
+        warnings.warn("of another", RuntimeWarning, stacklevel=1)
+
+    assert command(info)() == 0
+    own, other = capsys.readouterr().err.splitlines()[:2]
+    assert own.startswith(
+        "ctr-dynamics: warning: compiled kernels cannot be kept in cache (Read-only file system)"
+    )
+    assert other.endswith("RuntimeWarning: of another")
+    assert Path(__file__).name in other
