@@ -15,12 +15,13 @@ from ctr_dynamics.benchmarks.release import DT, Release, release_robot
 from ctr_dynamics.kernels import rod as kernels
 from ctr_dynamics.kernels.compiler import njit
 from ctr_dynamics.kernels.lanes import rows
+from ctr_dynamics.kernels.layout import RATES, Y_NOW
+from ctr_dynamics.kernels.sections import section_lengths
 from ctr_dynamics.kernels.shooting import broyden
 from ctr_dynamics.kernels.workspace import field_rows, offsets, state_rows
-from ctr_dynamics.model.mesh import section_lengths
 from ctr_dynamics.model.model import Model
 from ctr_dynamics.model.statics import Statics
-from ctr_dynamics.model.time_scheme import RATES, Y_NOW, make_scheme
+from ctr_dynamics.model.time_scheme import make_scheme
 
 Floats = NDArray[np.float64]
 TOLERANCE, LIMIT = 1e-7, 40

@@ -7,19 +7,20 @@ from typing import Any
 import numpy as np
 
 from ctr_dynamics.benchmarks.machine import best_of
+from ctr_dynamics.kernels.paired_time_step import PAIR_LANES
 from ctr_dynamics.kernels.rod import sweep
+from ctr_dynamics.kernels.sections import section_lengths
 from ctr_dynamics.kernels.shooting import broadcast
 from ctr_dynamics.kernels.workspace import lane_count
-from ctr_dynamics.model.mesh import node_count, section_lengths
+from ctr_dynamics.model.mesh import node_count
 from ctr_dynamics.model.model import Model
-from ctr_dynamics.model.paired_steps import LANES as PAIR
 from ctr_dynamics.model.statics import Statics
 from ctr_dynamics.model.time_scheme import make_scheme
 from ctr_dynamics.robot import Robot
 from ctr_dynamics.robot_files import load_robot, robot_from_dict, robot_to_dict
 
 # one lane; those of two runs at once; packs of eight
-LANES: tuple[tuple[int, ...], ...] = ((), PAIR, (0,), (0,) * 2, (0,) * 4)
+LANES: tuple[tuple[int, ...], ...] = ((), PAIR_LANES, (0,), (0,) * 2, (0,) * 4)
 
 
 def sweep_cost(model: Model, lanes: tuple[int, ...], repeats: int) -> float:

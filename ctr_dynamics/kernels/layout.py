@@ -5,6 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
+# Slots of the stored fields; the rates of a step's stages follow from RATES on.
+Y_NOW, Y_BEFORE, RATE_NOW, RATES = 0, 1, 2, 3
+
 EXTENDED = (
     ("stribeck_excess", 1),
     ("stribeck_inverse_speed", 1),

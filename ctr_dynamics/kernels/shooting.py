@@ -7,8 +7,8 @@ import numpy as np
 from ctr_dynamics.kernels.compiler import njit
 from ctr_dynamics.kernels.lanes import PACK
 from ctr_dynamics.kernels.rod import sweep
+from ctr_dynamics.kernels.sections import section_lengths
 from ctr_dynamics.kernels.workspace import base_rows, field_rows, lane_count, parameter_rows, state_rows
-from ctr_dynamics.model.mesh import section_lengths
 
 CONVERGED, STALLED, NOT_FINITE = 0, 1, 2
 

@@ -9,11 +9,11 @@ import numpy as np
 
 from ctr_dynamics.kernels.compiler import njit
 from ctr_dynamics.kernels.lanes import PACK, columns, fma, rows
+from ctr_dynamics.kernels.layout import RATE_NOW, RATES, Y_BEFORE, Y_NOW
 from ctr_dynamics.kernels.rod import sweep
 from ctr_dynamics.kernels.shooting import broadcast, invert, lane_lengths
 from ctr_dynamics.kernels.time_step import history
 from ctr_dynamics.kernels.workspace import input_row, lane_count, unknown_lanes
-from ctr_dynamics.model.time_scheme import RATE_NOW, RATES, Y_BEFORE, Y_NOW
 
 THETA = 0.55  # of the one-stage tangent: nearly the trapezoidal rule, with a little damping of what the step does not resolve
 

@@ -3,10 +3,10 @@
 import numpy as np
 
 from ctr_dynamics.kernels.compiler import njit
+from ctr_dynamics.kernels.layout import RATE_NOW, RATES, Y_BEFORE, Y_NOW
+from ctr_dynamics.kernels.sections import section_lengths
 from ctr_dynamics.kernels.shooting import CONVERGED, solve
 from ctr_dynamics.kernels.workspace import input_row
-from ctr_dynamics.model.mesh import section_lengths
-from ctr_dynamics.model.time_scheme import RATE_NOW, RATES, Y_BEFORE, Y_NOW
 
 RENEW = 2  # sweeps a stage beyond which the next step starts with a new Jacobian, which costs two
 

@@ -12,12 +12,13 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 
 from ctr_dynamics.errors import InputError
+from ctr_dynamics.kernels.layout import RATES, Y_BEFORE, Y_NOW
 from ctr_dynamics.kernels.shooting import CONVERGED, NOT_FINITE
 from ctr_dynamics.kernels.time_step import EARLIER, RENEW, extrapolate, remember, step
 from ctr_dynamics.model.mesh import Mesh, point_positions
 from ctr_dynamics.model.model import Model
 from ctr_dynamics.model.statics import Statics
-from ctr_dynamics.model.time_scheme import RATES, Y_BEFORE, Y_NOW, Scheme, make_scheme
+from ctr_dynamics.model.time_scheme import Scheme, make_scheme
 
 OUTCOMES = {
     CONVERGED: "ok",

@@ -13,7 +13,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ctr_dynamics.model.mesh import Mesh, section_lengths
+from ctr_dynamics.kernels.sections import section_lengths
+from ctr_dynamics.model.mesh import Mesh
 from ctr_dynamics.model.model import Model
 from ctr_dynamics.model.statics import _Work
 

@@ -10,11 +10,12 @@ from itertools import product
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ctr_dynamics.kernels.compiler import njit
+from ctr_dynamics.kernels.end_angles import end_angles
 from ctr_dynamics.kernels.rod import sweep
+from ctr_dynamics.kernels.sections import section_lengths
 from ctr_dynamics.kernels.shooting import CONVERGED, broadcast, lanes_for, solve
 from ctr_dynamics.kernels.workspace import lane_count
-from ctr_dynamics.model.mesh import Key, Mesh, section_lengths
+from ctr_dynamics.model.mesh import Key, Mesh
 from ctr_dynamics.model.model import Model
 
 
@@ -207,38 +208,6 @@ def _continue(work: _Work, par: np.ndarray, x: np.ndarray, rows: np.ndarray, tol
     return True
 
 
-@njit(cache=True, nogil=True)
-def _end_angles(
-    sec_cells: np.ndarray,
-    sec_tubes: np.ndarray,
-    seclen: np.ndarray,
-    out: np.ndarray,
-    states: np.ndarray,
-    angles: np.ndarray,
-) -> None:
-    """Fill ``angles`` (N, lanes), see :meth:`_Work.end_angles`; u_1z is integrated by the weights of the Runge-Kutta stages."""
-    n, lanes = angles.shape
-    psi = np.empty(lanes)
-    for j in range(lanes):
-        psi[j] = 2.0 * math.atan2(states[0, 6, j], states[0, 3, j])
-    row, node = 8, 0  # of u_1z at the section's first point; the section's first node
-    for k in range(len(sec_cells)):
-        weight = seclen[k] / sec_cells[k] / 6.0
-        for _ in range(sec_cells[k]):
-            for stage in range(4):
-                share = 2.0 * weight if stage in (1, 2) else weight
-                for j in range(lanes):
-                    psi[j] += share * out[row, j]
-                row += 7 + 2 * n
-        row += 7 + 2 * n
-        node += sec_cells[k] + 1
-        after = sec_tubes[k + 1] if k + 1 < len(sec_cells) else 0
-        if after < sec_tubes[k]:
-            i = sec_tubes[k] - 1
-            for j in range(lanes):
-                angles[i, j] = psi[j] + (states[node - 1, 17 + n + i, j] if i else 0.0)
-
-
 class _Work:
     """Buffers of one static problem on one mesh."""
 
@@ -290,7 +259,7 @@ class _Work:
     def end_angles(self, out: np.ndarray, states: np.ndarray) -> np.ndarray:
         """psi_L (N, lanes) from fields (points * F, lanes) and states (nodes, S, lanes): base angle plus the integral of u_1z, plus theta."""
         angles = np.zeros((self.model.n, out.shape[1]))
-        _end_angles(self.mesh.sec_cells, self.mesh.sec_tubes, self.seclen, out, states, angles)
+        end_angles(self.mesh.sec_cells, self.mesh.sec_tubes, self.seclen, out, states, angles)
         return angles
 
     def joint_jacobian(

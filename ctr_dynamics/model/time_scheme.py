@@ -12,8 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ctr_dynamics.errors import InputError
-
-Y_NOW, Y_BEFORE, RATE_NOW, RATES = 0, 1, 2, 3  # slots of stored fields; stage rates follow from RATES
+from ctr_dynamics.kernels.layout import RATES, Y_NOW
 
 
 @dataclass(frozen=True)

@@ -14,16 +14,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctr_dynamics.errors import InputError
-from ctr_dynamics.kernels.compiler import njit
 from ctr_dynamics.kernels.lanes import PACK
+from ctr_dynamics.kernels.layout import RATES
 from ctr_dynamics.kernels.shooting import CONVERGED, aligned_zeros, lanes_for
+from ctr_dynamics.kernels.step_sequence import advance, advance_tangent
 from ctr_dynamics.kernels.tangent import linearise, step_tangent
-from ctr_dynamics.kernels.time_step import RENEW, extrapolate, remember, step
 from ctr_dynamics.kernels.workspace import input_row
 from ctr_dynamics.model.mesh import Key, Mesh, fits
 from ctr_dynamics.model.model import Model
 from ctr_dynamics.model.simulator import Inputs, Record, Simulator, State, remap_columns
-from ctr_dynamics.model.time_scheme import RATES, Scheme
+from ctr_dynamics.model.time_scheme import Scheme
 
 Floats = NDArray[np.float64]
 InputRows = Callable[[Floats], Floats]
@@ -51,59 +51,6 @@ class Trajectory:
     columns: Floats | None
     failure: str = ""
     sweeps: int = 0
-
-
-@njit(cache=True, nogil=True)
-def _advance(tubes, lane, lanes, mesh, c0, weights, par, inputs, bank, unknowns, earlier, inverse, fresh, small, big, scale, perturb,
-             tolerance, limit, tips):  # fmt: skip
-    """Steps with ``inputs`` (K, stages, inputs) until one fails; returns (steps taken, plain sweeps, outcome of the last)."""
-    nodes = small[6]
-    S = len(nodes) - tips.shape[1]
-    guess, found = np.empty_like(unknowns), np.empty_like(unknowns)
-    total = 0
-    for k in range(len(inputs)):
-        extrapolate(unknowns, earlier, perturb, guess)
-        outcome, _, sweeps, _ = step(tubes, lane, lanes, mesh, c0, weights, par, inputs[k], bank, guess, found, inverse, fresh, small, big,
-                                     scale, perturb, tolerance, limit)  # fmt: skip
-        total += sweeps
-        if outcome != CONVERGED:
-            return k, total, outcome
-        fresh = sweeps > RENEW * len(c0)
-        remember(unknowns, earlier, found)
-        for i in range(tips.shape[1]):
-            tips[k, i] = nodes[S + i]
-    return len(inputs), total, CONVERGED
-
-
-@njit(cache=True, nogil=True)
-def _advance_tangent(tubes, lane, lanes, wide, mesh, c0, weights, par, inputs, bank, unknowns, earlier, inverse, fresh, small, big, scale,
-                     perturb, fine, tolerance, limit, tips, dpar, dinputs, epsilon, many, work, dbank, before, matrix, dx, dnodes,
-                     dtips):  # fmt: skip
-    """The same with the columns ``dbank`` of the stored fields; ``dtips`` (K, 13, r) takes those of the tip."""
-    nodes = small[6]
-    S = len(nodes) - tips.shape[1]
-    guess, found = np.empty_like(unknowns), np.empty_like(unknowns)
-    stages = len(c0)
-    total = 0
-    for k in range(len(inputs)):
-        extrapolate(unknowns, earlier, perturb, guess)
-        before[:] = bank[:RATES]
-        outcome, _, sweeps, _ = step(tubes, lane, lanes, mesh, c0, weights, par, inputs[k], bank, guess, found, inverse, fresh, small, big,
-                                     scale, perturb, tolerance, limit)  # fmt: skip
-        total += sweeps
-        if outcome != CONVERGED:
-            return k, total, outcome
-        fresh = sweeps > RENEW * len(c0)
-        remember(unknowns, earlier, found)
-        for i in range(tips.shape[1]):
-            tips[k, i] = nodes[S + i]
-        if not step_tangent(tubes, wide, mesh, c0, weights, par, inputs[k], found, before, bank[RATES : RATES + stages], dpar, dinputs[k],
-                            epsilon, fine, many, work, dbank, matrix, dx, dnodes):  # fmt: skip
-            return k, total, -1
-        for i in range(dtips.shape[1]):
-            for c in range(dtips.shape[2]):
-                dtips[k, i, c] = dnodes[i, c]
-    return len(inputs), total, CONVERGED
 
 
 class _Columns:
@@ -373,13 +320,13 @@ def _fast(
         not state.usable, small, big, model.scale, model.step,
     )  # fmt: skip
     if columns is None:
-        taken, sweeps, outcome = _advance(*common, *solver, simulator.tolerance, simulator.limit, last)
+        taken, sweeps, outcome = advance(*common, *solver, simulator.tolerance, simulator.limit, last)
     else:
         assert dtips is not None
         many, work, before = columns.buffers(state.key, state.mesh, len(state.bank))
         shape = (*rows.shape, columns.count)
         dinputs = np.ascontiguousarray(columns.input_effect(times.ravel()).reshape(shape))
-        taken, sweeps, outcome = _advance_tangent(
+        taken, sweeps, outcome = advance_tangent(
             *common, columns.wide, *solver, model.tangent_step, simulator.tolerance, simulator.limit, last, columns.effect, dinputs,
             EPSILON, many, work, columns.bank, before, columns.matrix, columns.dx, columns.dnodes, dtips,
         )  # fmt: skip

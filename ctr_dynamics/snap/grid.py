@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 
 from ctr_dynamics.errors import InputError
+from ctr_dynamics.kernels.snap_newton import Arrays
 from ctr_dynamics.model.mesh import Tubes, breakpoints
 
 SPACING = 0.001  # m, of cells on robots without a grid of their own
@@ -19,36 +19,6 @@ SHORTEST = (
 
 # The grid of the authors' published program (15, 30, 10, 15, 10, 4 points), base to tip.
 PUBLISHED = {"till2020_snap_example": (14, 29, 9, 14, 9, 3)}
-
-
-class Arrays(NamedTuple):
-    """What the kernels read of a grid.
-
-    ``n`` tubes, ``turning`` of them begin behind the plate, on ``base`` cells each. Cells k = 0.. run from the actuators to the tip between
-    nodes k and k + 1. ``cell_section`` (cells,): section, -1 behind the plate; ``ds`` (cells,) m; ``base_ds`` (N,) m; ``ust`` (cells, 3N)
-    precurvature in the cells' middles, ``ust_start``, ``ust_end`` (sections, 3N) at both ends of each section, ``ust_behind`` (3N,) just
-    behind the plate, ``uz_base`` (base, N) its z part in the cells there, 1/m. ``tubes`` (sections,): present in each;
-    ``first_cell`` (sections + 1,). ``size`` (nodes,), ``start`` (nodes + 1,): unknowns of each node; ``rows`` (cells,), ``row_start``
-    (cells + 1,): equations of each cell.
-    """
-
-    n: int
-    turning: int
-    base: int
-    cell_section: np.ndarray
-    ds: np.ndarray
-    base_ds: np.ndarray
-    ust: np.ndarray
-    ust_start: np.ndarray
-    ust_end: np.ndarray
-    ust_behind: np.ndarray
-    uz_base: np.ndarray
-    tubes: np.ndarray
-    first_cell: np.ndarray
-    size: np.ndarray
-    start: np.ndarray
-    rows: np.ndarray
-    row_start: np.ndarray
 
 
 @dataclass(frozen=True)

@@ -7,9 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from ctr_dynamics.errors import InputError
+from ctr_dynamics.kernels.layout import RATE_NOW, Y_BEFORE, Y_NOW
 from ctr_dynamics.kernels.snap_newton import CONVERGED, NOT_FINITE, make_work, solve
 from ctr_dynamics.model.model import Model
-from ctr_dynamics.model.time_scheme import RATE_NOW, Y_BEFORE, Y_NOW, make_scheme
+from ctr_dynamics.model.time_scheme import make_scheme
 from ctr_dynamics.robot import Robot
 from ctr_dynamics.snap.grid import Grid, build_grid, default_cells
 

@@ -12,7 +12,8 @@ from model_cases import dominant_frequency, make_robot, make_tube
 from scipy.interpolate import CubicSpline
 
 from ctr_dynamics.kernels.rod import sweep
-from ctr_dynamics.model.mesh import node_positions, section_lengths
+from ctr_dynamics.kernels.sections import section_lengths
+from ctr_dynamics.model.mesh import node_positions
 from ctr_dynamics.model.model import Model
 from ctr_dynamics.model.simulator import Inputs, Simulator
 from ctr_dynamics.model.statics import Statics

@@ -7,8 +7,8 @@ from model_oracle import Oracle
 
 from ctr_dynamics.kernels.lanes import sincos
 from ctr_dynamics.kernels.rod import sweep
+from ctr_dynamics.kernels.sections import section_lengths
 from ctr_dynamics.kernels.workspace import lane_count
-from ctr_dynamics.model.mesh import section_lengths
 from ctr_dynamics.model.model import Model
 
 

@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 from model_cases import make_robot, make_tube, many_tubes, still
 
+from ctr_dynamics.kernels.layout import RATES
 from ctr_dynamics.model.mesh import fits, node_count, section_key
 from ctr_dynamics.model.model import Model
 from ctr_dynamics.model.simulator import Inputs, Simulator, remap_fields
 from ctr_dynamics.model.statics import Statics
-from ctr_dynamics.model.time_scheme import RATES, make_scheme
+from ctr_dynamics.model.time_scheme import make_scheme
 from ctr_dynamics.robot_files import load_robot
 
 DT = 0.003

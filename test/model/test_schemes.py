@@ -5,9 +5,10 @@ import pytest
 from model_cases import make_robot, make_tube, run, still
 
 from ctr_dynamics.errors import InputError
+from ctr_dynamics.kernels.layout import RATE_NOW, RATES, Y_BEFORE, Y_NOW
 from ctr_dynamics.kernels.tangent import by_fields
 from ctr_dynamics.model.model import Model
-from ctr_dynamics.model.time_scheme import RATE_NOW, RATES, Y_BEFORE, Y_NOW, make_scheme
+from ctr_dynamics.model.time_scheme import make_scheme
 from ctr_dynamics.robot_files import load_robot
 
 ORDERS = {"backward_euler": 1, "bdf2": 2, "trapezoid": 2, "bdf_alpha": 2, "sdirk2": 2, "sdirk3": 3}

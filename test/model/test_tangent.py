@@ -6,11 +6,12 @@ Initial fields, a parameter and an actuator angle.
 import numpy as np
 import pytest
 
+from ctr_dynamics.kernels.layout import RATES
 from ctr_dynamics.kernels.shooting import lanes_for
 from ctr_dynamics.kernels.tangent import step_tangent
 from ctr_dynamics.model.model import Model
 from ctr_dynamics.model.simulator import Inputs, Simulator
-from ctr_dynamics.model.time_scheme import RATES, make_scheme
+from ctr_dynamics.model.time_scheme import make_scheme
 from ctr_dynamics.robot_files import load_robot
 
 DT, STEPS, COLUMNS = 0.003, 12, 8

@@ -8,10 +8,11 @@ import pytest
 from model_cases import dominant_frequency, make_robot, make_tube, still
 from scipy.optimize import brentq
 
-from ctr_dynamics.model.mesh import section_lengths
+from ctr_dynamics.kernels.layout import RATES
+from ctr_dynamics.kernels.sections import section_lengths
 from ctr_dynamics.model.model import Model
 from ctr_dynamics.model.simulator import Simulator
-from ctr_dynamics.model.time_scheme import RATES, make_scheme
+from ctr_dynamics.model.time_scheme import make_scheme
 
 L = 0.2
 

@@ -15,9 +15,10 @@ from ctr_dynamics.estimation.filter.parameter_priors import ModelUncertainty
 from ctr_dynamics.estimation.filter.reduction import Change
 from ctr_dynamics.kernels.covariance import position_deviations
 from ctr_dynamics.kernels.filter_steps import sparse_product
+from ctr_dynamics.kernels.sections import section_lengths
 from ctr_dynamics.kernels.shooting import lanes_for, lanes_free
 from ctr_dynamics.kernels.tangent import linearise, theta_tangent
-from ctr_dynamics.model.mesh import Key, Mesh, build_mesh, section_lengths
+from ctr_dynamics.model.mesh import Key, Mesh, build_mesh
 from ctr_dynamics.model.mesh_interpolation import Transfer, coarse_key, transfer
 from ctr_dynamics.model.model import Model
 from ctr_dynamics.model.simulator import Record, remap_columns
