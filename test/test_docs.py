@@ -25,6 +25,7 @@ PAGES = [
     *sorted((ROOT / "docs").glob("*.md")),
     *sorted((ROOT / "msg_docs").glob("*.md")),
 ]
+NOT_CODE = {p.name for p in PARAMETERS} | {"ctr_dynamics/findings/1"}
 SNAP_VALUES = {"tube_coulomb", "tube_viscous", "epsilon", "beta1"}  # what `snap --set` takes
 TEXT = {
     page: page.read_text(encoding="utf-8") for page in [*PAGES, *sorted((ROOT / "examples").rglob("*.md"))]
@@ -117,6 +118,55 @@ def test_commands_in_the_pages_exist(page, commands):
         assert used <= known, line
         for assignment in re.findall(r"--set (\w[\w.]*)=", line):
             assert assignment in (SNAP_VALUES if words[0] == "snap" else {p.name for p in PARAMETERS}), line
+
+
+def definitions(module: Path) -> dict[str, ast.AST]:
+    """Functions, classes and assigned names at the top of a module, by name."""
+    found: dict[str, ast.AST] = {}
+    for node in ast.parse(module.read_text(encoding="utf-8")).body:
+        if isinstance(node, (ast.FunctionDef, ast.ClassDef)):
+            found[node.name] = node
+        elif isinstance(node, ast.Assign):
+            found |= {target.id: node for target in node.targets if isinstance(target, ast.Name)}
+        elif isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name):
+            found[node.target.id] = node
+    return found
+
+
+def missing_part(name: str) -> str:
+    """The first part of a dotted name below `ctr_dynamics` that does not exist; empty when all do."""
+    place, parts = ROOT / "ctr_dynamics", name.split(".")
+    while parts and (place / parts[0]).is_dir():
+        place /= parts.pop(0)
+    module = place / f"{parts[0]}.py" if parts else place / "__init__.py"
+    if not module.is_file() and parts:
+        module = place / "__init__.py"
+    elif parts:
+        parts.pop(0)
+    if not parts:
+        return ""
+    found = definitions(module).get(parts[0])
+    if found is None:
+        return parts[0]
+    members = {n.name for n in getattr(found, "body", []) if isinstance(n, ast.FunctionDef)}
+    return "" if len(parts) == 1 or parts[1] in members else parts[1]
+
+
+@pytest.mark.parametrize(
+    "page", [p for p in TEXT if p.name != reference.PAGE.name], ids=lambda page: page.name
+)
+def test_names_and_files_of_the_code_in_the_pages_exist(page):
+    """Dotted names in code spans, with or without `ctr_dynamics` before them, and paths of files."""
+    packages = {path.stem for path in (ROOT / "ctr_dynamics").glob("[a-z]*")}
+    for span in re.findall(r"`([^`\n]+)`", TEXT[page]):
+        name = span.split("(")[0].removeprefix("ctr_dynamics.")
+        if re.fullmatch(r"[a-z_]+(\.\w+)+", name) and name.split(".")[0] in packages and name not in NOT_CODE:
+            assert missing_part(name) == "", f"{page.name}: {span}"
+        elif (
+            re.fullmatch(r"(ctr_dynamics|tools|test|benchmarks|examples)/[\w/.]+", span)
+            and span not in NOT_CODE
+        ):
+            assert (ROOT / span).exists(), f"{page.name}: {span}"
 
 
 def string_constants() -> str:

@@ -100,7 +100,9 @@ def paragraphs(text: str) -> Iterator[tuple[str, bool]]:
 def sentences(text: str) -> Iterator[Sentence]:
     """All sentences of a page in Markdown."""
     for paragraph, in_table in paragraphs(text):
-        plain = _CODE.sub(lambda code: re.sub(r"\W", "", code[0]) or "code", _LINK.sub(r"\1", paragraph))
+        plain = _CODE.sub(
+            lambda code: f"`{re.sub(r'[^A-Za-z0-9_]', '', code[0]) or 'code'}`", _LINK.sub(r"\1", paragraph)
+        )
         plain = _ABBREVIATION.sub(r"\1", plain)
         for piece in _END.split(plain):
             count = sum(1 for word in piece.split() if _WORD.search(word))
