@@ -32,7 +32,7 @@ ROS_MESSAGES = ["std", "geometry", "sensor", "nav", "diagnostic", "visualization
 setup(
     name=PACKAGE,
     version=version(),
-    packages=find_packages(exclude=["test", "test.*"]),
+    packages=find_packages(include=[PACKAGE, f"{PACKAGE}.*"]),
     package_data={PACKAGE: ["config/*.yaml", "config/*/*.yaml", "config/view/*", "data/bags/*", "py.typed"]},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{PACKAGE}"]),
@@ -76,8 +76,10 @@ setup(
         "test": [
             "distributed>=2024.8",
             "pytest>=8",
+            "pytest-cov>=5",
             "pytest-xdist>=3.5",
             "hypothesis>=6.100",
+            "import-linter>=2",
             "ruff",
             "mypy",
             "types-PyYAML",

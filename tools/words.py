@@ -16,7 +16,7 @@ from pathlib import Path
 
 from tools.prose import pages, paragraphs
 
-CODE = ("ctr_dynamics", "tools", "examples", "benchmarks")
+CODE = ("ctr_dynamics", "tools", "examples", "studies")
 OWN = ("tools/words.py", "docs/glossary.md")  # they name the replaced words
 
 
@@ -102,7 +102,7 @@ TERMS = (
         "misfit monitor",
         "misfit",
         "misfit",
-        "estimation/|benchmarks/",
+        "estimation/|studies/",
         r"README|docs/(?!.*diagnosis)|parameters|topics",
     ),
     Term(

@@ -9,8 +9,8 @@ from typing import Annotated
 
 import typer
 
-from ctr_dynamics.cli.demo_command import SHIPPED, shipped_file
 from ctr_dynamics.io.atomic_files import atomic_file, check_targets, output_folder
+from ctr_dynamics.io.shipped_bags import shipped_bag
 
 
 def bench(
@@ -41,7 +41,7 @@ def bench(
 
     check_targets({"page": page}, {"bag": bag})
     output_folder(output)
-    result = measure(bag or shipped_file(f"{SHIPPED}.mcap"), quick, say)
+    result = measure(bag or shipped_bag(), quick, say)
     with atomic_file(output / "bench.json") as part:
         part.write_text(json.dumps(result, indent=1, allow_nan=False) + "\n", encoding="utf-8")
     if page is not None:

@@ -7,7 +7,6 @@ import math
 import tempfile
 import time
 from collections.abc import Sequence
-from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -21,6 +20,7 @@ from ctr_dynamics.io.atomic_files import atomic_file, output_folder
 from ctr_dynamics.io.bag_writer import write_bag
 from ctr_dynamics.io.messages import topics
 from ctr_dynamics.io.messages.cdr import decode_stamp
+from ctr_dynamics.io.shipped_bags import shipped_bag, shipped_truth
 from ctr_dynamics.parameters import Settings
 from ctr_dynamics.robot_files import load_robot
 from ctr_dynamics.runtime import live_report
@@ -30,7 +30,6 @@ if TYPE_CHECKING:
     from ctr_dynamics.ros.listener import Listener
     from ctr_dynamics.ros.node_processes import NodeProcess
 
-SHIPPED = "clean_release"
 SHORTEST_S = 2.0
 """Of a run, below which its errors say nothing: the start is left out."""
 START_S = 900.0
@@ -61,7 +60,7 @@ def demo(
     if not (duration == 0.0 or SHORTEST_S <= duration < math.inf):
         raise InputError(f"--duration is {duration:g} s", do=f"write {SHORTEST_S:g} s or more, or 0 for all")
     if bag is None:
-        bag, truth = shipped_file(f"{SHIPPED}.mcap"), truth or shipped_truth()
+        bag, truth = shipped_bag(), truth or shipped_truth()
     candidates = live_report.truth_of(truth) if truth is not None else []
     messages = load(bag, 0.0, duration)
     span_s = (messages[-1].log_ns - messages[0].log_ns) * 1e-9
@@ -119,26 +118,6 @@ def demo(
         part.write_text(json.dumps(figures, indent=1), encoding="utf-8")
     console.print(f"picture, figures and recorded outputs are in {output}")
     return 0
-
-
-def shipped_file(name: str) -> Path:
-    """A file of the package's `data/bags`.
-
-    Raises:
-        InputError: it is not there.
-    """
-    path = Path(str(resources.files("ctr_dynamics") / "data" / "bags" / name))
-    if not path.is_file():
-        raise InputError("the shipped bag is missing", do="give one with --bag", where=str(path))
-    return path
-
-
-def shipped_truth() -> Path | None:
-    """The truth of the shipped bag, if it is shipped too."""
-    try:
-        return shipped_file(f"{SHIPPED}.npz")
-    except InputError:
-        return None
 
 
 def follow(console: Console, driver: NodeProcess, listener: Listener, span_s: float) -> None:

@@ -14,11 +14,9 @@ import ast
 import functools
 import hashlib
 import os
-import pickle
 import re
 import shutil
 import sys
-import tempfile
 import time
 import warnings
 from collections.abc import Callable
@@ -27,7 +25,6 @@ from typing import Any
 
 import numba
 from numba.core import caching, types
-from numba.core.serialize import dumps
 
 PACKAGE = Path(__file__).resolve().parents[1]
 LAYOUT = 2  # of what is stored; another number begins a new cache
@@ -147,37 +144,31 @@ def _say_not_kept(folder: Path, reason: str) -> None:
     )
 
 
-class _Files:
-    """Compiled code of one kernel: a file for each key, written whole or not at all."""
+class _Files(caching.IndexDataCacheFile):
+    """Compiled code of one kernel: a file for each key and no index; written whole or not at all."""
 
-    def __init__(self, folder: Path, base: str) -> None:
-        self._folder, self._base = folder, base
+    def _name(self, key: str) -> str:
+        return f"{self._filename_base}.{key}.nbc"
 
-    def _path(self, key: str) -> Path:
-        return self._folder / f"{self._base}.{key}.nbc"
+    def __init__(self, folder: Path, filename_base: str, digest: str) -> None:
+        super().__init__(str(folder), filename_base, digest)
+        self._folder, self._filename_base = folder, filename_base
 
     def load(self, key: str) -> Any:
         """What is stored under ``key``; None without it, or where it cannot be read."""
         try:
-            data = self._path(key).read_bytes()
-        except OSError:
+            data = self._load_data(self._name(key))
+        except Exception:  # absent, or damaged: reading raises whatever the bytes lead to
             return None
         _note_use(self._folder)
-        try:
-            return pickle.loads(data)
-        except Exception:  # damaged: pickle raises whatever the bytes lead to
-            return None
+        return data
 
     def save(self, key: str, data: Any) -> None:
         """Store it; a folder that cannot be written is said once, and computing goes on."""
         try:
             new = not self._folder.is_dir()
             self._folder.mkdir(parents=True, exist_ok=True)
-            number, name = tempfile.mkstemp(dir=self._folder)
-            with os.fdopen(number, "wb") as stream:
-                stream.write(dumps(data))
-            os.chmod(name, 0o644)
-            os.replace(name, self._path(key))
+            self._save_data(self._name(key), data)
         except OSError as error:
             _say_not_kept(cache_folder(), error.strerror or str(error))
             return
@@ -186,7 +177,7 @@ class _Files:
 
     def flush(self) -> None:
         """Remove everything that is stored of this kernel."""
-        for path in self._folder.glob(f"{self._base}.*.nbc"):
+        for path in self._folder.glob(f"{self._filename_base}.*.nbc"):
             path.unlink(missing_ok=True)
 
 
@@ -227,7 +218,9 @@ class _KernelCache(caching.FunctionCache):
 
     def __init__(self, function: Callable[..., Any]) -> None:
         super().__init__(function)
-        self._cache_file: Any = _Files(Path(self._cache_path), self._impl.filename_base)
+        self._cache_file = _Files(
+            Path(self._cache_path), self._impl.filename_base, self._impl.locator.get_source_stamp()
+        )
 
     def _index_key(self, sig: Any, codegen: Any) -> str:
         """Name of the file of this signature, on this processor."""

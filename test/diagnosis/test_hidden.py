@@ -1,4 +1,4 @@
-"""Effects hidden by a simulator of its own, sealed until the verdict is in. The large study is benchmarks/study.py; these seeds are others."""
+"""Effects hidden by a simulator of its own, sealed until the verdict is in. The large study is studies/diagnosis_study.py; these seeds are others."""
 
 import json
 import math

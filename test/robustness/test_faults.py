@@ -1,8 +1,7 @@
-"""The faults of benchmarks/fault_study.py do to the messages what they say, and only then."""
+"""The faults of studies/live_faults.py do to the messages what they say, and only then."""
 
 from __future__ import annotations
 
-import importlib.util
 from pathlib import Path
 
 import numpy as np
@@ -10,17 +9,10 @@ import pytest
 
 from ctr_dynamics.io.messages import cdr, topics
 from ctr_dynamics.runtime.playback import load
+from studies import fault_messages as faults
 
 ROOT = Path(__file__).parents[2]
 BAG = ROOT / "test" / "data" / "bags" / "clean_release.mcap"
-
-
-@pytest.fixture(scope="module")
-def faults():
-    spec = importlib.util.spec_from_file_location("fault_messages", ROOT / "benchmarks" / "fault_messages.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
 
 
 @pytest.fixture(scope="module")
@@ -28,7 +20,7 @@ def messages():
     return load(BAG, 0.0, 4.0)
 
 
-def test_every_fault_keeps_order_and_what_lies_outside_its_time(faults, messages):
+def test_every_fault_keeps_order_and_what_lies_outside_its_time(messages):
     first = messages[0].log_ns
     for name, fault in faults.FAULTS.items():
         changed = fault(messages)
@@ -40,7 +32,7 @@ def test_every_fault_keeps_order_and_what_lies_outside_its_time(faults, messages
         assert changed != messages, name
 
 
-def test_what_the_faults_do(faults, messages):
+def test_what_the_faults_do(messages):
     first = messages[0].log_ns
 
     def inside(name, topic):
@@ -69,7 +61,7 @@ def test_what_the_faults_do(faults, messages):
             cdr.decode_joint_state(m.data)
 
 
-def test_tenfold_is_linear_in_between(faults, messages):
+def test_tenfold_is_linear_in_between(messages):
     more = [m for m in faults.tenfold(messages) if m.topic == topics.JOINT_STATES]
     few = [m for m in messages if m.topic == topics.JOINT_STATES]
     assert len(more) == 10 * (len(few) - 1) + 1

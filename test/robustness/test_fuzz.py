@@ -1,26 +1,17 @@
-"""Readers take damaged files or refuse them in one line: some hundred of the files of benchmarks/fuzz_readers.py, and its own account."""
+"""Readers take damaged files or refuse them in one line: some hundred of the files of studies/fuzz_readers.py, and its own account."""
 
 from __future__ import annotations
 
-import importlib.util
-import sys
 from pathlib import Path
 
 import pytest
 
+from studies import fuzz_readers as fuzz
+
 ROOT = Path(__file__).parents[2]
 
 
-@pytest.fixture(scope="module")
-def fuzz():
-    spec = importlib.util.spec_from_file_location("fuzz_readers", ROOT / "benchmarks" / "fuzz_readers.py")
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module
-    spec.loader.exec_module(module)
-    return module
-
-
-def test_whole_files_are_taken(fuzz, tmp_path):
+def test_whole_files_are_taken(tmp_path):
     for kind, (files, suffix, reader) in fuzz.seeds().items():
         for number, data in enumerate(files):
             path = tmp_path / f"{kind}{number}{suffix}"
@@ -28,7 +19,7 @@ def test_whole_files_are_taken(fuzz, tmp_path):
             reader(path)
 
 
-def test_damaged_files_neither_crash_nor_hang(fuzz):
+def test_damaged_files_neither_crash_nor_hang():
     figures = fuzz.fuzz(400, seed=20)
     assert figures["failures"] == []
     assert sum(sum(found.values()) for found in figures["counts"].values()) == 400
@@ -37,7 +28,7 @@ def test_damaged_files_neither_crash_nor_hang(fuzz):
     assert 50 < taken < 350  # the damage is neither nothing nor everything
 
 
-def test_failures_are_counted(fuzz, tmp_path):
+def test_failures_are_counted(tmp_path):
     """What the account is for: a reader that breaks, hangs or takes too much is seen."""
 
     def hang(path):

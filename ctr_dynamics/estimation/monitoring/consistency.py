@@ -1,6 +1,6 @@
 """Misfit monitor: does the filter's picture of the robot still hold? Windowed NIS, CUSUM and whiteness of the innovations. No clock, no ROS.
 
-The limits are set by simulated white innovations (benchmarks/misfit_limits.py): a consistent filter at 40 Hz alarms less than once in ten hours.
+The limits are set by simulated white innovations (studies/monitor_limits.py): a consistent filter at 40 Hz alarms less than once in ten hours.
 """
 
 from __future__ import annotations

@@ -5,7 +5,7 @@ output as a Markdown table: resident memory, steps, invalid steps, and how much 
 plays the same to the estimator node over real DDS, which takes as long as it says; the table tells the node's resident memory, and behind it
 stands what the node reports of its deadlines.
 
-    python benchmarks/memory.py [BAG] --minutes 60 [--live]
+    python -m studies.long_memory [BAG] --minutes 60 [--live]
 """
 
 from __future__ import annotations
@@ -19,19 +19,18 @@ import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-import live_run
-
 from ctr_dynamics.benchmarks.fused import DT_NS
-from ctr_dynamics.cli.demo_command import shipped_file
 from ctr_dynamics.estimation.estimator import Estimator
 from ctr_dynamics.io.bag_reader import InputMessage, open_bag
 from ctr_dynamics.io.bag_writer import write_bag
 from ctr_dynamics.io.messages import topics
 from ctr_dynamics.io.messages.cdr import JointStateIn, PoseIn, WrenchIn
 from ctr_dynamics.io.messages.encode import encode_joint_state, encode_pose_stamped, encode_wrench_stamped
+from ctr_dynamics.io.shipped_bags import shipped_bag
 from ctr_dynamics.parameters import Settings
 from ctr_dynamics.robot_files import load_robot
 from ctr_dynamics.runtime.step_encoder import StepEncoder
+from studies import live_punctuality
 
 RETURN_NS, JOINTS_NS = 2_000_000_000, 10_000_000  # length of the way back, and between its joint states
 MINUTE_NS = 60_000_000_000
@@ -148,7 +147,7 @@ def live(bag: Path, robot_name: str, minutes: int) -> list[float]:
                 if item.log_ns > end_ns:
                     break
                 writer.write(item.topic, item.log_ns, serialised(item))
-        report = live_run.run(long, {"robot": robot_name}, 60.0 * minutes, listen=False, watch=watch)
+        report = live_punctuality.run(long, {"robot": robot_name}, 60.0 * minutes, listen=False, watch=watch)
     print(f"\n{json.dumps(report)}")
     return memory
 
@@ -156,7 +155,7 @@ def live(bag: Path, robot_name: str, minutes: int) -> list[float]:
 def main() -> int:
     """Run the benchmark; returns 1 when memory grows by more than the limit."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n", maxsplit=1)[0])
-    parser.add_argument("bag", nargs="?", type=Path, default=shipped_file("clean_release.mcap"))
+    parser.add_argument("bag", nargs="?", type=Path, default=shipped_bag())
     parser.add_argument("--minutes", type=int, default=60)
     parser.add_argument("--robot", default="till2020_tissue")
     parser.add_argument(

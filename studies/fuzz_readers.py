@@ -1,6 +1,6 @@
 """Damaged files for every reader: bags, robot files, parameter files, scenarios, CSV logs, layouts, pose tables, messages.
 
-    python benchmarks/fuzz_readers.py --files 10000 --output fuzz.json
+    python -m studies.fuzz_readers --files 10000 --output fuzz.json
 
 A reader may take a damaged file or refuse it with one line (InputError, or CdrError for a message); anything else, more than `LIMIT_S` for one
 file, or more memory than `MEMORY_BYTES` is a failure. Files are read in child processes, so that a crash of the interpreter is counted too. A seed
@@ -47,6 +47,7 @@ MEMORY_BYTES = (
     2 * 2**30
 )  # of address space beyond what the interpreter has: twice the largest chunk that is read, and its copy
 BATCH = 500
+ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = Path(str(resources.files("ctr_dynamics")))
 CSV = "time [s],tube1_rotation [deg],tube1_translation [mm],x [mm],y [mm],z [mm],qx,qy,qz,qw\n" + "".join(
     f"{0.01 * k:.3f},{k},-{20 + k},1.5,2.5,{100 + k},0,0,0.6,0.8\n" for k in range(30)
@@ -247,8 +248,17 @@ def fuzz(files: int, seed: int) -> dict[str, Any]:
     number = 0
     while number < files:
         count = min(BATCH, files - number)
-        command = [sys.executable, __file__, "--worker", str(number), str(count), "--seed", str(seed)]
-        child = subprocess.run(command, capture_output=True, text=True)
+        command = [
+            sys.executable,
+            "-m",
+            "studies.fuzz_readers",
+            "--worker",
+            str(number),
+            str(count),
+            "--seed",
+            str(seed),
+        ]
+        child = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
         done = 0
         for text in child.stdout.splitlines():
             line = json.loads(text)

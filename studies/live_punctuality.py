@@ -6,7 +6,7 @@ asked time has been played. Figures go to standard output as JSON. Beside them s
 punctuality: how often a thread of this script that does nothing but sleep until the next 3 ms is as late, and
 for how long a virtual machine's processors were given to others.
 
-    python benchmarks/live_run.py BAG [BAG ...] --seconds 60 --policy predict
+    python -m studies.live_punctuality BAG [BAG ...] --seconds 60 --policy predict
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """The large study of diagnosis: many cases with hidden effects, from a simulator of its own, and how often the verdicts are right.
 
-    python benchmarks/study.py --output study --singles 80 --clean 80 --pairs 24 --outside 24
-    python benchmarks/study.py --output study --table docs/study.md
+    python -m studies.diagnosis_study --output study --singles 80 --clean 80 --pairs 24 --outside 24
+    python -m studies.diagnosis_study --output study --table docs/study.md
 
 Every case is one task (joblib processes, or a Dask cluster with --cluster ADDRESS). Results go to DIR/results.jsonl, one line a case; a run that
 is stopped goes on where it was. Seeds are the stratum's first seed plus the number of the case.
@@ -13,21 +13,19 @@ import argparse
 import json
 import math
 import os
-import sys
 import tempfile
 import time
 from pathlib import Path
 from typing import Any
 
-ROOT = Path(__file__).resolve().parent.parent
+from studies import add_truth_path
+
 Z95 = 1.959964
 
 
 def one(stratum: str, seed: int) -> dict[str, Any]:
     """Make a case, diagnose it, then open the answer."""
-    for folder in (ROOT, ROOT / "test" / "diagnosis"):
-        if str(folder) not in sys.path:
-            sys.path.insert(0, str(folder))
+    add_truth_path()
     from truth.cases import make_case
 
     from ctr_dynamics.diagnosis.output.findings import findings

@@ -1,6 +1,6 @@
 """How often the misfit monitor's limits are passed by the innovations of a consistent filter: white and normal, 6 axes at 40 Hz.
 
-    python benchmarks/misfit_limits.py --hours 1000
+    python -m studies.monitor_limits --hours 1000
 
 For each statistic: alarms per ten hours at the default limit and the limit that is passed once in ten hours. Alarms are separated by at least
 a window; the CUSUM starts anew after each.

@@ -1,6 +1,6 @@
 """The estimator live under faults: what it does meanwhile, how soon it is back, and what is lost.
 
-    python benchmarks/fault_study.py --output faults.json [--only NAME ...] [--table]
+    python -m studies.live_faults --output faults.json [--only NAME ...] [--table]
 
 Each fault changes the messages of the shipped release bag between 2 s and 3 s (or all of them, or the machine) and plays them over
 DDS to a fresh estimator node that records. Looked at are the node's outputs and its recording: numbers that are not finite, stamps
@@ -34,18 +34,16 @@ from builtin_interfaces.msg import Time
 from rclpy.serialization import serialize_message
 from rosgraph_msgs.msg import Clock
 
-from ctr_dynamics.cli.demo_command import shipped_file
 from ctr_dynamics.io.bag_reader import RawMessage, open_bag
 from ctr_dynamics.io.messages import cdr, topics
+from ctr_dynamics.io.shipped_bags import shipped_bag, shipped_truth
 from ctr_dynamics.ros import qos
 from ctr_dynamics.ros.listener import Listener
 from ctr_dynamics.ros.node_processes import ESTIMATOR, NodeProcess, free_domain
 from ctr_dynamics.ros.topic_names import message_class
 from ctr_dynamics.runtime import live_report
 from ctr_dynamics.runtime.playback import load, pace, shifted
-
-sys.path.insert(0, str(Path(__file__).parent))
-from fault_messages import END_S, FAULTS, NEEDS_RESET, WHOLE_RUN, Messages
+from studies.fault_messages import END_S, FAULTS, NEEDS_RESET, WHOLE_RUN, Messages
 
 SECONDS = 5.0
 PATIENCE_S = 900.0
@@ -137,7 +135,7 @@ def stamp_of(t: int) -> Time:
 
 def run(fault: str, folder: Path, speed: float) -> Result:
     """One fault on a fresh node."""
-    bag = shipped_file("clean_release.mcap")
+    bag = shipped_bag()
     messages = FAULTS[fault](load(bag, 0.0, SECONDS))
     recording = folder / "recorded.mcap"
     domain = free_domain()
@@ -214,9 +212,12 @@ def error(poses: list[Any], start_ns: int, fault: str) -> float | None:
     """Tip error (rms, 3-D, m) against the truth in the last second."""
     if "for good" in fault or fault.startswith("kill"):
         return None
+    truth_file = shipped_truth()
+    if truth_file is None:
+        return None
     fused = live_report.trace_of(poses, start_ns)
     best = math.inf
-    for truth in live_report.truth_of(shipped_file("clean_release.npz")):
+    for truth in live_report.truth_of(truth_file):
         inside = (fused.t > SECONDS - 1.0) & (fused.t < SECONDS - 0.05)
         if inside.any():
             distance = np.linalg.norm(fused.p[inside] - truth.at(fused.t[inside]), axis=1)
@@ -230,11 +231,7 @@ def long_run(hours: float) -> dict[str, Any]:
     from ctr_dynamics.parameters import Settings
     from ctr_dynamics.robot_files import load_robot
 
-    inputs = [
-        item
-        for item in open_bag(shipped_file("clean_release.mcap")).inputs()
-        if item.topic != topics.TIP_LOAD
-    ]
+    inputs = [item for item in open_bag(shipped_bag()).inputs() if item.topic != topics.TIP_LOAD]
     first = inputs[0].log_ns
     part = [item for item in inputs if 4_000_000_000 <= item.log_ns - first < 5_000_000_000]
     estimator = Estimator(load_robot("till2020_tissue"), Settings({"output.policy": "wait"}))

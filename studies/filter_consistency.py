@@ -1,6 +1,6 @@
 """Is the published covariance right? NEES and NIS over many clean bags, each of another robot inside the file's tolerances.
 
-    python benchmarks/consistency.py --cases 12
+    python -m studies.filter_consistency --cases 12
 
 One bag holds a few independent values of the tracker's drift only, so the NEES of a single bag scatters widely about 1; the mean over many bags
 tells whether the filter is consistent. The bags come from the truth generator of the diagnosis tests.
@@ -9,14 +9,14 @@ tells whether the filter is consistent. The bags come from the truth generator o
 from __future__ import annotations
 
 import argparse
-import sys
 import tempfile
 from pathlib import Path
 
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-ROOT = Path(__file__).resolve().parent.parent
+from studies import add_truth_path
+
 SINCE_S = 0.5
 SEED = 90_000
 
@@ -50,8 +50,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--cases", type=int, default=12)
     options = parser.parse_args()
-    for folder in (ROOT, ROOT / "test" / "diagnosis"):
-        sys.path.insert(0, str(folder))
+    add_truth_path()
     from truth.cases import make_case
 
     rows: dict[str, list[tuple[float, float, float]]] = {"protocol": [], "sweep": []}
