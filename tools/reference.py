@@ -36,7 +36,7 @@ API: dict[str, tuple[str, ...]] = {
 SERVICES = {
     "/ctr/estimator/reset": (
         "std_srvs/srv/Trigger",
-        "Starts the estimator anew at the next complete joint state.",
+        "Reinitialises the estimator at the next complete joint state.",
     ),
     "/ctr/estimator/save_snapshot": (
         "std_srvs/srv/Trigger",
@@ -50,14 +50,14 @@ SERVICES = {
 
 # What names mean wherever they occur, unless the text says otherwise; vectors in `ctr_base`, N tubes, innermost first.
 GLOSSARY = {
-    "accepted": "whether a tracker sample was fused",
+    "accepted": "whether a tracker measurement was fused",
     "base_cells": "integration cells behind the base plate",
     "beta": "(N,) positions of the tubes' bases, m, zero or negative",
     "alpha": "(N,) actuator angles, rad",
     "content": "HTML of this package's own (`Markup`)",
     "data": "a serialised message (CDR with its encapsulation)",
-    "delay_s": "how long after its stamp a sample was taken in, s",
-    "dof": "degrees of freedom of a sample",
+    "delay_s": "time from the stamp of a measurement to its use, s",
+    "dof": "degrees of freedom of a measurement",
     "end_body": "body fixed to a tube's end: mass (kg), inertia (3,) (kg m^2)",
     "equilibrium": "an `Equilibrium` of the same model",
     "files": "MCAP files of a bag",
@@ -65,7 +65,7 @@ GLOSSARY = {
     "torque": "(3,) torque about tube 1's tip, N m",
     "frame_id": "frame of a message; `ctr_base`, or it is rejected",
     "guess": "(5 + N,) unknowns of the shooting to start from",
-    "innovations": "tracker samples processed in this step",
+    "innovations": "tracker measurements processed in this step",
     "malformed": "topic to number of messages that could not be decoded",
     "location_notes": "what was noticed while looking for the bag's files",
     "mesh": "sections and cells of the backbone",
@@ -81,14 +81,14 @@ GLOSSARY = {
     "position": "(3,) m",
     "quaternion_xyzw": "(4,) unit quaternion in ROS order",
     "progress": "called now and then with the fraction done",
-    "reason": "why not, in words; empty when all is well",
+    "reason": "why not, in words; empty when there is no problem",
     "recording": "what a simulation gave (`Recording`)",
     "robot": "a `Robot`",
     "scenario": "a `Scenario`",
     "solver": "work of the step's solver",
     "stamp_ns": "time stamp, ns",
     "tip_velocity_covariance": "(6, 6) of tip_velocity",
-    "tolerance": "largest scaled imbalance at the tip at which the shooting ends",
+    "tolerance": "largest scaled residual at the tip at which the shooting ends",
     "valid": "whether the outputs of the step can be used",
     "bag": "an opened `Bag`",
     "text": "plain text; it is escaped",
