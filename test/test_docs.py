@@ -163,8 +163,7 @@ def test_names_and_files_of_the_code_in_the_pages_exist(page):
         if re.fullmatch(r"[a-z_]+(\.\w+)+", name) and name.split(".")[0] in packages and name not in NOT_CODE:
             assert missing_part(name) == "", f"{page.name}: {span}"
         elif (
-            re.fullmatch(r"(ctr_dynamics|tools|test|studies|examples)/[\w/.]+", span)
-            and span not in NOT_CODE
+            re.fullmatch(r"(ctr_dynamics|tools|test|studies|examples)/[\w/.]+", span) and span not in NOT_CODE
         ):
             assert (ROOT / span).exists(), f"{page.name}: {span}"
 
