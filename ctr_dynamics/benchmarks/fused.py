@@ -65,7 +65,7 @@ def fused_replay(
         "bag": bag.name,
         "nodes": model.nodes,
         "rank": int(settings["filter.rank"]),
-        "columns": estimator.fusion.columns.rank,  # what the rank becomes when its last pack of lanes is filled
+        "columns": estimator.fusion.factor.rank,  # what the rank becomes when its last pack of lanes is filled
         "steps": steps,
         "realtime_ratio": steps * DT_NS * 1e-9 / wall,
         "tick_ms": {"p50": p50, "p99": p99, "p99.9": p999, "max": worst, "mean": float(ticks.mean())},

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ctr_dynamics.estimation.filter.ekf import Fusion
+from ctr_dynamics.estimation.filter.ekf import RodEkf
 from ctr_dynamics.kernels.filter_steps import backbone_rows, matrix
 from ctr_dynamics.model.mesh import node_points, node_positions
 from ctr_dynamics.model.model import Model
@@ -18,7 +18,7 @@ SHAPES = 8  # sections at a beta whose nodes are remembered
 class Backbone:
     """Makes the rows of the backbone of one estimator."""
 
-    def __init__(self, model: Model, fusion: Fusion) -> None:
+    def __init__(self, model: Model, fusion: RodEkf) -> None:
         self.model, self.fusion = model, fusion
         self._nodes: dict[tuple, tuple[Floats, NDArray[np.int64]]] = {}
 
@@ -35,10 +35,10 @@ class Backbone:
         s, points = self._nodes[key]
         rows = np.empty((len(state.nodes), 15), np.float32)
         fusion = self.fusion
-        inserted = fusion.inserted
+        inserted = fusion.insertion_fraction
         backbone_rows(
             s, state.nodes, state.fields, points, self.model.n, float(state.inputs.beta_rate[0]) * (1.0 - inserted),
-            fusion.tracker.rotation, fusion.bias, fusion.columns.position_deviation(fusion.pi), rows,
+            fusion.tracker.rotation, fusion.bias, fusion.factor.position_deviation(fusion.pi), rows,
         )  # fmt: skip
         rates = state.inputs.beta_rate
         if inserted and np.any(rates):

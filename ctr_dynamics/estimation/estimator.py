@@ -446,7 +446,7 @@ class Estimator:
             "problem": self.health.problem,
             "parameters": self.runs.parameters(),
             "tracker_bias": [float(x) for x in self.fusion.bias],
-            "tip_force_drive_N": self.fusion.drive.sigma,
+            "tip_force_drive_N": self.fusion.force_variance.sigma,
             "statuses": [
                 {"name": s.name, "level": s.level, "message": s.message, "values": s.values}
                 for s in self.health.statuses()

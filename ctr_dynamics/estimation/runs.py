@@ -12,8 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctr_dynamics.errors import InputError
-from ctr_dynamics.estimation.filter.ekf import Fusion, FusionOptions
-from ctr_dynamics.estimation.filter.tip_window import TipWindow
+from ctr_dynamics.estimation.filter.ekf import FilterOptions, FilterState, RodEkf
+from ctr_dynamics.estimation.filter.gating import GateOptions
+from ctr_dynamics.estimation.filter.tip_window import TipWindow, TipWindowState
 from ctr_dynamics.estimation.inputs.actuation import Actuation, Signals, standing
 from ctr_dynamics.estimation.inputs.input_buffer import DT_NS, InputBuffer, Sample, seconds
 from ctr_dynamics.estimation.monitoring.health import Health
@@ -38,8 +39,8 @@ class Kept:
     k: int
     fused: State
     alone: State
-    fusion: tuple
-    alone_tips: tuple
+    fusion: FilterState
+    alone_tips: TipWindowState
     taken: dict[int, int]
 
 
@@ -67,17 +68,17 @@ class Runs:
             translation=np.array(settings["tracker.registration_translation_m"]),
             mask=axes_mask(str(settings["tracker.axes"])),
         )
-        self.fusion = Fusion(
+        self.fusion = RodEkf(
             self.simulator,
             self.tracker,
-            FusionOptions(
+            FilterOptions(
                 rank=int(settings["filter.rank"]),
-                gate_probability=float(settings["filter.gate_probability"]),
                 force_sigma=float(settings["filter.tip_force_sigma_N"]),
                 force_sigma_max=float(settings["filter.tip_force_sigma_max_N"]),
                 force_change=float(settings["filter.tip_force_change_s"]),
                 force_time=float(settings["filter.tip_force_time_s"]),
                 window=float(settings["filter.window_s"]),
+                gate=GateOptions(probability=float(settings["filter.gate_probability"])),
             ),
         )
         rows = [input_row(model.tubes, i) for i in range(model.input_count)]
@@ -87,8 +88,6 @@ class Runs:
         self._load[3 * model.n : 3 * model.n + 3] = model.setup.tip_force
         # the model alone has no parameters
         self._bare = Actuation(self._signals, self._load, self._by_theta[:, :0].copy(), np.zeros(0))
-        if model.extended:
-            self.fusion.inserted = float(model.setup.block[model.layout["insertion"]][0])
         self.clear()
 
     def clear(self) -> None:
@@ -109,7 +108,7 @@ class Runs:
         t = seconds(k)
         self._signals.clear()
         self.fusion.forget_parameters()
-        self.fusion.refused = 0
+        self.fusion.gate.rejections = 0
         try:
             self.fused = self.simulator.rest(self._bare(t))
         except InputError as error:
@@ -156,11 +155,11 @@ class Runs:
         if result.substeps > 1:
             self.health.substeps += 1
         if track is not None:
-            self.fusion.follow(track.fusion, self.fused)
+            self.fusion.reuse_covariance(track.fusion, self.fused)
         else:
             due = self.inputs.due_samples(self.tracker, t) if fuse else []
             pause = self.inputs.covers_no_more(k)
-            if not self.fusion.predict(self.fused, result, t, sampled=bool(due), pause=pause):
+            if not self.fusion.propagate(self.fused, result, t, measured=bool(due), idle=pause):
                 self.health.note(
                     "tracker", "tangent", "the step could not be linearised; the covariance was held"
                 )
@@ -178,7 +177,7 @@ class Runs:
         if both is not None and both[0].ok and both[1].ok:
             assert self.fused is not None
             self._keep_alone_tip(t)
-            self.fusion.predict(self.fused, both[0], t)
+            self.fusion.propagate(self.fused, both[0], t)
             for sample, time_s, position in self.inputs.due_samples(self.tracker, math.inf)[:1]:
                 time_s = min(time_s, t + self.tracker.delay)
                 self._compare(time_s, position, sample.quaternion)
@@ -219,7 +218,7 @@ class Runs:
 
     def _keep_alone_tip(self, t: float) -> None:
         assert self.alone is not None
-        rate = float(self.alone.inputs.beta_rate[0]) * (1.0 - self.fusion.inserted)
+        rate = float(self.alone.inputs.beta_rate[0]) * (1.0 - self.fusion.insertion_fraction)
         self.alone_tips.append(t, self.alone.nodes[-1], self._no_columns, rate)
 
     def _fuse(self, k: int, due: list[tuple[Sample, float, Floats]]) -> None:
@@ -247,7 +246,7 @@ class Runs:
             self.health.measured(innovation)
             self.innovations.append(innovation)
         self.inputs.forget_samples(k)
-        self.health.force_sigma = self.fusion.drive.sigma
+        self.health.force_sigma = self.fusion.force_variance.sigma
 
     def _compare(
         self, time_s: float, position: Floats, quaternion: Floats
@@ -273,7 +272,7 @@ class Runs:
 
     def settle(self, k: int) -> None:
         """What the outputs of step ``k`` did not wait for; who returns to that step need not do it again."""
-        if self.fusion.settle() and self.kept[-1].k == k:
+        if self.fusion.add_noise_and_reduce() and self.kept[-1].k == k:
             self.keep(k)
 
     # -- states to return to --
@@ -297,8 +296,8 @@ class Runs:
             k,
             self.fused.copy(),
             self.alone.copy(),
-            self.fusion.snapshot(),
-            self.alone_tips.snapshot(),
+            self.fusion.checkpoint(),
+            self.alone_tips.checkpoint(),
             {s.stamp_ns: s.fused_k for s in self.inputs.samples if s.fused_k is not None},
         )
 
@@ -313,9 +312,9 @@ class Runs:
     def parameters(self) -> dict[str, Any]:
         """Values and deviations of what the filter estimates beside the state, for a file."""
         f = self.fusion
-        r = f.columns.theta.shape[1] if self.fused is not None else 0
+        r = f.factor.theta.shape[1] if self.fused is not None else 0
         deviation = (
-            np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", f.columns.theta, f.pi[:r, :r], f.columns.theta), 0.0))
+            np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", f.factor.theta, f.pi[:r, :r], f.factor.theta), 0.0))
             if r
             else None
         )

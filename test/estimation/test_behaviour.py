@@ -277,23 +277,22 @@ def test_rehearsed_steps_leave_no_trace(release, policy, tick):
     assert run.estimator.summary() == plain.estimator.summary()
 
 
-def test_what_is_settled_in_pauses_is_as_if_the_next_step_had_done_it(release):
+def test_a_reduction_in_idle_time_is_as_if_the_next_step_had_done_it(release):
     messages = [m for m in release if m.stamp <= 1.3e9]
-    settled = []
+    reduced = []
 
-    def pausing(made):
+    def idling(made):
         advance = made.advance
 
-        def paused(*arguments):
+        def then_idle(*arguments):
             steps = advance(*arguments)
-            settled.append(made.fusion._unsettled)
-            made.fusion.settle()
+            reduced.append(made.fusion.add_noise_and_reduce())
             return steps
 
-        made.advance = paused
+        made.advance = then_idle
 
-    run = play(messages, prepare=pausing)
-    assert sum(settled) > 5
+    run = play(messages, prepare=idling)
+    assert sum(reduced) > 5
     same_bytes(run, play(messages))
 
 
@@ -310,15 +309,16 @@ def test_the_last_step_that_a_joint_state_covers_is_known_before_it_comes():
 def test_reductions_follow_the_last_step_that_a_joint_state_covers(release):
     made = estimator()
     found = []
-    settle, inputs = made.fusion.settle, made.inputs
+    reduce, inputs = made.fusion.add_noise_and_reduce, made.inputs
 
     def noted():
-        if made.fusion._unsettled:
+        reduced = reduce()
+        if reduced:
             stamp = inputs.stamp(made.k - 1)
             found.append((made.k - 1, any(stamp <= s < stamp + DT_NS for s in inputs.joints.stamps)))
-        settle()
+        return reduced
 
-    made.fusion.settle = noted
+    made.fusion.add_noise_and_reduce = noted
     for message in sorted((m for m in release if m.stamp <= 1.3e9), key=lambda m: m.arrival):
         message.give(made)
         made.advance(START_NS + message.arrival)

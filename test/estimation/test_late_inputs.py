@@ -272,7 +272,7 @@ def test_a_way_back_begins_with_what_a_pause_has_settled(sweep):
     counts = []
 
     def with_pauses(made):
-        advance, reduce = made.advance, made.fusion._reduce
+        advance, energy = made.advance, made.fusion.factor.energy  # asked for once a reduction
 
         def paused(*arguments):
             steps = advance(*arguments)
@@ -282,9 +282,9 @@ def test_a_way_back_begins_with_what_a_pause_has_settled(sweep):
 
         def counted():
             counts[-1] += 1
-            reduce()
+            return energy()
 
-        made.advance, made.fusion._reduce = paused, counted
+        made.advance, made.fusion.factor.energy = paused, counted
 
     late = [m.late(0.001) if m.kind == "joints" else m for m in sweep]
     for policy in ("wait", "predict"):

@@ -29,25 +29,26 @@ def nearest(covariance, row, value):
 
 
 def test_a_parameter_at_the_end_of_its_range_takes_the_rest_along(fusion):
-    u, rows = fusion.uncertainty, fusion.columns.theta
+    u, rows = fusion.uncertainty, fusion.factor.theta
     r = rows.shape[1]
     i = parameter(fusion, "base_viscous")
     gain = fusion.pi[:, :r] @ rows[i]
     x = gain * (-3.0 / (rows[i] @ gain[:r]))  # three times less than nothing
     assert (fusion.theta + rows @ x[:r])[i] < u.lowest[i] - 1.0
-    kept = fusion._confined(x)
-    theta = fusion.theta + rows @ kept[:r]
+    moved = u.confined(x, fusion.theta, rows, fusion.pi)
+    theta = fusion.theta + rows @ moved[:r]
     assert theta[i] == pytest.approx(u.lowest[i], abs=1e-9)
     row = np.append(rows[i], np.zeros(len(x) - r))
     wanted = x + nearest(fusion.pi, row, u.lowest[i] - fusion.theta[i] - rows[i] @ x[:r])
-    np.testing.assert_allclose(kept, wanted, atol=1e-6 * np.abs(wanted).max())
+    np.testing.assert_allclose(moved, wanted, atol=1e-6 * np.abs(wanted).max())
     assert np.all(theta >= u.lowest - 1e-9)
     assert np.all(theta <= u.highest + 1e-9)
 
 
 def test_corrections_inside_the_ranges_are_left_alone(fusion):
     x = 0.1 * np.ones(len(fusion.pi))
-    np.testing.assert_array_equal(fusion._confined(x), x)
+    confined = fusion.uncertainty.confined(x, fusion.theta, fusion.factor.theta, fusion.pi)
+    np.testing.assert_array_equal(confined, x)
 
 
 def test_ranges_are_those_of_a_robot(fusion):

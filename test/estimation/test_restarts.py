@@ -51,7 +51,7 @@ def test_a_new_filter_begins_with_the_parameters_of_the_file(running):
             fusion.theta[0] = fusion.uncertainty.highest[0]
             fusion._apply_theta()
         fusion.start(state.copy(), t)
-        columns.append(fusion.columns.stored.copy())
+        columns.append(fusion.factor.stored.copy())
     np.testing.assert_array_equal(*columns)
 
 

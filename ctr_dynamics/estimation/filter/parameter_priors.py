@@ -1,7 +1,7 @@
 """What the robot file is unsure of: the parameters that the filter carries, with their deviations and their effect on the model.
 
-Model parameters and the unknown tip force move the fields and ride in the columns of the covariance; tracker errors (registration, lever arm,
-delay, drift) enter the measurement only and are states of their own.
+Model parameters and the unknown tip force move the fields and are rows of the covariance factor. Tracker errors (registration, lever arm, delay,
+drift) enter the measurement only and are states of their own.
 """
 
 from __future__ import annotations
@@ -10,12 +10,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ctr_dynamics.kernels.filter_steps import outside
 from ctr_dynamics.model.model import Model
 from ctr_dynamics.robot import Robot
 
 FORCE = ("tip_force.x", "tip_force.y", "tip_force.z")
 
-# Ranges that a robot can have: of relative changes of a quantity, from a tenth of it to ten times, and of angles in rad.
+# Ranges that a robot can have: of relative changes of a quantity, from a tenth of it to ten times, and of angles in rad (29 deg).
 RELATIVE, ANGLE = (-0.9, 9.0), (-0.5, 0.5)
 
 # Tracker states: name and number of axes, in their order in the filter.
@@ -34,9 +35,9 @@ class ModelUncertainty:
 
     Attributes:
         names: (n_theta,) names; the last three are the tip force's axes.
-        sigma: (n_theta,) prior deviations; 0 for the tip force, which the filter drives itself.
+        sigma: (n_theta,) prior deviations; 0 for the tip force, whose size the filter adapts.
         effect: (NP, n_theta) derivative of the parameter block.
-        lowest, highest: (n_theta,) range that a robot can have; without ends for the tip force.
+        lowest, highest: (n_theta,) range that a robot can have; unlimited for the tip force.
     """
 
     names: tuple[str, ...]
@@ -49,6 +50,34 @@ class ModelUncertainty:
     def force(self) -> slice:
         """Rows of the tip force among the parameters."""
         return slice(len(self.names) - 3, len(self.names))
+
+    def confined(self, x: np.ndarray, theta: np.ndarray, rows: np.ndarray, pi: np.ndarray) -> np.ndarray:
+        """The correction ``x`` (r + 13,), changed where it would move a parameter out of its range.
+
+        It is moved along the covariance until that parameter is at the range's end. All else then takes its most likely value beside it
+        (Simon 2010, projection of the estimate).
+
+        Args:
+            x: of the coefficients and the tracker states.
+            theta: (p,) parameters before the correction.
+            rows: (p, r) their rows of the covariance factor.
+            pi: (r + 13, r + 13) covariance of what ``x`` corrects.
+        """
+        r = rows.shape[1]
+        if not outside(theta, rows, x[:r], self.lowest, self.highest):
+            return x
+        for _ in range(len(self.names)):
+            moved = theta + rows @ x[:r]
+            excess = np.clip(moved, self.lowest, self.highest) - moved
+            if not excess.any():
+                break
+            i = int(np.argmax(np.abs(excess) / np.maximum(self.sigma, 1e-300)))
+            gain = pi[:, :r] @ rows[i]
+            variance = float(rows[i] @ gain[:r])
+            if variance <= 1e-12 * self.sigma[i] ** 2:
+                break
+            x = x + gain * (excess[i] / variance)
+        return x
 
 
 def model_uncertainty(model: Model) -> ModelUncertainty:

@@ -1,10 +1,8 @@
-"""How strongly the unknown tip force is driven: a distribution over its size, from how large the innovations are (docs/filter.md).
+"""Process noise: the unknown tip force and the tracker's drift decay (Gauss-Markov) and get new randomness.
 
-With the gains that the filter has used, its covariance is affine in the force's variance: P = F + c D, where F comes from the prior, the other
-noise and the readings' noise, D from the force's randomness, and c is the variance by the one assumed so far. D goes through the filter beside P. So
-what an innovation's covariance would be with any other variance is known, S(c) = S + (c - 1) H D H^T, and with it the likelihood of that variance.
-The variance is taken from a grid and changes now and then to one drawn from its prior: a filter for a hidden Markov chain (Rabiner 1989).
-The drive is the mean variance, and P is at once what it would be had that been the drive all along.
+With the time constant T and n steps of dt, a state x of stationary variance s^2 becomes d x + w, with d = exp(-n dt / T) and
+var w = (1 - d^2) s^2. The tip force moves the fields, so its randomness is appended to the covariance factor as columns of its own. The drift is
+a tracker state.
 """
 
 from __future__ import annotations
@@ -13,121 +11,71 @@ import math
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg.lapack import dsygvd
+
+from ctr_dynamics.estimation.filter.covariance_factor import CovarianceFactor
+from ctr_dynamics.estimation.filter.factor_reduction import APPENDED
+from ctr_dynamics.estimation.filter.force_variance import ForceVariance
+from ctr_dynamics.kernels.filter_steps import fade
+from ctr_dynamics.robot import Robot
+from ctr_dynamics.sensing.tracker import DRIFT, STATES
 
 Floats = NDArray[np.float64]
 
-MOST = 10.0  # times the variance, at one sample, up or down: what else the model misses looks like a force at its first sample
-RAISED = 1000.0  # times the variance, at one sample, where readings in a row have been outside the gate
-SHORTEST = (
-    1e-3  # s between two samples, or a late one and its predecessor: no size is ever out of the question
-)
-SPACING = 0.5  # of the grid, in the logarithm of the variance: less than one innovation can tell apart
 
+class ProcessNoise:
+    """Process noise of one filter.
 
-class ForceDrive:
-    """Distribution of the unknown tip force's variance.
-
-    Attributes:
-        part: (n, n) what of the filter's covariance is in proportion to that variance.
-        share: largest part of an innovation's variance that the force had at the last sample, 0 to 1, along any direction.
-        grid: (m,) logarithms of the variances (N^2) between ``least``^2 and ``most``^2; prior, weights: (m,) their probabilities. A variance
-            ten times as large is a tenth as likely before anything is measured.
+    Args:
+        robot: with the tracker's drift.
+        dt: s, one step.
+        force_rows: rows of the tip force among the uncertain parameters.
+        force_time: s, time constant of the tip force.
+        force_variance: distribution of its variance.
     """
 
-    def __init__(self, least: float, most: float, change_s: float) -> None:
-        """Deviations ``least`` to ``most`` (N per axis); ``change_s``: mean time between two changes, s."""
-        low, high = 2.0 * math.log(least), 2.0 * math.log(most)
-        self.grid = np.linspace(low, high, max(1, math.ceil((high - low) / SPACING) + 1))
-        prior = np.exp(low - self.grid)
-        self.prior: Floats = prior / prior.sum()
-        self.change_s = change_s
-        self.part = np.zeros((0, 0))
-        self.weights = self.prior
-        self.sigma = least  # N per axis
-        self.share = 0.0
-        self._stamp = -math.inf
+    def __init__(
+        self, robot: Robot, dt: float, force_rows: slice, force_time: float, force_variance: ForceVariance
+    ) -> None:
+        self._noise, self.dt = robot.tracker.noise, dt
+        self._rows, self._time = force_rows, force_time
+        self.force_variance = force_variance
+        self._decay = math.exp(-dt / force_time)
 
-    def start(self, pi: Floats, force: slice) -> None:
-        """Begin with the least deviation, which coefficients ``force`` of the covariance ``pi`` hold."""
-        self.part = np.zeros_like(pi)
-        self.part[force, force] = pi[force, force]
-        self.weights = self.prior
-        self.sigma, self.share, self._stamp = math.exp(0.5 * self.grid[0]), 0.0, -math.inf
+    def decay_force(self, theta: Floats, factor: CovarianceFactor) -> None:
+        """The tip force of the parameters ``theta`` (p,) and its rows of the factor decay over one step, in place."""
+        fade(self._decay, theta[self._rows], factor.theta[self._rows])
 
-    def append(self, at: int, count: int, variance: float) -> None:
-        """New randomness of the force: ``count`` coefficients of ``variance`` before the coefficient ``at``."""
-        n = len(self.part)
-        old = np.r_[:at, at + count : n + count]
-        part = np.zeros((n + count, n + count))
-        part[np.ix_(old, old)] = self.part
-        np.fill_diagonal(part[at : at + count, at : at + count], variance)
-        self.part = part
+    def add(self, steps: int, pi: Floats, bias: Floats, factor: CovarianceFactor) -> Floats:
+        """Process noise of the last ``steps`` steps.
 
-    def fade(self, rows: slice, decay: float) -> None:
-        """States ``rows`` have decayed."""
-        self.part[rows, :] *= decay
-        self.part[:, rows] *= decay
-
-    def keep(self, kept: Floats) -> None:
-        """The first r coefficients a have become ``kept`` (k, r) a."""
-        k, r = kept.shape
-        old, n = self.part, k + len(self.part) - r
-        part = np.empty((n, n))
-        part[:k, :k] = kept @ old[:r, :r] @ kept.T
-        part[:k, k:] = kept @ old[:r, r:]
-        part[k:, :k] = part[:k, k:].T
-        part[k:, k:] = old[r:, r:]
-        self.part = part
-
-    def learn(self, stamp: float, nu: Floats, H: Floats, S: Floats) -> Floats:
-        """Take in an innovation ``nu`` (k,) of derivative ``H`` (k, n) and covariance ``S`` (k, k), of time ``stamp`` (s).
-
-        Returns the change (n, n) that the new drive makes of the filter's covariance.
+        The tracker states ``bias`` (13,) and the covariance ``pi`` (r + 13, r + 13) change in place. The factor gets a column for each axis of
+        the force, and the covariance with them is returned.
         """
-        share, axes, failed = dsygvd(H @ self.part @ H.T, S)
-        if failed:
-            return np.zeros_like(self.part)
-        share = np.clip(share, 0.0, 1.0)
-        squares = (axes.T @ nu) ** 2  # in directions where S is 1 and the force's part of it the share
-        by_size = np.exp(self.grid - 2.0 * math.log(self.sigma))
-        size = np.maximum(1.0 + np.multiply.outer(by_size - 1.0, share), 1e-9)
-        likelihood = -0.5 * (np.log(size) + squares / size).sum(axis=1)
-        changed = -math.expm1(-max(SHORTEST, stamp - self._stamp) / self.change_s)
-        self._stamp = max(stamp, self._stamp)
-        weights = (1.0 - changed) * self.weights + changed * self.prior
-        weights *= np.exp(likelihood - likelihood.max())
-        self.weights = weights / weights.sum()
-        c = min(max(float(self.weights @ by_size), 1.0 / MOST), MOST)
-        largest = float(share.max())
-        self.share = c * largest / (1.0 + (c - 1.0) * largest)
-        more = (c - 1.0) * self.part
-        self.scale(c)
-        return more
+        self._drift(steps, pi, bias, factor)
+        return self._force(steps, pi, factor)
 
-    @property
-    def headroom(self) -> float:
-        """By how much the variance may grow where the filter has lost the robot."""
-        return min(RAISED, math.exp(self.grid[-1]) / self.sigma**2)
+    def _drift(self, steps: int, pi: Floats, bias: Floats, factor: CovarianceFactor) -> None:
+        decay = math.exp(-steps * self.dt / self._noise.drift_time.value)
+        r = factor.theta.shape[1]
+        rows = slice(r + DRIFT.start, r + DRIFT.stop)
+        bias[DRIFT] *= decay
+        pi[rows, :] *= decay
+        pi[:, rows] *= decay
+        pi[rows, rows] += np.eye(3) * ((1 - decay**2) * self._noise.drift.value**2)
+        self.force_variance.decay(rows, decay)
 
-    def scale(self, c: float, wider: Floats | None = None) -> None:
-        """Have ``c`` times the variance, in the past too; ``wider`` (n,): deviations of the coefficients by what they were."""
-        self.sigma *= math.sqrt(c)
-        self.part = c * self.part
-        if wider is not None:
-            self.part *= np.multiply.outer(wider, wider)
-
-    def corrected(self, K: Floats, H: Floats) -> None:
-        """A reading has been fused with gain ``K`` (n, k)."""
-        left = np.eye(len(K)) - K @ H
-        part = left @ self.part @ left.T
-        self.part = 0.5 * (part + part.T)
-
-    def snapshot(self) -> tuple:
-        """What :meth:`restore` returns to. Nothing in it is written to later."""
-        return self.part.copy(), self.weights, self.sigma, self.share, self._stamp
-
-    def restore(self, snapshot: tuple) -> None:
-        """Return to a snapshot."""
-        part, self.weights, self.sigma, self.share, self._stamp = snapshot
-        self.part = part.copy()
+    def _force(self, steps: int, pi: Floats, factor: CovarianceFactor) -> Floats:
+        """The new columns move nothing but the force so far; their coefficients have the variance 1 - d^2."""
+        decay2 = math.exp(-2 * steps * self.dt / self._time)
+        r = factor.theta.shape[1]
+        wide = r + APPENDED
+        theta = np.zeros((len(factor.theta), wide))
+        theta[:, :r] = factor.theta
+        theta[self._rows, r:] = self.force_variance.sigma * np.eye(3)
+        factor.theta = theta
+        wider = np.zeros((wide + STATES, wide + STATES))
+        wider[:r, :r], wider[:r, wide:] = pi[:r, :r], pi[:r, r:]
+        wider[wide:, :r], wider[wide:, wide:] = pi[r:, :r], pi[r:, r:]
+        np.fill_diagonal(wider[r:wide, r:wide], 1.0 - decay2)
+        self.force_variance.append(r, APPENDED, 1.0 - decay2)
+        return wider

@@ -1,4 +1,8 @@
-"""Tip kinematics: pose and twist of tube 1's end in ``ctr_base``, and how they follow from node states and their columns."""
+"""The tips of the last steps: pose and twist of tube 1's end in ``ctr_base``, with their rows of the covariance factor.
+
+A delayed measurement is compared with the tip of its own time. All stored tips are in the same coefficients, so that its innovation also corrects
+the present.
+"""
 
 from __future__ import annotations
 
@@ -7,19 +11,20 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ctr_dynamics.estimation.filter.reduction import Change
+from ctr_dynamics.estimation.filter.factor_reduction import BasisChange
 from ctr_dynamics.kernels.filter_steps import interpolate_columns, shift_tips, tip_between, tip_rows
 
 Floats = NDArray[np.float64]
 
 
 class Tip(NamedTuple):
-    """Pose and twist in ``ctr_base`` at one time, with columns of their first variation.
+    """Pose and twist in ``ctr_base`` at one time, with the first variation by the coefficients of the covariance factor.
 
     Attributes:
+        stamp: s from the first step.
         mean: (13,) position, quaternion, velocity and rate in one vector, of which these are parts:
         position (3,) m, quaternion (4,) wxyz, velocity (3,) m/s (insertion included), rate (3,) rad/s (base axes).
-        columns: (12, r): position, rotation vector (base axes), velocity, angular velocity for every column of the covariance.
+        columns: (12, r): position, rotation vector (base axes), velocity, angular velocity by every coefficient.
     """
 
     stamp: float
@@ -43,15 +48,29 @@ class Tip(NamedTuple):
         return self.mean[10:13]
 
 
-class TipWindow:
-    """The tips of the last steps with their columns, so that a late sample is compared with the tip of its own time.
+class TipWindowState(NamedTuple):
+    """What a checkpoint stores of a :class:`TipWindow`.
 
-    Rows lie one after the other in arrays with room for more, so that a snapshot holds references and not copies: later steps write behind what
-    it sees. Where room ends, the window moves to new arrays.
+    Attributes:
+        end: number of rows. stamps, means: of the window, copies. columns: the array itself, ``recent``: a copy of its last rows.
     """
 
-    MORE = 64  # rows of room
-    OPEN = 3  # newest rows whose columns may change yet
+    end: int
+    stamps: Floats
+    means: Floats
+    columns: Floats
+    recent: Floats
+
+
+class TipWindow:
+    """The tips of the last ``steps`` steps.
+
+    Rows lie one after the other in arrays with room for more, so that a checkpoint holds references and not copies: later steps write behind
+    what it sees. Where the room ends, the window moves to new arrays.
+    """
+
+    MORE = 64  # rows of room: the window is then moved every 0.2 s
+    OPEN = 3  # newest rows whose columns may change yet: the factor skips two steps at most
 
     def __init__(self, steps: int) -> None:
         self.size = steps
@@ -60,9 +79,9 @@ class TipWindow:
     def clear(self, columns: int) -> None:
         """Forget all tips; further ones have ``columns`` columns."""
         self.end = 0
-        self._rooms(columns)
+        self._allocate(columns)
 
-    def _rooms(self, columns: int) -> None:
+    def _allocate(self, columns: int) -> None:
         room = self.size + self.MORE
         self.stamps = np.zeros(room)
         self.means = np.zeros((room, 13))  # position, quaternion, velocity, rate
@@ -74,11 +93,17 @@ class TipWindow:
         return max(0, self.end - self.size)
 
     def append(self, stamp: float, node: Floats, dnode: Floats, insertion_rate: float) -> None:
-        """Add the tip of the last node's state (S,) with columns (S, r); the oldest goes when the window is full. Rate d beta_1 / dt in m/s."""
+        """Add the tip of the time ``stamp`` (s); the oldest is dropped when the window is full.
+
+        Args:
+            stamp: s from the first step.
+            node, dnode: the last node's state (S,) and its rows (S, r) of the covariance factor.
+            insertion_rate: m/s, what of d beta_1 / dt the state's velocity does not hold.
+        """
         if self.end == len(self.stamps):
-            keep = slice(self.end - self.size, self.end)
-            old = self.stamps[keep], self.means[keep], self.columns[keep]
-            self._rooms(self.columns.shape[2])
+            window = slice(self.end - self.size, self.end)
+            old = self.stamps[window], self.means[window], self.columns[window]
+            self._allocate(self.columns.shape[2])
             self.end = self.size
             self.stamps[: self.end], self.means[: self.end], self.columns[: self.end] = old
         i = self.end
@@ -93,7 +118,7 @@ class TipWindow:
         return Tip(self.stamps[i], self.means[i], self.columns[i])
 
     def at(self, time: float, dt: float, columns: bool = True) -> Tip | None:
-        """Tip at ``time`` (s), at most one step ``dt`` ahead of the newest, if asked for with its columns; None outside the window."""
+        """Tip at ``time`` (s), at most one step ``dt`` (s) ahead of the newest; with its columns if asked for. None outside the window."""
         if not self.end:
             return None
         begin = self.begin
@@ -117,7 +142,7 @@ class TipWindow:
         if self.end >= count + 2:
             interpolate_columns(self.columns[self.end - 2 - count : self.end], count)
 
-    def change(self, change: Change, size: int) -> None:
+    def change_basis(self, change: BasisChange, size: int) -> None:
         """Go over to ``size`` other coefficients; columns that have been appended since do not move the past."""
         old = self.columns
         self.columns = np.empty((len(self.stamps), 12, size))
@@ -125,26 +150,31 @@ class TipWindow:
         change(old.reshape(-1, old.shape[2])[rows], self.columns.reshape(-1, size)[rows])
 
     def shift(self, a: Floats) -> None:
-        """Move every kept tip by the columns times ``a`` (r,)."""
+        """Move every tip by its columns times the coefficients ``a`` (r,)."""
         shift_tips(self.columns[self.begin : self.end], a, self.means[self.begin : self.end])
 
-    def snapshot(self) -> tuple:
-        """What :meth:`restore` needs. The last rows of columns may change yet (:meth:`interpolate`), the means with every correction."""
+    def checkpoint(self) -> TipWindowState:
+        """What :meth:`restore` returns to. The last rows of columns may change yet (:meth:`interpolate`), the means with every correction."""
         recent = self.columns[max(0, self.end - self.OPEN) : self.end].copy()
         rows = slice(self.begin, self.end)
-        return self.end, self.stamps[rows].copy(), self.means[rows].copy(), self.columns, recent
+        return TipWindowState(
+            self.end, self.stamps[rows].copy(), self.means[rows].copy(), self.columns, recent
+        )
 
-    def restore(self, snapshot: tuple) -> None:
-        """Go back to an earlier snapshot."""
-        self.end, stamps, means, self.columns, recent = snapshot
+    def restore(self, state: TipWindowState) -> None:
+        """Return to a checkpoint."""
+        self.end, self.columns = state.end, state.columns
         rows = slice(self.begin, self.end)
-        self.stamps[rows], self.means[rows] = stamps, means
-        self.columns[self.end - len(recent) : self.end] = recent
+        self.stamps[rows], self.means[rows] = state.stamps, state.means
+        self.columns[self.end - len(state.recent) : self.end] = state.recent
 
-    def follow(self, snapshot: tuple, node: Floats, insertion_rate: float) -> None:
-        """Take the columns of ``snapshot``, which is one step ahead, with the own means, and as the newest tip the last node's state (S,)."""
+    def reuse_covariance(self, state: TipWindowState, node: Floats, insertion_rate: float) -> None:
+        """Take the columns of ``state``, which is one step ahead, and keep the own means.
+
+        The newest tip is that of the last node's state ``node`` (S,); see :meth:`append`.
+        """
         own = self.means[self.begin : self.end].copy()
-        self.restore(snapshot)
+        self.restore(state)
         i = self.end - 1
         count = min(len(own), i - self.begin)
         if count:

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from ctr_dynamics.estimation.filter import reduction
-from ctr_dynamics.estimation.filter.reduction import APPENDED, principal, reduced
+from ctr_dynamics.estimation.filter import factor_reduction
+from ctr_dynamics.estimation.filter.factor_reduction import APPENDED, principal, reduced
 from ctr_dynamics.kernels import covariance_reduction as reduction_kernels
 
 RANK, OTHERS, ROWS = 9, 4, 40
@@ -56,7 +56,7 @@ def test_what_is_left_is_the_covariance_of_the_principal_columns(way, seed):
 def test_columns_are_eliminated_where_the_covariance_is_regular_and_principal_where_not(monkeypatch):
     used = []
     monkeypatch.setattr(
-        reduction, "without", lambda *a: used.append(1) or reduction_kernels.without.py_func(*a)
+        factor_reduction, "without", lambda *a: used.append(1) or reduction_kernels.without.py_func(*a)
     )
     V, pi, weights = case(1)
     gram = V.T @ (weights[:, None] * V)

@@ -1,4 +1,4 @@
-"""Tip kinematics, the window of kept tips, and the tracker's sensitivities against finite differences."""
+"""Tip kinematics, the window of the last tips, and the tracker's sensitivities against finite differences."""
 
 import copy
 from dataclasses import replace
@@ -8,7 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from tracker_twin import expected, residual
 
-from ctr_dynamics.estimation.filter.reduction import through
+from ctr_dynamics.estimation.filter.factor_reduction import through
 from ctr_dynamics.estimation.filter.tip_window import Tip, TipWindow, tip_rows
 from ctr_dynamics.kernels.rotations import conjugate, from_vector, matrix, multiply, to_vector
 from ctr_dynamics.kernels.tracker_measurement import fused_tip
@@ -291,7 +291,7 @@ def test_shift_moves_every_kept_tip_along_its_columns():
     for i in range(6):
         window.append(i * DT, node_at(i * DT), RNG.normal(size=(22, 3)), 0.0)
     a = 1e-4 * RNG.normal(size=3)
-    before = window.snapshot()
+    before = window.checkpoint()
     old = [window.at(i * DT, DT) for i in range(2, 6)]
     window.shift(a)
     for i, was in zip(range(2, 6), old, strict=True):
@@ -311,7 +311,7 @@ def test_window_follows_changes_of_the_columns():
     window.append(0.0, node_at(0.0), change, 0.0)
     columns = window.last.columns.copy()
     T = RNG.normal(size=(3, 2))  # the third column has been appended since: it does not move this tip
-    window.change(through(T), 2)
+    window.change_basis(through(T), 2)
     assert np.allclose(window.last.columns, np.c_[columns, np.zeros(12)] @ T)
 
 
@@ -325,12 +325,14 @@ def test_steps_without_columns_of_their_own_get_those_between_their_neighbours(c
     older = window.columns[: window.end - 2 - count].copy()
     window.interpolate(count)
     for i in range(1, count + 1):
-        share = i / (count + 1)
-        assert np.allclose(window.columns[window.end - 2 - count + i], (1 - share) * first + share * last)
+        fraction = i / (count + 1)
+        assert np.allclose(
+            window.columns[window.end - 2 - count + i], (1 - fraction) * first + fraction * last
+        )
     assert np.array_equal(window.columns[: len(older)], older)
 
 
-def test_snapshots_by_reference_are_as_good_as_copies():
+def test_checkpoints_by_reference_are_as_good_as_copies():
     """Going back and forth past the end of the room, with columns reduced, interpolated and shifted on the way."""
     rng, step = np.random.default_rng(4), 0.003
     window = TipWindow(6)
@@ -348,25 +350,25 @@ def test_snapshots_by_reference_are_as_good_as_copies():
             window.append(step * k, node_at(step * k), rng.normal(size=(22, COLUMNS)), 0.0)
             k += 1
             window.interpolate(int(rng.integers(window.OPEN)))
-            kept.append((k, window.snapshot(), copy.deepcopy(window)))
+            kept.append((k, window.checkpoint(), copy.deepcopy(window)))
         elif action == "reduce" and k:
-            window.change(through(rng.normal(size=(COLUMNS + 3, COLUMNS))), COLUMNS)
+            window.change_basis(through(rng.normal(size=(COLUMNS + 3, COLUMNS))), COLUMNS)
         elif action == "shift" and k:
             window.shift(1e-3 * rng.normal(size=COLUMNS))
         elif action == "back" and len(kept) > 5:
             del kept[-int(rng.integers(1, 5)) :]
-            k, snapshot, copied = kept[-1]
-            window.restore(snapshot)
+            k, stored, copied = kept[-1]
+            window.restore(stored)
             for a, b in zip(seen(window), seen(copied), strict=True):
                 np.testing.assert_array_equal(a, b)
     assert k > 100  # the room ended at least once
 
 
-def test_window_follows_columns_of_another_course_around_its_own_tips():
+def test_a_reused_covariance_lies_around_the_windows_own_tips():
     there, here = filled(DT * np.arange(10)), filled(DT * np.arange(9))
     here.means[: here.end, 0] += 0.5
     node = node_at(DT * 9.0) + np.eye(22)[1]
-    here.follow(there.snapshot(), node, 0.0)
+    here.reuse_covariance(there.checkpoint(), node, 0.0)
     assert (here.end, here.last.stamp) == (10, there.last.stamp)
     np.testing.assert_array_equal(here.columns, there.columns)
     np.testing.assert_allclose(here.means[:9, 0], there.means[:9, 0] + 0.5)
