@@ -7,7 +7,7 @@ class InputError(ValueError):
     """An argument, file or parameter that cannot be used.
 
     The message is one line and says what is wrong, the value, the limit with its unit, and what to do.
-    Commands print it on stderr and end with exit code 2; the node refuses to start or to take the value.
+    Commands print it on stderr and end with exit code 2; the node does not start, or rejects the value.
 
     Args:
         what: what is wrong, in one sentence without a full stop at its end; line breaks become blanks.

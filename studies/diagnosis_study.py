@@ -240,7 +240,7 @@ def table(rows: list[dict[str, Any]]) -> list[tuple[str, str, str]]:
             share([r["verdict"] == "unknown" or "unknown" in named(r) for r in by.get("outside", [])]),
         ),
         ("causes of probability >= 0.95 that are right", ">= 93 %", share(given)),
-        ("something hidden: likeliest explanation right where it has >= 0.95", "-", share(right_sure)),
+        ("something hidden: likeliest hypothesis right where it has >= 0.95", "-", share(right_sure)),
         (
             "not excited called so",
             "-",

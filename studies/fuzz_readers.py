@@ -2,7 +2,7 @@
 
     python -m studies.fuzz_readers --files 10000 --output fuzz.json
 
-A reader may take a damaged file or refuse it with one line (InputError, or CdrError for a message); anything else, more than `LIMIT_S` for one
+A reader may take a damaged file or reject it with one line (InputError, or CdrError for a message); anything else, more than `LIMIT_S` for one
 file, or more memory than `MEMORY_BYTES` is a failure. Files are read in child processes, so that a crash of the interpreter is counted too. A seed
 and a number name a file; `--only N` reads that one again and shows the traceback. Exit code 1 when anything failed.
 """
@@ -195,7 +195,7 @@ def _alarm(number: int, frame: Any) -> None:
 
 
 def read_one(number: int, seed: int, kinds: dict, folder: Path) -> tuple[str, str, str]:
-    """Kind, outcome (taken, refused, failed, too long, memory) and what was said of one file."""
+    """Kind, outcome (taken, rejected, failed, too long, memory) and what was said of one file."""
     dice = random.Random(f"{seed}/{number}")
     kind = dice.choices(list(SHARE), list(SHARE.values()))[0]
     files, suffix, reader = kinds[kind]
@@ -207,7 +207,7 @@ def read_one(number: int, seed: int, kinds: dict, folder: Path) -> tuple[str, st
         return kind, "taken", ""
     except InputError as error:
         text = str(error)
-        return kind, ("refused" if "\n" not in text and len(text) < 4000 else "failed"), text
+        return kind, ("rejected" if "\n" not in text and len(text) < 4000 else "failed"), text
     except TookTooLong:
         return kind, "too long", ""
     except MemoryError:
@@ -234,7 +234,7 @@ def work(first: int, count: int, seed: int) -> None:
                 "outcome": outcome,
                 "seconds": round(time.perf_counter() - begin, 4),
             }
-            if outcome not in ("taken", "refused"):
+            if outcome not in ("taken", "rejected"):
                 line["text"] = text
             line["peak_bytes"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
             print(json.dumps(line), flush=True)

@@ -1,7 +1,7 @@
 """Punctuality of the estimator node over real DDS: steps published late, how late, and none skipped.
 
 The estimator and a driver run as two processes of this machine; nobody but this script's own listener (with
---listen) hears the outputs. Bags are played one after the other, each run with a fresh estimator, until the
+--listen) receives the outputs. Bags are played one after the other, each run with a fresh estimator, until the
 asked time has been played. Figures go to standard output as JSON. Beside them stands the machine's own
 punctuality: how often a thread of this script that does nothing but sleep until the next 3 ms is as late, and
 for how long a virtual machine's processors were given to others.
@@ -127,7 +127,7 @@ def main() -> int:
     parser.add_argument("--policy", choices=("predict", "wait"), default="predict")
     parser.add_argument("--robot", default="till2020_tissue")
     parser.add_argument("--nodes", type=int, default=None, help="model.nodes")
-    parser.add_argument("--record", action="store_true", help="let the node record what it hears and says")
+    parser.add_argument("--record", action="store_true", help="let the node record its inputs and outputs")
     parser.add_argument("--listen", action="store_true", help="subscribe to every output meanwhile")
     options = parser.parse_args()
     runs: list[dict[str, Any]] = []

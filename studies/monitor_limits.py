@@ -3,7 +3,7 @@
     python -m studies.monitor_limits --hours 1000
 
 For each statistic: alarms per ten hours at the default limit and the limit that is passed once in ten hours. Alarms are separated by at least
-a window; the CUSUM starts anew after each.
+a window; the CUSUM begins at zero after each.
 """
 
 from __future__ import annotations

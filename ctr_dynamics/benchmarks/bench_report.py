@@ -48,7 +48,7 @@ def text(result: Result) -> str:
     ]
     lines += [
         "",
-        "replay with fusion and the model alone beside it",
+        "replay with fusion and the open loop beside it",
         "nodes  rank  columns  times real time  p50 (ms)  p99 (ms)  p99.9 (ms)  max (ms)",
     ]
     for r in [*result["replay"], *result["rank"]]:

@@ -80,7 +80,7 @@ class _Shooting:
         section_lengths(self.mesh.bp_tube, self.mesh.bp_offset, first.beta, self.seclen)
         self.inverse: Floats | None = None
 
-    def imbalance(self, c0: float, x: Floats) -> Floats:
+    def residual(self, c0: float, x: Floats) -> Floats:
         euler_sweep(
             self.model.tubes, self.W, c0, self.mesh, self.par, self.seclen, x, self.hist, self.histb, self.out, self.outb, self.nodes, self.res,
         )  # fmt: skip
@@ -104,18 +104,18 @@ class _Shooting:
             size = np.abs(res / self.model.scale).max()
             return float(size) if np.isfinite(size) else np.inf
 
-        res = self.imbalance(c0, self.x)
+        res = self.residual(c0, self.x)
         size, share, newest = size_of(res), 1.0, False
         for _ in range(LIMIT):
             if size <= TOLERANCE:
                 return True
             if self.inverse is None:
                 steps = np.diag(self.model.step)
-                columns = [(self.imbalance(c0, self.x + step) - res) / step.sum() for step in steps]
+                columns = [(self.residual(c0, self.x + step) - res) / step.sum() for step in steps]
                 self.inverse = np.ascontiguousarray(np.linalg.inv(np.stack(columns, axis=1)))
                 newest = True
             dx = -share * self.inverse @ res
-            new = self.imbalance(c0, self.x + dx)
+            new = self.residual(c0, self.x + dx)
             reached = size_of(new)
             if reached < size:
                 broyden(self.inverse, dx, new - res, np.empty((2, len(dx))))

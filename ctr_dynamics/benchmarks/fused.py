@@ -17,7 +17,7 @@ from ctr_dynamics.parameters import Settings
 from ctr_dynamics.robot_files import load_robot
 from ctr_dynamics.runtime.garbage_collection import seldom_collected
 from ctr_dynamics.runtime.replay import Player
-from ctr_dynamics.runtime.warm_up import rehearse
+from ctr_dynamics.runtime.warm_up import warm_up
 
 EDGES_MS = tuple(float(x) for x in np.round(np.geomspace(0.1, 30.0, 51), 4))
 
@@ -45,7 +45,7 @@ def fused_replay(
         values["filter.rank"] = rank
     settings, robot = Settings(values), load_robot(robot_name)
     opened = open_bag(bag)
-    rehearse(robot, settings)  # as the node does before its first message
+    warm_up(robot, settings)  # as the node does before its first message
     most = None if seconds is None else round(seconds * 1e9) // DT_NS
     wall = np.inf
     for _ in range(rounds):

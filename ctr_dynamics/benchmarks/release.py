@@ -120,7 +120,7 @@ def sampled(test: Release, dt: float, duration: float, turn: Floats | None = Non
             )
         return known[key]
 
-    # as many as a run takes, or it would sample the last ones anew
+    # as many as a run takes, or it would sample the last ones again
     count = int(np.floor(duration / dt + 1e-9))
     for first in range(0, count, trajectory.CHUNK):
         steps = np.arange(first, min(first + trajectory.CHUNK, count))

@@ -104,16 +104,18 @@ def demo(
     record(output / "outputs.mcap", listener)
     bag_start_ns = min(decode_stamp(m.data) for m in messages if m.topic == topics.JOINT_STATES)
     start_ns = bag_start_ns + shift["shift_ns"]
-    alone = live_report.trace_of(heard[topics.TIP_POSE_PREDICTED], start_ns)
+    open_loop = live_report.trace_of(heard[topics.TIP_POSE_PREDICTED], start_ns)
     fused = live_report.trace_of(heard[topics.TIP_POSE], start_ns)
     tracker = live_report.tracker_of(bag, bag_start_ns, nominal)
-    comparisons = live_report.comparisons(tracker, candidates, alone, fused)
+    comparisons = live_report.comparisons(tracker, candidates, open_loop, fused)
     if not comparisons:
         console.print("neither tracker poses nor a truth fall into the run: nothing to compare it with")
     show(console, comparisons, timing, len(fused.t))
     shapes = live_report.backbones(heard[topics.BACKBONE_STATE], start_ns, 8)
-    live_report.draw(output / "demo.png", shapes, alone, fused, tracker, f"{bag.name}, robot {robot}, live")
-    figures = {"comparisons": [vars(c) for c in comparisons], "timing": timing, "driver": shift}
+    live_report.draw(
+        output / "demo.png", shapes, open_loop, fused, tracker, f"{bag.name}, robot {robot}, live"
+    )
+    figures = {"comparisons": [c.as_json() for c in comparisons], "timing": timing, "driver": shift}
     with atomic_file(output / "demo.json") as part:
         part.write_text(json.dumps(figures, indent=1), encoding="utf-8")
     console.print(f"picture, figures and recorded outputs are in {output}")
@@ -164,9 +166,11 @@ def show(
         for c in comparisons:
             errors.add_column(f"{c.reference}: rms", justify="right")
             errors.add_column("max", justify="right")
-        for run in ("alone", "fused"):
+        for run in ("open_loop", "fused"):
             values = [getattr(c, f"{run}_{kind}") for c in comparisons for kind in ("rms", "max")]
-            errors.add_row("model alone" if run == "alone" else "fused", *(f"{1e3 * v:.2f}" for v in values))
+            errors.add_row(
+                "open loop" if run == "open_loop" else "fused", *(f"{1e3 * v:.2f}" for v in values)
+            )
         console.print(errors)
     steps = Table(title=f"steps of 3 ms, policy {timing['policy']}")
     for name in ("", "p50 (ms)", "p99 (ms)", "max (ms)"):

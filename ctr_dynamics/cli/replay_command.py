@@ -65,7 +65,7 @@ def _table(result: ReplayResult) -> list[tuple[str, str]]:
         ("steps", f"{summary['steps']} of 3 ms, {summary['duration_s']:.2f} s"),
         ("run time", f"{summary['wall_s']:.2f} s, {summary['realtime_ratio']:.1f} times real time"),
         ("time per step", f"p50 {step['p50']:.2f} ms, p99 {step['p99']:.2f} ms, max {step['max']:.2f} ms"),
-        ("residual rms, model alone", _number(residual.get("predicted"), ".3f", "mm", 1e3)),
+        ("residual rms, open loop", _number(residual.get("predicted"), ".3f", "mm", 1e3)),
         ("residual rms, fused", _number(residual.get("fused"), ".3f", "mm", 1e3)),
         (
             "NIS per degree of freedom",
@@ -73,7 +73,7 @@ def _table(result: ReplayResult) -> list[tuple[str, str]]:
             f"to {_number(nis.get('upper95'), '.3f')})",
         ),
         (
-            "tracker samples",
+            "tracker measurements",
             f"rejected {_count(summary['rejected'])}, late {_count(summary['late'])}, "
             f"dropped {_count(summary['dropped'])}",
         ),
@@ -125,7 +125,7 @@ def replay(
         list[str] | None, typer.Option("--set", metavar="NAME=VALUE", help="One parameter; may be repeated.")
     ] = None,
     no_fusion: Annotated[
-        bool, typer.Option("--no-fusion", help="The model alone, without the tracker.")
+        bool, typer.Option("--no-fusion", help="Open loop: the model without the tracker.")
     ] = False,
 ) -> int:
     """Run a recorded bag through the estimator, without a ROS graph.

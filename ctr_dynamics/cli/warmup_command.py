@@ -12,7 +12,7 @@ from ctr_dynamics.diagnosis.kernel_warm_up import rehearse as rehearse_diagnosis
 from ctr_dynamics.kernels.compiler import cache_folder
 from ctr_dynamics.parameters import Settings
 from ctr_dynamics.robot_files import load_robot
-from ctr_dynamics.runtime.warm_up import rehearse as rehearse_node
+from ctr_dynamics.runtime.warm_up import warm_up
 
 
 def warmup(
@@ -36,7 +36,7 @@ def warmup(
 def _estimator(name: str) -> str:
     begin, steps = time.perf_counter(), 0
     for policy in ("predict", "wait"):
-        steps = rehearse_node(load_robot(name), Settings({"robot": name, "output.policy": policy}))
+        steps = warm_up(load_robot(name), Settings({"robot": name, "output.policy": policy}))
     return f"{name}: estimator, {steps} steps, {time.perf_counter() - begin:.1f} s"
 
 

@@ -20,7 +20,7 @@ def _is_device(path: Path) -> bool:
 
 
 def check_target(path: Path, what: str = "") -> None:
-    """Refuse a file that could not be written, before the work.
+    """Reject a file that could not be written, before the work.
 
     Args:
         path: of the file.

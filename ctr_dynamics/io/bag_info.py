@@ -230,7 +230,7 @@ def _between_topics(bag: Bag, times: dict[str, _Times], reports: list[TopicRepor
     by_name = {report.name: report for report in reports}
     for name, level, text in (
         (JOINT_STATES, "error", "not in the bag; nothing can be estimated without it"),
-        (TRACKER_TIP, "warning", "not in the bag; only the model alone can run (`replay --no-fusion`)"),
+        (TRACKER_TIP, "warning", "not in the bag; only the open loop can run (`replay --no-fusion`)"),
         (TIP_LOAD, "note", "not in the bag; the known load is taken as zero"),
     ):
         if name not in times:
@@ -251,8 +251,8 @@ def _between_topics(bag: Bag, times: dict[str, _Times], reports: list[TopicRepor
                 Finding(
                     "warning",
                     name,
-                    f"the slowest sample came {offset['max'] - offset['min']:.3f} s later than the "
-                    f"quickest, limit {LATE_LIMIT_S:g} s: such samples are not fused; raise filter.window_s "
+                    f"the slowest measurement came {offset['max'] - offset['min']:.3f} s later than the "
+                    f"quickest, limit {LATE_LIMIT_S:g} s: such measurements are not fused; raise filter.window_s "
                     "or mend the driver",
                 )
             )
@@ -285,7 +285,11 @@ def _start_and_end(joints: _Times, tracker: _Times) -> list[Finding]:
                 "warning",
                 TRACKER_TIP,
                 f"starts {abs(start):.3f} s {side} the joints, limit {START_LIMIT_S:g} s; "
-                + ("the model runs alone until then" if start > 0 else "earlier samples are not used"),
+                + (
+                    "the model runs in open loop until then"
+                    if start > 0
+                    else "earlier measurements are not used"
+                ),
             )
         )
     if end > START_LIMIT_S:

@@ -11,7 +11,7 @@ from ctr_dynamics.errors import InputError
 
 
 class _Loader(yaml.SafeLoader):
-    """SafeLoader that reads 52e9 as a number and refuses a key given twice."""
+    """SafeLoader that reads 52e9 as a number and rejects a key given twice."""
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
         seen = set()

@@ -61,7 +61,7 @@ _SCRIPT = """
       pen.strokeStyle = "#cf222e"; pen.lineWidth = 5; pen.lineJoin = "round"; pen.beginPath();
       frame.points.forEach((p, i) => { const [x, y] = place(p, view); i ? pen.lineTo(x, y) : pen.moveTo(x, y); });
       pen.stroke();
-      dot(frame.alone, view, "#0969da", 8);
+      dot(frame.open_loop, view, "#0969da", 8);
       dot(frame.tracker, view, "#57606a", 6);
       const bar = 10 ** Math.floor(Math.log10(across / 3));
       pen.fillStyle = "#1b1f24"; pen.fillRect(view * half + margin, canvas.height - 40, bar * scale, 4);
@@ -99,20 +99,20 @@ def add_animation(
     page: Page,
     t: Floats,
     shapes: Sequence[Floats],
-    alone: Sequence[Floats | None],
+    open_loop: Sequence[Floats | None],
     tracker: Sequence[Floats | None],
 ) -> None:
     """Put an animation into the page.
 
     Args:
-        t: (n,) s. shapes: n backbones (points, 3), m. alone, tracker: n points (3,) m, or None.
+        t: (n,) s. shapes: n backbones (points, 3), m. open_loop, tracker: n points (3,) m, or None.
     """
     every = max(1, -(-len(t) // MAX_FRAMES))
     frames = [
         {
             "t": round(float(t[k]), 4),
             "points": _millimetres(shapes[k]),
-            "alone": None if alone[k] is None else _millimetres(alone[k]),
+            "open_loop": None if open_loop[k] is None else _millimetres(open_loop[k]),
             "tracker": None if tracker[k] is None else _millimetres(tracker[k]),
         }
         for k in range(0, len(t), every)

@@ -20,7 +20,7 @@ from ctr_dynamics.reporting.page import Markup
 Floats = NDArray[np.float64]
 COLOURS = {
     "fused": "#cf222e",
-    "alone": "#0969da",
+    "open_loop": "#0969da",
     "tracker": "#8c959f",
     "limit": "#bf8700",
     "other": "#1a7f37",

@@ -36,7 +36,7 @@ class ReplayLog:
     t: list[float] = field(default_factory=list)
     fused: list[Floats] = field(default_factory=list)
     sigma: list[Floats] = field(default_factory=list)
-    alone: list[Floats] = field(default_factory=list)
+    open_loop: list[Floats] = field(default_factory=list)
     force: list[Floats] = field(default_factory=list)
     force_sigma: list[Floats] = field(default_factory=list)
     valid: list[bool] = field(default_factory=list)
@@ -59,7 +59,7 @@ class ReplayLog:
         self.fused.append(np.array(out.tip_position) if good else nothing)
         variance = np.diag(out.tip_covariance)[:3] if good else nothing
         self.sigma.append(np.sqrt(np.maximum(variance, 0.0)))
-        self.alone.append(np.array(out.predicted_position) if good else nothing)
+        self.open_loop.append(np.array(out.predicted_position) if good else nothing)
         self.turned.append(np.array(out.predicted_quaternion_wxyz) if good else np.full(4, np.nan))
         self.force.append(np.array(out.disturbance_force) if good else nothing)
         self.force_sigma.append(np.array(out.disturbance_sigma) if good else nothing)
@@ -68,11 +68,11 @@ class ReplayLog:
             self.shapes.append((t, out.backbone[:, 1:4].astype(float)))
 
     def pose(self, pose: PoseIn) -> None:
-        """Take in one tracker sample."""
+        """Take in one tracker measurement."""
         self.poses.append(pose)
 
     def samples(self) -> tuple[Floats, Floats]:
-        """Times (s,) s and positions (s, 3) m of the tip in `ctr_base` that the usable tracker samples show."""
+        """Times (s,) s and positions (s, 3) m of the tip in `ctr_base` that the usable tracker measurements show."""
         whole = self.tracker.mask[3:].all()
         times, points = [], []
         for pose in self.poses:
@@ -101,29 +101,34 @@ def replay_page(log: ReplayLog, summary: dict[str, Any], step_times_s: Sequence[
     )
     _verdict(page, summary)
     page.table(_figures_of(summary))
-    t, fused, alone, sigma = np.array(log.t), np.array(log.fused), np.array(log.alone), np.array(log.sigma)
+    t, fused, open_loop, sigma = (
+        np.array(log.t),
+        np.array(log.fused),
+        np.array(log.open_loop),
+        np.array(log.sigma),
+    )
     sample_t, sample_p = log.samples()
     dark = _stretches(t, np.array(log.valid))
     page.heading("Backbone")
-    _animation(page, log, t, alone, sample_t, sample_p)
+    _animation(page, log, t, open_loop, sample_t, sample_p)
     page.heading("Tip before and after fusion")
     traces = []
     for i, axis in enumerate(_AXES):
         panel = Panel(f"tip {axis} (mm)", shaded=dark)
         panel.line(sample_t, 1e3 * sample_p[:, i], "tracker", "tracker", dots=True)
-        panel.line(t, 1e3 * alone[:, i], "model alone", "alone")
+        panel.line(t, 1e3 * open_loop[:, i], "open loop", "open_loop")
         panel.line(t, 1e3 * fused[:, i], "fused", "fused", band=BAND * 1e3 * sigma[:, i])
         traces.append(panel)
     page.figure(
         figure_svg(traces),
         "Position of the tip in ctr_base. The band is two standard deviations as published; red stretches are invalid. "
-        "Tracker samples are taken to the tip by the robot file's registration, lever arm and delay.",
+        "Tracker measurements are taken to the tip by the robot file's registration, lever arm and delay.",
     )
     inside = (sample_t >= t[0]) & (sample_t <= t[-1]) if len(sample_t) else np.zeros(0, bool)
     if inside.any():
         page.heading("Distance from the tracker")
         page.figure(
-            figure_svg(_residual_panels(t, fused, alone, sigma, sample_t[inside], sample_p[inside])),
+            figure_svg(_residual_panels(t, fused, open_loop, sigma, sample_t[inside], sample_p[inside])),
             _RESIDUAL_CAPTION,
         )
     _innovations(page, log.innovations, log.first_ns or 0)
@@ -143,18 +148,18 @@ def replay_page(log: ReplayLog, summary: dict[str, Any], step_times_s: Sequence[
     spent = 1e3 * np.asarray(step_times_s, float)
     if len(spent) == len(t):
         panel = Panel("ms", limits=[(STEP_MS, "real time, 3 ms")], log=True).line(
-            t, spent, "time spent", "alone"
+            t, spent, "time spent", "open_loop"
         )
         page.figure(
             figure_svg([panel]),
-            "Time that each step took on this machine, roll-back for late samples included.",
+            "Time that each step took on this machine, roll-back for late measurements included.",
         )
     _provenance(page, summary)
     return page
 
 
 _RESIDUAL_CAPTION = (
-    "Tracker sample minus tip at its time, before fusion (model alone) and after. The band is two standard deviations of the fused "
+    "Tracker measurement minus tip at its time, before fusion (open loop) and after. The band is two standard deviations of the fused "
     "tip; the tracker's own noise comes on top."
 )
 
@@ -187,11 +192,11 @@ def _figures_of(summary: dict[str, Any]) -> list[tuple[str, Any]]:
         return "-" if value is None else f"{1e3 * value:.3f} mm"
 
     return [
-        ("residual rms, model alone", millimetres(residual.get("predicted"))),
+        ("residual rms, open loop", millimetres(residual.get("predicted"))),
         ("residual rms, fused", millimetres(residual.get("fused"))),
         ("NIS per degree of freedom", nis.get("mean")),
         (
-            "tracker samples rejected, late, dropped",
+            "tracker measurements rejected, late, dropped",
             f"{summary['rejected']}, {summary['late']}, {summary['dropped']}",
         ),
         ("invalid steps", summary["invalid"]["steps"]),
@@ -212,13 +217,13 @@ def _at(t: Floats, values: Floats, when: Floats) -> Floats:
 
 
 def _residual_panels(
-    t: Floats, fused: Floats, alone: Floats, sigma: Floats, sample_t: Floats, sample_p: Floats
+    t: Floats, fused: Floats, open_loop: Floats, sigma: Floats, sample_t: Floats, sample_p: Floats
 ) -> list[Panel]:
-    before, after = sample_p - _at(t, alone, sample_t), sample_p - _at(t, fused, sample_t)
+    before, after = sample_p - _at(t, open_loop, sample_t), sample_p - _at(t, fused, sample_t)
     panels = []
     for i, axis in enumerate(_AXES):
         panel = Panel(f"{axis} (mm)")
-        panel.line(sample_t, 1e3 * before[:, i], "model alone", "alone")
+        panel.line(sample_t, 1e3 * before[:, i], "open loop", "open_loop")
         panel.line(sample_t, 1e3 * after[:, i], "fused", "fused", dots=True)
         zero = np.zeros(len(t))
         panel.line(t, zero, "", "fused", band=BAND * 1e3 * np.nan_to_num(sigma[:, i]))
@@ -230,7 +235,7 @@ def _innovations(page: Page, found: list[Innovation], first_ns: int) -> None:
     page.heading("Innovations")
     usable = [item for item in found if item.dof > 0 and np.isfinite(item.nis)]
     if not usable:
-        page.paragraph("No tracker sample was compared with the model.")
+        page.paragraph("No tracker measurement was compared with the model.")
         return
     t = np.array([(item.stamp_ns - first_ns) * 1e-9 for item in usable])
     order = np.argsort(t, kind="stable")
@@ -241,14 +246,14 @@ def _innovations(page: Page, found: list[Innovation], first_ns: int) -> None:
     for i, name in enumerate(("x (mm)", "y (mm)", "z (mm)", "rx (deg)", "ry (deg)", "rz (deg)")):
         if np.isfinite(residual[:, i]).any():
             factor = 1e3 if i < 3 else float(np.degrees(1.0))
-            panel = Panel(name).line(t, factor * residual[:, i], "", "alone", dots=True)
+            panel = Panel(name).line(t, factor * residual[:, i], "", "open_loop", dots=True)
             panel.line(
                 t, np.zeros(len(t)), "", "tracker", band=BAND * factor * np.nan_to_num(deviation[:, i])
             )
             panels.append(panel)
     page.figure(
         figure_svg(panels, height=1.25),
-        "Measured minus expected pose of each sample, with two standard deviations as the filter expects them. About 95 % of the dots "
+        "Measured minus expected pose of each measurement, with two standard deviations as the filter expects them. About 95 % of the dots "
         "lie within.",
     )
     page.heading("NIS")
@@ -257,7 +262,7 @@ def _innovations(page: Page, found: list[Innovation], first_ns: int) -> None:
     dof = round(float(np.median([item.dof for item in usable])))
     limits = [(chi2.ppf(p, dof) / dof, label) for p, label in ((0.025, "95 %"), (0.975, ""))]
     panel = Panel("NIS / dof", limits=limits, log=True)
-    panel.line(t[accepted], nis[accepted], "fused", "alone", dots=True)
+    panel.line(t[accepted], nis[accepted], "fused", "open_loop", dots=True)
     if not accepted.all():
         panel.line(t[~accepted], nis[~accepted], "rejected", "fused", dots=True)
     page.figure(
@@ -271,25 +276,25 @@ def _innovations(page: Page, found: list[Innovation], first_ns: int) -> None:
     if reasons:
         page.table(
             sorted(reasons.items(), key=lambda entry: -entry[1])[:20],
-            header=("why samples were refused or marked", "samples"),
+            header=("why measurements were rejected or marked", "measurements"),
         )
 
 
 def _animation(
-    page: Page, log: ReplayLog, t: Floats, alone: Floats, sample_t: Floats, sample_p: Floats
+    page: Page, log: ReplayLog, t: Floats, open_loop: Floats, sample_t: Floats, sample_p: Floats
 ) -> None:
     if not log.shapes:
         page.paragraph("No valid step.")
         return
     times = np.array([when for when, _ in log.shapes])
-    tips = _at(t, np.nan_to_num(alone), times)
+    tips = _at(t, np.nan_to_num(open_loop), times)
     nearest: list[Floats | None] = []
     for when in times:
         k = int(np.argmin(np.abs(sample_t - when))) if len(sample_t) else -1
         nearest.append(sample_p[k] if k >= 0 and abs(sample_t[k] - when) < 0.05 else None)
     add_animation(page, times, [points for _, points in log.shapes], list(tips), nearest)
     page.paragraph(
-        "Fused backbone (red) with its tip's last second, tip of the model alone (blue), tracker (grey)."
+        "Fused backbone (red) with its tip's last second, tip in open loop (blue), tracker (grey)."
     )
 
 

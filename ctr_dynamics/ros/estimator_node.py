@@ -41,14 +41,14 @@ from ctr_dynamics.ros.topic_names import NAME, NAMESPACE, message_class, node_to
 from ctr_dynamics.runtime import node_diagnostics
 from ctr_dynamics.runtime.memory import keep_memory
 from ctr_dynamics.runtime.recorder import Recorder
-from ctr_dynamics.runtime.ring_buffer_recording import RollingRecording
+from ctr_dynamics.runtime.ring_buffer_recording import RingBufferRecording
 from ctr_dynamics.runtime.step_encoder import StepEncoder
 from ctr_dynamics.runtime.step_loop import StepLoop
 from ctr_dynamics.runtime.timing import StepTiming
-from ctr_dynamics.runtime.warm_up import rehearse
+from ctr_dynamics.runtime.warm_up import warm_up
 
 DIAGNOSTICS_NS = 500_000_000
-DIAGNOSTICS_WAIT_NS = 100_000_000  # how long they wait for a pause between steps
+DIAGNOSTICS_WAIT_NS = 100_000_000  # how long they wait for time between steps
 # A thread that wants the interpreter gets it after this long; the default of 5 ms is longer than a step.
 SWITCH_INTERVAL_S = 1e-4
 
@@ -78,7 +78,7 @@ class EstimatorNode(Node):
         self.timing = StepTiming(
             self.settings["output.policy"], round(self.settings["input_timeout_s"] * 1e9)
         )
-        self.rolling = self._open_rolling()
+        self.ring_buffer = self._open_ring_buffer()
         self.recorder = self._open_recorder()
         self._qos_faults = qos.QosFaults()
         self._undecodable: dict[str, tuple[int, str]] = {}
@@ -104,7 +104,7 @@ class EstimatorNode(Node):
             self.timing,
             self.get_logger().error,
             wall=not self._use_sim_time,
-            rehearse=self._rehearse,
+            prefetch=self._prefetch,
         )
         self._offered = [
             self.create_service(Trigger, "~/reset", self._on_reset),
@@ -123,7 +123,7 @@ class EstimatorNode(Node):
     def _warm_estimator(self) -> Estimator:
         self.get_logger().info("compiling the kernels (seconds with a filled cache, minutes without)")
         begin = time.perf_counter()
-        rehearse(self._robot, self.settings)
+        warm_up(self._robot, self.settings)
         self.get_logger().info(f"kernels ready after {time.perf_counter() - begin:.1f} s")
         return Estimator(self._robot, self.settings)
 
@@ -131,7 +131,7 @@ class EstimatorNode(Node):
         path = self.settings["record.path"]
         return Recorder(LiveRecorder(path, self._provenance()), self.get_logger().error) if path else None
 
-    def _open_rolling(self) -> RollingRecording | None:
+    def _open_ring_buffer(self) -> RingBufferRecording | None:
         seconds = self.settings["record.rolling_s"]
         if not seconds:
             return None
@@ -140,7 +140,7 @@ class EstimatorNode(Node):
             folder = Path(get_logging_directory())
             folder.mkdir(parents=True, exist_ok=True)
             path = folder / "ctr_estimator_rolling.mcap"
-        return RollingRecording(
+        return RingBufferRecording(
             path, seconds, self.settings["robot"], self._provenance(), self.get_logger().warning
         )
 
@@ -169,15 +169,15 @@ class EstimatorNode(Node):
             topics.TRACKER_TIP: self._take_tracker,
             topics.TIP_LOAD: self._take_load,
         }[topic.name]
-        loop, now_ns, record, rolling = self.loop, self._now_ns, self.recorder, self.rolling
+        loop, now_ns, record, ring_buffer = self.loop, self._now_ns, self.recorder, self.ring_buffer
 
         def arrived(data: bytes) -> None:
             arrival_ns = now_ns()
             loop.offer(partial(take, data, arrival_ns))
             if record is not None:
                 record.put(topic.name, arrival_ns, data)
-            if rolling is not None:
-                rolling.put(topic.name, arrival_ns, data)
+            if ring_buffer is not None:
+                ring_buffer.put(topic.name, arrival_ns, data)
 
         return self.create_subscription(
             message_class(topic.ros_type),
@@ -205,8 +205,8 @@ class EstimatorNode(Node):
             return
         clock = self.loop.stamp_clock
         if not clock.sample(message.stamp_ns, arrival_ns):
-            refusal = clock.refusal(message.stamp_ns, arrival_ns)
-            self._estimator.health.note("joints", "far ahead", refusal)
+            rejection = clock.rejection(message.stamp_ns, arrival_ns)
+            self._estimator.health.note("joints", "far ahead", rejection)
             return
         self.timing.arrived(message.stamp_ns, clock.at(arrival_ns))
         self._estimator.add_joint_state(message.stamp_ns, message.names, message.positions)
@@ -233,17 +233,17 @@ class EstimatorNode(Node):
         count, _ = self._undecodable.get(topic, (0, ""))
         self._undecodable[topic] = (count + 1, str(error))
 
-    def _rehearse(self) -> None:
+    def _prefetch(self) -> None:
         self._estimator.rehearse()
-        self.outputs.rehearse()
+        self.outputs.prefetch()
 
-    def _housekeeping(self, now_ns: int, pause: bool) -> None:
+    def _housekeeping(self, now_ns: int, idle: bool) -> None:
         """Diagnostics, at once when validity or the warning of a snap has changed and else at 2 Hz of the wall clock."""
         monotonic_ns = time.monotonic_ns()
-        if self.rolling is not None:
-            self.rolling.alarm(self._estimator.health.misfitting, monotonic_ns)
+        if self.ring_buffer is not None:
+            self.ring_buffer.alarm(self._estimator.health.misfitting, monotonic_ns)
         before, now = self._shown, (self.outputs.valid, self._estimator.health.snap_ahead)
-        due_ns = self._next_diagnostics_ns + (0 if pause else DIAGNOSTICS_WAIT_NS)
+        due_ns = self._next_diagnostics_ns + (0 if idle else DIAGNOSTICS_WAIT_NS)
         if now == before and monotonic_ns < due_ns:
             return
         self._next_diagnostics_ns = monotonic_ns + DIAGNOSTICS_NS
@@ -257,8 +257,8 @@ class EstimatorNode(Node):
 
     def _statuses(self, now_ns: int) -> list[Any]:
         health = self._estimator.health.statuses()
-        if self.rolling is not None:
-            health = [self.rolling.describe(s) if s.name == "misfit" else s for s in health]
+        if self.ring_buffer is not None:
+            health = [self.ring_buffer.describe(s) if s.name == "misfit" else s for s in health]
         return [
             *health,
             node_diagnostics.timing_status(
@@ -270,7 +270,7 @@ class EstimatorNode(Node):
                 self._use_sim_time,
                 self.timing.input_timeout_ns if self.timing.policy == "predict" else None,
             ),
-            node_diagnostics.topics_status(self._qos_faults.by_topic, self._undecodable, self.loop.refused),
+            node_diagnostics.topics_status(self._qos_faults.by_topic, self._undecodable, self.loop.rejected),
         ]
 
     # In the executor.
@@ -293,7 +293,7 @@ class EstimatorNode(Node):
         return self._answer(
             response,
             lambda: self.loop.call(self._reset),
-            lambda _: "the estimator starts anew at the next complete joint state",
+            lambda _: "the estimator reinitialises at the next complete joint state",
         )
 
     def _on_save_snapshot(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
@@ -323,8 +323,8 @@ class EstimatorNode(Node):
 
     def _save_snapshot(self) -> Path:
         snapshot = self.loop.call(self._estimator.snapshot)
-        if self.rolling is not None:
-            self.rolling.save("snapshot saved")
+        if self.ring_buffer is not None:
+            self.ring_buffer.save("snapshot saved")
         folder = Path(get_logging_directory())
         folder.mkdir(parents=True, exist_ok=True)
         path = folder / f"ctr_estimator_{time.time_ns()}.json"
@@ -341,7 +341,7 @@ class EstimatorNode(Node):
         return path
 
     def _prepare(self, settings: Settings, changes: set[str]) -> None:
-        """Refuse parameters that cannot be used; where a new estimator is needed, make it here."""
+        """Reject parameters that cannot be used; where a new estimator is needed, make it here."""
         fresh = Estimator(self._robot, settings) if changes - {"filter.enabled"} else None
         self._prepared = (settings, changes, fresh)
 
@@ -353,7 +353,7 @@ class EstimatorNode(Node):
         self.settings = settings
         if fresh is not None:
             self.loop.put(partial(self._swap, fresh, settings))
-            self.get_logger().info(f"{', '.join(sorted(changes))} changed: the estimator starts anew")
+            self.get_logger().info(f"{', '.join(sorted(changes))} changed: the estimator reinitialises")
         elif "filter.enabled" in changes:
             self.loop.put(lambda: self._estimator.set_fusion(settings["filter.enabled"]))
 
@@ -372,8 +372,8 @@ class EstimatorNode(Node):
         self.loop.join()
         if self.recorder is not None:
             self.recorder.close()
-        if self.rolling is not None:
-            self.rolling.close(self._estimator.health.misfitting)
+        if self.ring_buffer is not None:
+            self.ring_buffer.close(self._estimator.health.misfitting)
         path = self.settings["timing_report"]
         try:
             if path:

@@ -1,4 +1,4 @@
-"""Hears the estimator's topics over DDS and keeps every message as it came."""
+"""Subscribes to the estimator's topics over DDS and keeps every message as it came."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Hears every topic of the table over DDS and passes the bytes on."""
+"""Subscribes to every topic of the table over DDS and passes the bytes on."""
 
 from __future__ import annotations
 

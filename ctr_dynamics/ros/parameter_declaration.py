@@ -74,7 +74,7 @@ def watch(
 
     Args:
         current: the settings in use.
-        prepare: called with the new settings and the names that change; raises InputError to refuse them.
+        prepare: called with the new settings and the names that change; raises InputError to reject them.
         apply: called once the change is accepted.
     """
 

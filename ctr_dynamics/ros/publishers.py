@@ -71,7 +71,7 @@ class Outputs:
             return "no step has been taken yet: waiting for the first complete joint state"
         return str(self._last.reason)
 
-    def rehearse(self) -> None:
+    def prefetch(self) -> None:
         """Make the last step's messages again, for nobody, so that the next ones are made sooner."""
         if self._last is not None:
             self._encoder.encode(self._last)

@@ -45,8 +45,8 @@ class StampClock:
         self.known = True
         return True
 
-    def refusal(self, stamp_ns: int, arrival_ns: int) -> str:
-        """What to say of a joint state that :meth:`sample` has refused."""
+    def rejection(self, stamp_ns: int, arrival_ns: int) -> str:
+        """What to say of a joint state that :meth:`sample` has rejected."""
         ahead_s = (stamp_ns - self.at(arrival_ns)) * 1e-9
         return f"stamp {ahead_s:.3f} s ahead, limit {self.limit_ns * 1e-9:g} s; left out unless others follow"
 

@@ -1,4 +1,4 @@
-"""What a live run has shown: tip errors of the model alone and fused, punctuality, and a picture."""
+"""What a live run has shown: tip errors in open loop and fused, punctuality, and a picture."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import zipfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,14 +46,25 @@ class Trace:
 
 @dataclass(frozen=True)
 class Comparison:
-    """Distances (m) of the model alone and of the fused tip from a reference over its samples."""
+    """Distances (m) of the open-loop and of the fused tip from a reference over its samples."""
 
     reference: str
     samples: int
-    alone_rms: float
-    alone_max: float
+    open_loop_rms: float
+    open_loop_max: float
     fused_rms: float
     fused_max: float
+
+    def as_json(self) -> dict[str, Any]:
+        """The numbers under the names of demo.json."""
+        return {
+            "reference": self.reference,
+            "samples": self.samples,
+            "alone_rms": self.open_loop_rms,
+            "alone_max": self.open_loop_max,
+            "fused_rms": self.fused_rms,
+            "fused_max": self.fused_max,
+        }
 
 
 def trace_of(messages: Sequence[Received], start_ns: int) -> Trace:
@@ -101,37 +112,39 @@ def truth_of(file: Path) -> list[Trace]:
     return traces
 
 
-def compare(reference: str, target: Trace, alone: Trace, fused: Trace, since_s: float = 0.0) -> Comparison:
+def compare(
+    reference: str, target: Trace, open_loop: Trace, fused: Trace, since_s: float = 0.0
+) -> Comparison:
     """Distances from `target` at its samples within both runs, from `since_s` on.
 
     Raises:
         ValueError: no sample of the reference lies in the run.
     """
-    begin = max(alone.t[0], fused.t[0], since_s)
-    inside = (target.t >= begin) & (target.t <= min(alone.t[-1], fused.t[-1]))
+    begin = max(open_loop.t[0], fused.t[0], since_s)
+    inside = (target.t >= begin) & (target.t <= min(open_loop.t[-1], fused.t[-1]))
     if not inside.any():
         raise ValueError(f"no sample of the {reference} lies in the time of the run")
     t, p = target.t[inside], target.p[inside]
-    a = np.linalg.norm(alone.at(t) - p, axis=1)
+    a = np.linalg.norm(open_loop.at(t) - p, axis=1)
     f = np.linalg.norm(fused.at(t) - p, axis=1)
     return Comparison(reference, len(t), _rms(a), float(a.max()), _rms(f), float(f.max()))
 
 
-def compare_truth(candidates: Sequence[Trace], alone: Trace, fused: Trace) -> Comparison:
+def compare_truth(candidates: Sequence[Trace], open_loop: Trace, fused: Trace) -> Comparison:
     """The comparison with whichever candidate the fused tip is nearer to over the run."""
-    found = [compare("truth", candidate, alone, fused, SETTLE_S) for candidate in candidates]
+    found = [compare("truth", candidate, open_loop, fused, SETTLE_S) for candidate in candidates]
     return min(found, key=lambda comparison: comparison.fused_rms)
 
 
-def comparisons(tracker: Trace, truth: Sequence[Trace], alone: Trace, fused: Trace) -> list[Comparison]:
+def comparisons(tracker: Trace, truth: Sequence[Trace], open_loop: Trace, fused: Trace) -> list[Comparison]:
     """With the tracker and the truth, as far as they have samples in the time of the run."""
     found = []
     if len(tracker.t):
         with contextlib.suppress(ValueError):
-            found.append(compare("tracker", tracker, alone, fused))
+            found.append(compare("tracker", tracker, open_loop, fused))
     if truth:
         with contextlib.suppress(ValueError):
-            found.append(compare_truth(truth, alone, fused))
+            found.append(compare_truth(truth, open_loop, fused))
     return found
 
 
@@ -154,7 +167,7 @@ def backbones(messages: Sequence[Received], start_ns: int, count: int) -> list[t
 def draw(
     file: Path,
     shapes: Sequence[tuple[float, Floats]],
-    alone: Trace,
+    open_loop: Trace,
     fused: Trace,
     tracker: Trace,
     title: str,
@@ -182,7 +195,7 @@ def draw(
     for axis, name in enumerate("xyz"):
         axes = figure.add_subplot(grid[axis, 1])
         axes.plot(tracker.t, 1e3 * tracker.p[:, axis], ".", ms=2, color="0.6", label="tracker")
-        axes.plot(alone.t, 1e3 * alone.p[:, axis], color="tab:blue", lw=1, label="model alone")
+        axes.plot(open_loop.t, 1e3 * open_loop.p[:, axis], color="tab:blue", lw=1, label="open loop")
         axes.plot(fused.t, 1e3 * fused.p[:, axis], color="tab:red", lw=1, label="fused")
         axes.set_ylabel(f"tip {name} (mm)")
         axes.grid(alpha=0.3)
@@ -191,7 +204,7 @@ def draw(
     axes = figure.add_subplot(grid[3, 1])
     inside = (tracker.t >= fused.t[0]) & (tracker.t <= fused.t[-1])
     t, p = tracker.t[inside], tracker.p[inside]
-    axes.plot(t, 1e3 * np.linalg.norm(alone.at(t) - p, axis=1), color="tab:blue", lw=0.8)
+    axes.plot(t, 1e3 * np.linalg.norm(open_loop.at(t) - p, axis=1), color="tab:blue", lw=0.8)
     axes.plot(t, 1e3 * np.linalg.norm(fused.at(t) - p, axis=1), color="tab:red", lw=0.8)
     axes.set(xlabel="time (s)", ylabel="from tracker (mm)", ylim=(0, None))
     axes.grid(alpha=0.3)

@@ -8,7 +8,7 @@ M_TRIM_THRESHOLD, M_MMAP_MAX, M_ARENA_MAX = -1, -4, -8  # malloc.h of the GNU C 
 
 
 def keep_memory() -> bool:
-    """Have the C library keep what is freed, in one place for all threads, so that what the rehearsal has used serves the first steps too.
+    """Have the C library keep what is freed, in one place for all threads, so that what the warm-up has used serves the first steps too.
 
     Returns False where the C library has no ``mallopt``; nothing is changed then.
     """

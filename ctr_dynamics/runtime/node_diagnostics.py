@@ -90,7 +90,7 @@ def clock_status(clock: StampClock, now_ns: int, use_sim_time: bool, limit_ns: i
 
 
 def topics_status(
-    qos_faults: Mapping[str, str], undecodable: Mapping[str, tuple[int, str]], refused: int = 0
+    qos_faults: Mapping[str, str], undecodable: Mapping[str, tuple[int, str]], rejected: int = 0
 ) -> Status:
     """Topics whose endpoints do not fit, messages that could not be decoded, and those for which there was no room."""
     values = {
@@ -99,12 +99,12 @@ def topics_status(
     }
     if qos_faults:
         return Status("topics", ERROR, "; ".join(qos_faults.values()), values)
-    if refused:
-        values["refused"] = str(refused)
+    if rejected:
+        values["rejected"] = str(rejected)
         return Status(
             "topics",
             ERROR,
-            f"{refused} messages were refused: {INBOX_LIMIT} were waiting already; send fewer, or give the node more of a core",
+            f"{rejected} messages were rejected: {INBOX_LIMIT} were waiting already; send fewer, or give the node more of a core",
             values,
         )
     if undecodable:

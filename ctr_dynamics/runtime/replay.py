@@ -127,8 +127,8 @@ class Player:
             if self._clock.sample(message.stamp_ns, item.log_ns):
                 self.estimator.add_joint_state(message.stamp_ns, message.names, message.positions)
             else:
-                refusal = self._clock.refusal(message.stamp_ns, item.log_ns)
-                self.estimator.health.note("joints", "far ahead", refusal)
+                rejection = self._clock.rejection(message.stamp_ns, item.log_ns)
+                self.estimator.health.note("joints", "far ahead", rejection)
         elif isinstance(message, PoseIn):
             self.estimator.add_tracker_pose(
                 message.stamp_ns, message.position, message.quaternion_xyzw, message.frame_id
@@ -237,7 +237,7 @@ def replay(
         if output is not None:
             writer = stack.enter_context(write_bag(Path(output), _metadata(provenance)))
         summary_part = stack.enter_context(atomic_file(Path(summary))) if summary is not None else None
-        make = make_estimator or _rehearsed_estimator(robot, settings)
+        make = make_estimator or _warm_estimator(robot, settings)
         report_part = stack.enter_context(atomic_file(Path(report))) if report is not None else None
         estimator = make(robot, settings)
         log = _report_log(estimator, opened) if report_part is not None else None
@@ -262,18 +262,18 @@ def replay(
     return ReplayResult(content, notes)
 
 
-def _rehearsed_estimator(robot: Robot, settings: Settings) -> MakeEstimator:
+def _warm_estimator(robot: Robot, settings: Settings) -> MakeEstimator:
     """The estimator, with everything compiled and loaded before the clock starts."""
     # Imported late: it brings the compiled model, which reading and checking a bag do not need.
     from ctr_dynamics.estimation.estimator import Estimator
-    from ctr_dynamics.runtime.warm_up import rehearse
+    from ctr_dynamics.runtime.warm_up import warm_up
 
-    rehearse(robot, settings)
+    warm_up(robot, settings)
     return Estimator
 
 
 def _report_log(estimator: Estimator, bag: Bag) -> ReplayLog:
-    """What a report collects, with the bag's tracker samples in it."""
+    """What a report collects, with the bag's tracker measurements in it."""
     from ctr_dynamics.reporting.replay_report import ReplayLog  # brings the plotting library
 
     log = ReplayLog(estimator.tracker)
@@ -361,7 +361,7 @@ def _without(bag: Bag, settings: Settings) -> list[str]:
     notes = (
         []
         if tracker is not None and tracker.messages
-        else [f"no pose on {TRACKER_TIP}: the model runs alone"]
+        else [f"no pose on {TRACKER_TIP}: the model runs in open loop"]
     )
     live = [p.name for p in PARAMETERS if p.name.startswith(LIVE_ONLY) and settings[p.name] != p.default]
     if live:

@@ -20,7 +20,7 @@ from ctr_dynamics.io.messages.topics import TIP_LOAD
 LIMIT_BYTES = 256 * 2**20  # kept in memory, whatever the rates of the inputs
 
 
-class RollingRecording:
+class RingBufferRecording:
     """Inputs of the last ``seconds``; any thread may call any method, a thread of its own writes, so that no step waits for a disk.
 
     Args:
@@ -56,7 +56,7 @@ class RollingRecording:
         self._lock = threading.Lock()
         self._asked_ns: int | None = None
         self._queue: queue.SimpleQueue[str | None] = queue.SimpleQueue()
-        self._thread = threading.Thread(target=self._run, name="rolling recording", daemon=True)
+        self._thread = threading.Thread(target=self._run, name="ring buffer recording", daemon=True)
         self._thread.start()
 
     def put(self, topic: str, log_ns: int, data: bytes) -> None:
@@ -96,7 +96,7 @@ class RollingRecording:
 
     def describe(self, status: Status) -> Status:
         """``status`` (misfit) with the recording and the command to run on it."""
-        values = {**status.values, "rolling recording": self.error or f"{self.written} times written"}
+        values = {**status.values, "ring buffer recording": self.error or f"{self.written} times written"}
         if not self.written:
             return replace(status, values=values)
         values |= {"recording": str(self.path), "diagnose": self.command}
@@ -116,7 +116,7 @@ class RollingRecording:
                 self._write()
             except (InputError, OSError) as error:
                 self.error = f"not written: {error}"
-                self._log(f"rolling recording {self.error}")
+                self._log(f"ring buffer recording {self.error}")
             else:
                 self.error = ""
                 self.written += 1

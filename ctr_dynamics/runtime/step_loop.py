@@ -21,7 +21,7 @@ from ctr_dynamics.runtime.timing import StepTiming
 
 STEP_NS = 3_000_000
 CATCH_UP_NS = 5_000_000_000
-"""A backlog longer than this is given up: the estimator starts anew."""
+"""A backlog longer than this is given up: the estimator reinitialises."""
 SLICE_STEPS = 8
 """Steps of a backlog that are taken between two looks at the inbox."""
 INBOX_LIMIT = 20_000
@@ -32,12 +32,12 @@ COLLECT_NS = 1_000_000_000
 COLLECT_SLACK_NS = 1_500_000
 GATHER_NS = 4_000_000
 """So long after the first joints the model starts: a load of the same time comes a moment later, and starting takes longer than that."""
-PAUSE_NS = 1_000_000
-"""What is done in a pause takes about as long."""
-REHEARSAL_NS = 2_500_000
-"""So long before the joints are expected that several steps wait for, a step is rehearsed; earlier, caches would have forgotten it again."""
-REHEARSALS = 3
-"""Steps of a rehearsal: the covariance follows every third."""
+IDLE_WORK_NS = 1_000_000
+"""Idle work takes about as long."""
+PREFETCH_NS = 2_500_000
+"""So long before joints are expected that several steps wait for, a step is computed without effect. Earlier would be in vain: caches forget."""
+PREFETCH_STEPS = 3
+"""Steps without effect: every third computes the covariance."""
 
 
 class Steps(Protocol):
@@ -79,13 +79,13 @@ class StepLoop(threading.Thread):
     Args:
         estimator: see `Steps`; touched by this thread alone once started.
         publish: called with every step in order of its stamp; returns False when the stamp was withheld.
-        housekeeping: called after each round with the current time and whether there is a pause; publishes diagnostics when they are due.
+        housekeeping: called after each round with the current time and whether there is time to spare; publishes diagnostics when they are due.
         clock_ns: the node's current time, 0 while it has none.
         timing: the account of punctuality.
         log_error: takes one line for the log.
         wall: whether that clock runs at the rate of the wall clock, so that one may sleep until a stamp.
         gather_ns: how long the first inputs are gathered.
-        rehearse: goes through a step without taking it; called a moment before joints that several steps wait for.
+        prefetch: computes a step without effect; called a moment before joints that several steps wait for.
     """
 
     def __init__(
@@ -98,14 +98,14 @@ class StepLoop(threading.Thread):
         log_error: Callable[[str], Any],
         wall: bool = True,
         gather_ns: int = GATHER_NS,
-        rehearse: Callable[[], object] = lambda: None,
+        prefetch: Callable[[], object] = lambda: None,
     ) -> None:
         super().__init__(name="stepping", daemon=True)
         self.estimator = estimator
         self.timing = timing
         self.stamp_clock = StampClock()
         self.inbox: deque[Callable[[], None]] = deque()
-        self.refused = 0
+        self.rejected = 0
         self.faults = 0
         self.last_fault = ""
         self._publish = publish
@@ -114,12 +114,12 @@ class StepLoop(threading.Thread):
         self._log_error = log_error
         self._wall = wall
         self._gather_ns = gather_ns
-        self._rehearse_step = rehearse
+        self._prefetch_step = prefetch
         self._took_steps = False
         # a step was due in this round and the estimator did not take it: it wants an input
         self._starved = False
-        self._pause_due = False
-        self._rehearsed_ns: int | None = None  # for the joints that were expected then
+        self._idle_work_due = False
+        self._prefetched_ns: int | None = None  # for the joints that were expected then
         self._wake = threading.Event()
         self._stopping = False
         self._last: tuple[int, int] | None = None  # k and stamp of the last step taken
@@ -134,11 +134,11 @@ class StepLoop(threading.Thread):
         self._wake.set()
 
     def offer(self, item: Callable[[], None]) -> None:
-        """The same for a message: beyond ``INBOX_LIMIT`` that wait it is refused, and counted."""
+        """The same for a message: beyond ``INBOX_LIMIT`` that wait it is rejected, and counted."""
         if len(self.inbox) < INBOX_LIMIT:
             self.put(item)
         else:
-            self.refused += 1
+            self.rejected += 1
 
     def call(self, function: Callable[[], Any], timeout_s: float = 5.0) -> Any:
         """Run `function` in the stepping thread and return its result.
@@ -200,20 +200,20 @@ class StepLoop(threading.Thread):
                 self.inbox.popleft()()
             self._advance()
             if self._took_steps:
-                self._pause_due = True
+                self._idle_work_due = True
             if not self.estimator.correcting:
-                if self._pause_due and not self.inbox and self._pause():
-                    self._pause_due = False
+                if self._idle_work_due and not self.inbox and self._idle():
+                    self._idle_work_due = False
                     self.estimator.use_pause()
             elif self._took_steps:
                 self._wake.set()  # now there is time for it
-            self._rehearse()
+            self._prefetch()
         except Exception as error:
-            # The node stays up whatever a message provokes: the fault is shown, the estimator starts anew.
-            self._fault(error, "the estimator starts anew")
+            # The node stays up whatever a message provokes: the fault is shown, the estimator reinitialises.
+            self._fault(error, "the estimator reinitialises")
             self.reset()
         try:
-            self._housekeeping(self._clock_ns(), self._pause())
+            self._housekeeping(self._clock_ns(), self._idle())
         except Exception as error:
             self._fault(error, "steps go on")
         self._collect()
@@ -223,28 +223,28 @@ class StepLoop(threading.Thread):
         self.last_fault = f"{type(error).__name__}: {error}; {what}"
         self._log_error(f"fault in the stepping thread, {what}\n{traceback.format_exc()}")
 
-    def _rehearsal_ns(self) -> int | None:
-        """When steps are to be rehearsed; None where that has been done, or where an input covers hardly more than one step."""
+    def _prefetch_ns(self) -> int | None:
+        """When to compute steps without effect; None where that has been done, or where an input covers hardly more than one step."""
         expected_ns = self.timing.next_arrival_ns
-        if expected_ns is None or expected_ns == self._rehearsed_ns or self._last is None or not self._wall:
+        if expected_ns is None or expected_ns == self._prefetched_ns or self._last is None or not self._wall:
             return None
         several = self.timing.policy != "predict" and self.timing.period_ns > 2 * STEP_NS
-        return expected_ns - REHEARSAL_NS if several else None
+        return expected_ns - PREFETCH_NS if several else None
 
-    def _rehearse(self) -> None:
-        """Go through steps a moment before several will be due at once, so that these meet warm caches."""
-        due_ns = self._rehearsal_ns()
+    def _prefetch(self) -> None:
+        """Compute steps without effect a moment before several will be due at once, so that these meet warm caches."""
+        due_ns = self._prefetch_ns()
         if due_ns is None or self._now_ns() < due_ns:
             return
-        self._rehearsed_ns = self.timing.next_arrival_ns
-        for _ in range(REHEARSALS):
-            if self.inbox or self._now_ns() > due_ns + REHEARSAL_NS:
+        self._prefetched_ns = self.timing.next_arrival_ns
+        for _ in range(PREFETCH_STEPS):
+            if self.inbox or self._now_ns() > due_ns + PREFETCH_NS:
                 return
-            self._rehearse_step()
+            self._prefetch_step()
 
-    def _pause(self) -> bool:
+    def _idle(self) -> bool:
         """Whether there is time for what no output waits for."""
-        return self._spare_s() * 1e9 > PAUSE_NS
+        return self._spare_s() * 1e9 > IDLE_WORK_NS
 
     def _spare_s(self) -> float:
         """Time until the next step falls due, s; infinite where nothing tells."""
@@ -271,7 +271,7 @@ class StepLoop(threading.Thread):
                 self.timing.corrected(spent_ns)
             for step in steps:
                 if self._last is not None and step.k <= self._last[0]:
-                    self.timing.restarted()  # the estimator has started anew by itself
+                    self.timing.restarted()  # the estimator has reinitialised itself
                 self._last = (step.k, step.stamp_ns)
                 if self._publish(step):
                     self.timing.published(step.k, step.stamp_ns, self._now_ns())
@@ -310,7 +310,7 @@ class StepLoop(threading.Thread):
         if now_ns - next_ns > CATCH_UP_NS:
             self._log_error(
                 f"steps are {(now_ns - next_ns) * 1e-9:.1f} s behind, limit {CATCH_UP_NS * 1e-9:g} s: "
-                "the estimator starts anew"
+                "the estimator reinitialises"
             )
             self.reset()
             return now_ns, False
@@ -327,9 +327,9 @@ class StepLoop(threading.Thread):
             wait_ns = min(due_ns - self._begin_ns(), IDLE_NS)
             if wait_ns <= 0 and self._starved:
                 wait_ns = RETRY_NS  # do not spin
-        rehearsal_ns = self._rehearsal_ns()
-        if rehearsal_ns is not None:
-            wait_ns = min(wait_ns, rehearsal_ns - self._now_ns())
+        prefetch_ns = self._prefetch_ns()
+        if prefetch_ns is not None:
+            wait_ns = min(wait_ns, prefetch_ns - self._now_ns())
         if wait_ns > 0:
             self._wake.wait(wait_ns * 1e-9)
 

@@ -95,7 +95,7 @@ class StepTiming:
         self._arrivals.append((joint_stamp_ns, arrival_ns))
 
     def restarted(self) -> None:
-        """The estimator starts anew: k begins at 0 again."""
+        """The estimator has reinitialised: k begins at 0 again."""
         self.restarts += 1
         self._last_k = None
         self._start_until_ns = None

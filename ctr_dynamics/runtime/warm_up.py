@@ -23,7 +23,7 @@ def _no_time() -> float:
     return 0.0
 
 
-def rehearse(robot: Robot, settings: Settings) -> int:
+def warm_up(robot: Robot, settings: Settings) -> int:
     """Run another estimator near the robot's rest position with every kind of input; returns how many steps.
 
     The actuators turn and slide a little, a load comes and goes, and jumps once, so that a step is divided, and the tracker reports the predicted

@@ -58,15 +58,15 @@ class Ramp(Primitive):
         return start + (self.to - start) * share
 
 
-class Fading(Primitive):
-    """A motion about the start that fades in and out over ``fade_s``, so that it begins and ends at the start
+class Tapered(Primitive):
+    """A motion about the start that grows from and returns to zero over ``fade_s``, so that it begins and ends at the start
     without a jump of speed.
     """
 
     fade_s: Annotated[FiniteFloat, Field(ge=0)] = 0.0
 
     @model_validator(mode="after")
-    def _check(self) -> Fading:
+    def _check(self) -> Tapered:
         if 2 * self.fade_s > self.duration_s:
             raise ValueError(
                 f"fade_s {self.fade_s:g} s is more than half of duration_s {self.duration_s:g} s"
@@ -79,7 +79,7 @@ class Fading(Primitive):
         return 0.5 - 0.5 * math.cos(math.pi * edge / self.fade_s) if edge < self.fade_s else 1.0
 
 
-class Sine(Fading):
+class Sine(Tapered):
     """``amplitude`` times a sine of ``frequency_hz``."""
 
     kind: Literal["sine"]
@@ -90,7 +90,7 @@ class Sine(Fading):
         return start + self.envelope(t) * self.amplitude * math.sin(2 * math.pi * self.frequency_hz * t)
 
 
-class Multisine(Fading):
+class Multisine(Tapered):
     """Sum of sines with amplitudes, frequencies and phases of their own (zero when not given)."""
 
     kind: Literal["multisine"]

@@ -32,7 +32,7 @@ HERE = Path(__file__).parent
 
 
 def diagnose(folder: Path, jobs: int, effects: list[str] | None = None) -> dict[str, Any]:
-    """Fit every explanation to the first snap of ``folder`` and check them on the others; ``effects`` keeps those causes only.
+    """Fit every hypothesis to the first snap of ``folder`` and check them on the others; ``effects`` keeps those causes only.
 
     Returns fits (likeliest first), the named cause or "", the snaps, and the checks of each fit.
     """
@@ -65,7 +65,7 @@ def table(found: dict[str, Any]) -> list[str]:
     fits: list[Fit] = found["fits"]
     snap: Snap = found["snaps"][0]
     rigid, best = found["rigid"], fits[0]
-    out = [f"{'explanation':32s} {'rms rad':>8s} {'BIC less the least':>18s}  parameters, 99 %"]
+    out = [f"{'hypothesis':32s} {'rms rad':>8s} {'BIC less the least':>18s}  parameters, 99 %"]
     for fit in fits:
         values = "; ".join(
             f"{name} {v:.4g} [{low:.4g}, {high:.4g}]"

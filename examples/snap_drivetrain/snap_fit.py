@@ -1,8 +1,8 @@
-"""Explanations of a recorded snap, fitted one by one: what the rigid model gets wrong, which effect of the catalogue mends it, at which size.
+"""Hypotheses on a recorded snap, fitted one by one: what the rigid model gets wrong, which effect of the catalogue mends it, at which size.
 
-Every explanation has the same nuisances: the robot file's values inside their tolerances, when the camera's clock started and where the
+Every hypothesis has the same nuisances: the robot file's values inside their tolerances, when the camera's clock started and where the
 markers' angle is zero. A cause adds one or two parameters of an effect of `ctr_dynamics.effects` without a prior. Least squares on the angle between
-the markers gives the likeliest values; BIC weighs explanations against each other.
+the markers gives the likeliest values; BIC weighs hypotheses against each other.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ LIMIT_S = 12e-3  # without a snap until then there is none
 ZERO = 0.02  # rad, deviation of the markers' zero
 CLOCK = 2e-5  # s, deviation of the time at which the angle is seen to pass 4 rad
 NUMERICS = 0.25  # part of the difference between coarse and fine grids that may be left in the fine one, as a deviation
-DECISIVE = 10.0  # difference of BIC from which on an explanation is better
+DECISIVE = 10.0  # difference of BIC from which on a hypothesis is better
 
 NUISANCES = (
     ("youngs_modulus", "tube1.scale"),
@@ -205,7 +205,7 @@ def simulate(robot: Robot, extensions: Values, snap: Snap, grid: Grid) -> Motion
 
 @dataclass
 class Fit:
-    """One explanation, fitted.
+    """One hypothesis, fitted.
 
     Attributes:
         values: of all effects, nuisances included. x: (n,) unknowns: nuisances in deviations, clock, zero, then those of the cause.

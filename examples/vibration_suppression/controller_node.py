@@ -2,7 +2,7 @@
 
     python controller_node.py --ros-args -p damping:=0.12 -p use_sim_time:=true
 
-A command goes out on /ctr/joint_commands at `rate_hz`, always: while the estimator is invalid or silent it fades back to the rest angles.
+A command goes out on /ctr/joint_commands at `rate_hz`, always: while the estimator is invalid or silent it decays to the rest angles.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ class ControllerNode(Node):
         )
         self._drives = DriveHistory()
         self._rate_sigma = math.inf
-        self.refused = {"no mode": 0, "no joints": 0, "invalid": 0}
+        self.rejected = {"no mode": 0, "no joints": 0, "invalid": 0}
         profile = qos.profile("reliable", 10)
         self._output = self.create_publisher(JointState, COMMANDS, profile)
         twist = message_class(topics.TOPIC[topics.TIP_TWIST].ros_type)
@@ -105,15 +105,15 @@ class ControllerNode(Node):
     def _modes(self, data: bytes) -> None:
         message = decode_modes(data)
         if message is None:
-            self._refuse("no mode")
+            self._reject("no mode")
             return
         t, count, position, velocity = message
         drive = self._drives.at(t)
         if self._mode >= count or not math.isfinite(self._rate_sigma):
-            self._refuse("no mode")
+            self._reject("no mode")
             return
         if drive is None:
-            self._refuse("no joints")
+            self._reject("no joints")
             return
         m = self._mode
         self._damper.take(
@@ -130,10 +130,10 @@ class ControllerNode(Node):
 
     def _valid(self, message: Bool) -> None:
         if not message.data:
-            self._refuse("invalid")
+            self._reject("invalid")
 
-    def _refuse(self, why: str) -> None:
-        self.refused[why] += 1
+    def _reject(self, why: str) -> None:
+        self.rejected[why] += 1
         self._damper.invalid()
 
     def _tick(self) -> None:
@@ -166,7 +166,7 @@ def main() -> int:
         try:
             spin_until(node, stop)
         finally:
-            node.get_logger().info(f"commands: {node.counts}; estimates refused: {node.refused}")
+            node.get_logger().info(f"commands: {node.counts}; estimates rejected: {node.rejected}")
             node.destroy_node()
             rclpy.try_shutdown()
     return 0

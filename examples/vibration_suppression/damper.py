@@ -75,7 +75,7 @@ class DriveHistory:
         self._readings: deque[tuple[float, float]] = deque(maxlen=64)
 
     def add(self, t: float, delta: float) -> None:
-        """A reading of delta (rad) at t (s); one that is not newer than the last starts the history anew."""
+        """A reading of delta (rad) at t (s); one that is not newer than the last begins a new history."""
         if self._readings and t <= self._readings[-1][0]:
             self._readings.clear()
         self._readings.append((t, delta))

@@ -1,4 +1,4 @@
-"""The simulated robot as a ROS node: hears joint commands, sends joints, tracker poses and loads; `plant.py` is the robot.
+"""The simulated robot as a ROS node: subscribes to joint commands, publishes joints, tracker poses and loads; `plant.py` is the robot.
 
     python robot_node.py --ros-args -p seconds:=6.0 -p speed:=0.5 -p report:=truth.npz
 

@@ -153,7 +153,7 @@ def test_joint_names(scenario, tmp_path, names, expected):
             {"skip": lambda topic, t: topic == topics.TRACKER_TIP and 0.5 < t < 1.5},
             "1 gaps longer than 0.5 s, the longest 1.000 s at 0.500 s",
         ),
-        ({"skip": lambda topic, t: topic == topics.TRACKER_TIP}, "only the model alone can run"),
+        ({"skip": lambda topic, t: topic == topics.TRACKER_TIP}, "only the open loop can run"),
         ({"tracker_stamp": lambda t: t - 3_000_000_000}, "log times are 3.000 s after the stamps"),
         ({"tracker_stamp": lambda t: t + 80_000_000}, "stamps are 0.080 s ahead of the joints'"),
         ({"tracker_stamp": lambda t: t // 50_000_000 * 50_000_000}, "40 stamps occur more than once"),

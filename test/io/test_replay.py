@@ -292,7 +292,7 @@ def test_what_a_replay_does_without_is_said(bags, stand_in, tmp_path):
             if m.topic != topics.TRACKER_TIP:
                 writer.write(m.topic, m.log_ns, m.data)
     assert run(tmp_path / "in.mcap", stand_in, tmp_path).notes == [
-        "no pose on /ctr/tracker/tip: the model runs alone"
+        "no pose on /ctr/tracker/tip: the model runs in open loop"
     ]
     settings = Settings({"output.policy": "wait", "record.path": "a.mcap", "qos.publisher_depth": 3})
     result = replay(bags / "clean_release.mcap", "till2020_tissue", settings, make_estimator=stand_in)

@@ -52,7 +52,7 @@ def test_failures_are_counted(tmp_path):
             outcomes[name] = fuzz.read_one(0, 1, kinds, tmp_path)[1]
     finally:
         fuzz.LIMIT_S = before
-    assert outcomes == {"hang": "too long", "refuse": "refused", "break": "failed", "take": "taken"}
+    assert outcomes == {"hang": "too long", "refuse": "rejected", "break": "failed", "take": "taken"}
 
 
 def test_nothing_in_a_file_is_executed(tmp_path):

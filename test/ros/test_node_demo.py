@@ -22,7 +22,7 @@ def run(capfd, **options):
 def test_the_demo_ends_with_tables_picture_and_recorded_outputs(tmp_path, capfd):
     code, shown = run(capfd, output=tmp_path / "out", duration=2.0)
     assert code == 0, shown
-    assert "model alone" in shown
+    assert "open loop" in shown
     assert "fused" in shown
     figures = json.loads((tmp_path / "out" / "demo.json").read_text())
     assert {c["reference"] for c in figures["comparisons"]} == {"tracker", "truth"}

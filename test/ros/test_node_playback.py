@@ -104,7 +104,7 @@ def test_comparison_is_over_the_samples_within_the_run():
     assert found.samples == 2
     assert found.fused_max == pytest.approx(1e-3)
     assert found.fused_rms == pytest.approx(1e-3 / np.sqrt(2))
-    assert found.alone_max == pytest.approx(5e-3)
+    assert found.open_loop_max == pytest.approx(5e-3)
     with pytest.raises(ValueError, match="tracker"):
         compare("tracker", Trace(np.array([5.0]), np.zeros((1, 3))), alone, fused)
     far = Trace(t, straight + 1.0)

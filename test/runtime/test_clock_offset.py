@@ -46,7 +46,7 @@ def test_one_wild_stamp_changes_nothing_and_a_lasting_change_is_followed(own):
     clock = StampClock(own)
     clock.sample(0, 0)
     assert not clock.sample(10**18, PERIOD), "it is to be left out"
-    assert "stamp 999999999.990 s ahead, limit 1 s" in clock.refusal(10**18, PERIOD)
+    assert "stamp 999999999.990 s ahead, limit 1 s" in clock.rejection(10**18, PERIOD)
     assert clock.at(PERIOD) == PERIOD
     assert clock.sample(2 * PERIOD, 2 * PERIOD)
     jump = 5_000 * MS

@@ -10,8 +10,8 @@ from ctr_dynamics.io.bag_reader import open_bag
 from ctr_dynamics.io.messages import topics
 from ctr_dynamics.io.messages.cdr import decode_stamp
 from ctr_dynamics.io.messages.encode import encode_joint_state, encode_wrench_stamped
-from ctr_dynamics.runtime import ring_buffer_recording as rolling
-from ctr_dynamics.runtime.ring_buffer_recording import RollingRecording
+from ctr_dynamics.runtime import ring_buffer_recording
+from ctr_dynamics.runtime.ring_buffer_recording import RingBufferRecording
 
 MS = 1_000_000
 S = 1_000 * MS
@@ -25,7 +25,7 @@ def joints(stamp_ns):
 def made(tmp_path):
     """A recording of two seconds and the lines of its log; closed at the end."""
     lines = []
-    recording = RollingRecording(tmp_path / "rolling.mcap", 2.0, "my robot.yaml", {}, lines.append)
+    recording = RingBufferRecording(tmp_path / "rolling.mcap", 2.0, "my robot.yaml", {}, lines.append)
     yield recording, lines
     if recording._thread.is_alive():
         recording.close(active=False)
@@ -51,7 +51,7 @@ def test_it_keeps_the_last_seconds_and_the_load_that_stood_before_them(made):
 
 def test_memory_is_bounded_and_a_clock_that_goes_back_begins_anew(made, monkeypatch):
     recording, _ = made
-    monkeypatch.setattr(rolling, "LIMIT_BYTES", 1000)
+    monkeypatch.setattr(ring_buffer_recording, "LIMIT_BYTES", 1000)
     for i in range(100):
         recording.put(topics.JOINT_STATES, 100 * S + i, bytes(100))
     assert sum(len(data) for _, _, data in recording.messages()) <= 1000
@@ -79,7 +79,9 @@ def test_what_cannot_be_written_is_said_and_the_thread_goes_on(made, tmp_path):
     recording.save("asked")
     assert done.wait(30)
     assert "no input has come yet" in recording.error
-    assert "no input" in recording.describe(Status("misfit", WARN, "misfit", {})).values["rolling recording"]
+    assert (
+        "no input" in recording.describe(Status("misfit", WARN, "misfit", {})).values["ring buffer recording"]
+    )
     recording.put(topics.JOINT_STATES, 0, joints(0))
     recording.save("asked again")
     recording.close(active=False)
@@ -91,4 +93,4 @@ def test_what_cannot_be_written_is_said_and_the_thread_goes_on(made, tmp_path):
 
 def test_a_path_that_cannot_be_is_refused_at_the_start(tmp_path):
     with pytest.raises(InputError, match=r"record\.rolling_path"):
-        RollingRecording(tmp_path / "none" / "a.mcap", 2.0, "r", {}, print)
+        RingBufferRecording(tmp_path / "none" / "a.mcap", 2.0, "r", {}, print)

@@ -14,8 +14,8 @@ from ctr_dynamics.runtime.node_diagnostics import clock_status, topics_status
 from ctr_dynamics.runtime.step_loop import (
     CATCH_UP_NS,
     INBOX_LIMIT,
-    REHEARSAL_NS,
-    REHEARSALS,
+    PREFETCH_NS,
+    PREFETCH_STEPS,
     STEP_NS,
     StepLoop,
 )
@@ -59,7 +59,7 @@ class Scripted:
         self.t0_ns, self.k = None, 0
 
 
-def make_loop(estimator, clock, policy="predict", publish=None, gather_ns=0, rehearse=lambda: None):
+def make_loop(estimator, clock, policy="predict", publish=None, gather_ns=0, prefetch=lambda: None):
     """A loop whose rounds the test calls itself; `published` holds the stamps."""
     published = []
     errors = []
@@ -76,7 +76,7 @@ def make_loop(estimator, clock, policy="predict", publish=None, gather_ns=0, reh
         StepTiming(policy, 100 * MS),
         errors.append,
         gather_ns=gather_ns,
-        rehearse=rehearse,
+        prefetch=prefetch,
     )
     return loop, published, errors
 
@@ -187,12 +187,12 @@ def test_a_flood_of_messages_is_refused_beyond_a_limit_and_counted(clock):
     taken = []
     for k in range(INBOX_LIMIT + 3):
         loop.offer(partial(taken.append, k))
-    assert loop.refused == 3
-    assert topics_status({}, {}, loop.refused).level == ERROR
+    assert loop.rejected == 3
+    assert topics_status({}, {}, loop.rejected).level == ERROR
     loop._round()
     assert taken == list(range(INBOX_LIMIT))
     loop.offer(partial(taken.append, -1))
-    assert loop.refused == 3
+    assert loop.rejected == 3
 
 
 def test_a_backlog_is_published_step_by_step_and_nothing_is_skipped(clock):
@@ -217,7 +217,7 @@ def test_a_hopeless_backlog_starts_anew(clock):
     loop._round()
     assert estimator.resets == 1
     assert len(published) == 1
-    assert "starts anew" in errors[0]
+    assert "reinitialises" in errors[0]
     assert loop.timing.restarts == 1
 
 
@@ -236,7 +236,7 @@ def test_a_fault_is_shown_and_the_estimator_starts_anew(clock):
     loop, _, errors = make_loop(estimator, clock)
     loop._round()
     assert loop.faults == 1
-    assert loop.last_fault == "ZeroDivisionError: no; the estimator starts anew"
+    assert loop.last_fault == "ZeroDivisionError: no; the estimator reinitialises"
     assert estimator.resets == 1
     assert "ZeroDivisionError" in errors[0]
 
@@ -308,7 +308,7 @@ def test_a_step_that_is_due_and_not_taken_is_not_asked_for_all_the_time(clock):
     assert waits == [pytest.approx(1e-3)]
 
 
-def test_housekeeping_is_told_whether_there_is_a_pause(clock):
+def test_housekeeping_is_told_whether_there_is_time_to_spare(clock):
     loop, _, _ = make_loop(Scripted(clock.now), clock)
     told = []
     loop._housekeeping = lambda now, pause: told.append(pause)
@@ -320,7 +320,7 @@ def test_housekeeping_is_told_whether_there_is_a_pause(clock):
     assert told == [True, True, False]
 
 
-def test_a_correction_that_waits_goes_before_the_pause(clock):
+def test_a_correction_that_waits_goes_before_idle_work(clock):
     estimator = Scripted(clock.now)
     loop, _, _ = make_loop(estimator, clock)
     loop._round()
@@ -421,7 +421,7 @@ def test_under_wait_every_step_is_out_before_the_next_is_taken(clock):
     assert taken == [(k, k + 1) for k in range(6)]
 
 
-def test_steps_are_rehearsed_once_a_moment_before_joints_that_several_wait_for(clock):
+def test_steps_are_prefetched_once_a_moment_before_joints_that_several_wait_for(clock):
     class Waiting(Scripted):
         """Takes the steps that joints cover."""
 
@@ -429,8 +429,8 @@ def test_steps_are_rehearsed_once_a_moment_before_joints_that_several_wait_for(c
             return super().advance(min(now_ns, self.covered_ns), spare_s, most)
 
     estimator = Waiting(clock.now)
-    rehearsed = []
-    loop, _, _ = make_loop(estimator, clock, policy="wait", rehearse=lambda: rehearsed.append(clock.now))
+    prefetched = []
+    loop, _, _ = make_loop(estimator, clock, policy="wait", prefetch=lambda: prefetched.append(clock.now))
     waits = noted_waits(loop)
     for _ in range(2):
         estimator.covered_ns = clock.now
@@ -441,36 +441,36 @@ def test_steps_are_rehearsed_once_a_moment_before_joints_that_several_wait_for(c
     begin = clock.now - 10 * MS  # of the second joint state; the third is expected 10 ms behind it
     clock.now = begin + 1 * MS
     loop._sleep()
-    assert waits.pop() == pytest.approx(1e-9 * (9 * MS - REHEARSAL_NS))
+    assert waits.pop() == pytest.approx(1e-9 * (9 * MS - PREFETCH_NS))
     loop._round()
-    assert rehearsed == []
-    clock.now = begin + 10 * MS - REHEARSAL_NS
+    assert prefetched == []
+    clock.now = begin + 10 * MS - PREFETCH_NS
     loop._round()
-    assert rehearsed == [clock.now] * REHEARSALS
+    assert prefetched == [clock.now] * PREFETCH_STEPS
     loop._round()
     loop._sleep()
-    assert len(rehearsed) == REHEARSALS
-    assert waits.pop() > 1e-9 * REHEARSAL_NS
+    assert len(prefetched) == PREFETCH_STEPS
+    assert waits.pop() > 1e-9 * PREFETCH_NS
     # joints that came early: what waits for them goes first
     loop.timing.arrived(begin + 10 * MS, begin + 10 * MS)
-    clock.now = begin + 20 * MS - REHEARSAL_NS
+    clock.now = begin + 20 * MS - PREFETCH_NS
     loop.inbox.append(lambda: None)
-    loop._rehearse()
-    assert len(rehearsed) == REHEARSALS
+    loop._prefetch()
+    assert len(prefetched) == PREFETCH_STEPS
 
 
 @pytest.mark.parametrize(("policy", "period_ns"), [("predict", 10 * MS), ("wait", 4 * MS)])
-def test_nothing_is_rehearsed_where_steps_come_one_by_one(clock, policy, period_ns):
+def test_nothing_is_prefetched_where_steps_come_one_by_one(clock, policy, period_ns):
     estimator = Scripted(clock.now)
-    rehearsed = []
-    loop, _, _ = make_loop(estimator, clock, policy=policy, rehearse=lambda: rehearsed.append(clock.now))
+    prefetched = []
+    loop, _, _ = make_loop(estimator, clock, policy=policy, prefetch=lambda: prefetched.append(clock.now))
     for _ in range(40):
         if (clock.now - estimator.t0_ns) % period_ns == 0:
             loop.timing.arrived(clock.now, clock.now)
         loop._round()
         clock.now += MS
     assert estimator.k > 10
-    assert rehearsed == []
+    assert prefetched == []
 
 
 def test_the_next_joints_are_expected_in_the_rhythm_of_their_stamps():

@@ -83,11 +83,11 @@ class Template:
         """
         numbers = np.concatenate(values, axis=None)
         if not math.isfinite(numbers.sum()):
-            self._refuse(stamp_ns, numbers)
+            self._reject(stamp_ns, numbers)
         self._doubles[self._slots] = numbers
         return self.stamped(stamp_ns)
 
-    def _refuse(self, stamp_ns: int, numbers: NDArray) -> None:
+    def _reject(self, stamp_ns: int, numbers: NDArray) -> None:
         """Raises NotFiniteError for the first message whose numbers are not finite."""
         for topic, part in zip(self.topics, np.split(numbers, np.cumsum(self.counts)[:-1]), strict=True):
             if not np.isfinite(part).all():

@@ -6,7 +6,7 @@ from ctr_dynamics.model.paired_steps import Pair
 from ctr_dynamics.model.simulator import Simulator
 from ctr_dynamics.parameters import Settings
 from ctr_dynamics.robot_files import load_robot
-from ctr_dynamics.runtime.warm_up import rehearse
+from ctr_dynamics.runtime.warm_up import warm_up
 
 
 @pytest.mark.parametrize("policy", ["predict", "wait"])
@@ -23,7 +23,7 @@ def test_both_runs_step_together_and_each_by_itself(monkeypatch, name, policy):
 
         monkeypatch.setattr(kind, "step", noted)
     settings = Settings({"robot": name, "output.policy": policy})
-    assert rehearse(load_robot(name), settings) > 100
+    assert warm_up(load_robot(name), settings) > 100
     assert sum(result is not None for _, result in taken[Pair]) > 100
     assert len({id(simulator) for simulator, _ in taken[Simulator]}) == 2
     assert all(result.ok for _, result in taken[Simulator])
