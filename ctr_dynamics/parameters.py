@@ -51,16 +51,6 @@ PARAMETERS: tuple[Parameter, ...] = (
         read_only=True,
     ),
     Parameter(
-        "model.dt_s",
-        "float",
-        0.003,
-        "s",
-        "Time step of the model and of the outputs.",
-        0.003,
-        0.003,
-        read_only=True,
-    ),
-    Parameter(
         "model.nodes", "int", 12, "", "Number of arc-length nodes along the robot.", 8, 1000, read_only=True
     ),
     Parameter(
@@ -322,6 +312,7 @@ PARAMETERS: tuple[Parameter, ...] = (
 )
 
 _BY_NAME = {parameter.name: parameter for parameter in PARAMETERS}
+_REMOVED = {"model.dt_s": "steps always take 3 ms: remove it"}
 # In every node's parameter file, and none of this table's business.
 _ROS_NAMES = re.compile(r"use_sim_time|start_type_description_service|qos_overrides\..*")
 
@@ -336,7 +327,7 @@ def parameter(name: str) -> Parameter:
         return _BY_NAME[name]
     except KeyError:
         near = get_close_matches(name, _BY_NAME, 1)
-        hint = f"did you mean '{near[0]}'?" if near else "see docs/parameters.md"
+        hint = _REMOVED.get(name) or (f"did you mean '{near[0]}'?" if near else "see docs/parameters.md")
         raise InputError(f"unknown parameter '{name}'", do=hint) from None
 
 

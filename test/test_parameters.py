@@ -96,7 +96,6 @@ def test_missing_parameter_file(tmp_path):
         ("model.nodes", 24.0, "24.0 is not a whole number"),
         ("model.nodes", True, "True is not a whole number"),
         ("model.alpha", math.nan, "nan is not finite"),
-        ("model.dt_s", 0.001, "0.001 s is outside its range; write 0.003 s"),
         ("model.scheme", "rk4", "'rk4' is not known; write backward_euler"),
         ("filter.enabled", "maybe", "'maybe' is not true or false"),
         ("filter.enabled", 1, "1 is not true or false"),

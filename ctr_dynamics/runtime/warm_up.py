@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 from ctr_dynamics.estimation.estimator import Estimator
+from ctr_dynamics.io.messages.topics import STEP_NS
 from ctr_dynamics.parameters import Settings
 from ctr_dynamics.robot import Robot
 from ctr_dynamics.runtime.step_encoder import StepEncoder
@@ -57,5 +58,5 @@ def warm_up(robot: Robot, settings: Settings) -> int:
             beside = PUSH * math.sin(SWING * tick) if tick in PUSHED else 0.0
             estimator.add_tracker_pose(out.stamp_ns - age_ns, (x + beside, y, z), (*xyz, w))
     if estimator.runs.fused is not None:
-        estimator.runs.apart(estimator.k * estimator.settings["model.dt_s"], [], record=True)
+        estimator.runs.apart(estimator.k * STEP_NS * 1e-9, [], record=True)
     return steps
