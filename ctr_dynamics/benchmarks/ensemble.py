@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ctr_dynamics.benchmarks.machine import best_of
 from ctr_dynamics.benchmarks.release import DT, Release, release_robot, sampled
-from ctr_dynamics.effects import apply_effects, make_setup
+from ctr_dynamics.effects import apply_effects
 from ctr_dynamics.model.batch import LANES, run_many
 from ctr_dynamics.model.model import Model
 from ctr_dynamics.model.time_scheme import make_scheme
@@ -27,9 +27,9 @@ def ensemble(test: Release, nodes: int, cases: int, duration: float, tolerance: 
     rng = np.random.default_rng(0)
     blocks, inputs = [], []
     for _ in range(cases):
-        setup = make_setup(model)
-        apply_effects(setup, {"youngs_modulus": {"all.scale": 1.0 + SPREAD * rng.standard_normal()}})
-        blocks.append(setup.block)
+        plant = model.plant.copy()
+        apply_effects(plant, {"youngs_modulus": {"all.scale": 1.0 + SPREAD * rng.standard_normal()}})
+        blocks.append(plant.block)
         inputs.append(sampled(test, DT, duration, SPREAD * rng.standard_normal(2)))
     parameters = np.stack(blocks)
     run_many(model, scheme, parameters[:LANES], inputs[:LANES], 4 * DT, tolerance=tolerance)

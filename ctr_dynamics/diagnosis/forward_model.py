@@ -1,6 +1,6 @@
 """One bag seen through the model: what the tracker should have read for any values of the effects, and its derivatives.
 
-The way is the estimator's: readings to actuators (:class:`ctr_dynamics.effects.Setup`), the dynamic model, tip to tracker. Derivatives by
+The way is the estimator's: readings to actuators (:class:`ctr_dynamics.effects.Plant`), the dynamic model, tip to tracker. Derivatives by
 quantities that move the model go through the tangent of every step; those of the tracker chain are differences of the last link alone.
 """
 
@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctr_dynamics.diagnosis.recording import Recording
-from ctr_dynamics.effects import EFFECTS, Quantity, Setup, apply_effects, make_setup
+from ctr_dynamics.effects import EFFECTS, Plant, Quantity, apply_effects, make_plant
 from ctr_dynamics.errors import InputError
-from ctr_dynamics.kernels.backlash import play
 from ctr_dynamics.kernels.lanes import PACK
+from ctr_dynamics.kernels.rotations import conjugate_rows, multiply_rows, to_vector_rows
 from ctr_dynamics.model.model import Model
 from ctr_dynamics.model.time_scheme import make_scheme
 from ctr_dynamics.model.trajectory import InputRows, Trajectory, run
@@ -30,9 +30,6 @@ Point = Mapping[
 NODES = 10  # from plate to tip: the error in space is then far below that in time (numerics.py measures both)
 FRACTION = 1e-3  # of a quantity's unit, for differences of what is cheap to evaluate
 GAP = 0.05  # s between joint states beyond which nothing is known of the motion between them
-AVERAGE_POINTS = np.array([0.04691008, 0.23076534, 0.5, 0.76923466, 0.95308992])
-AVERAGE_WEIGHTS = np.array([0.11846344, 0.23931434, 0.28444444, 0.23931434, 0.11846344])
-_INPUTS = ("gain", "offset", "backlash", "beta_offset", "actuator_delay", "load_shift", "tip_force")
 
 
 @dataclass(frozen=True)
@@ -60,7 +57,7 @@ class ForwardModel:
         self.recording, self.robot, self.nodes = recording, robot, nodes
         self.scheme = make_scheme("sdirk3", dt)
         self._models = {False: Model(robot, nodes=nodes), True: Model(robot, nodes=nodes, extended=True)}
-        self.nominal = make_setup(self._models[False])
+        self.nominal = make_plant(robot)
         load = Signal(6)
         for time, *wrench in recording.load.tolist():
             load.add(round(time * 1e9), np.array(wrench))
@@ -76,24 +73,21 @@ class ForwardModel:
 
     # -- the chain --
 
-    def setup(self, point: Point) -> Setup:
-        """Setup at ``point``."""
-        setup = self.nominal.copy()
+    def plant(self, point: Point) -> Plant:
+        """Plant at ``point``."""
+        plant = self.nominal.copy()
         values: dict[str, dict[str, float]] = {}
         for (effect, name), coordinate in point.items():
             values.setdefault(effect, {})[name] = EFFECTS[effect].find(name).value(coordinate)
-        apply_effects(setup, values)
-        return setup
+        apply_effects(plant, values)
+        return plant
 
-    def inputs(self, setup: Setup, extended: bool) -> InputRows:
+    def inputs(self, plant: Plant, extended: bool) -> InputRows:
         """Actuators and load at any times, as the model takes them."""
-        n, joints, load = setup.n, self.recording.joints, self.recording.load
+        n, joints, load, actuators = plant.n, self.recording.joints, self.recording.load, plant.actuators
         t = joints[:, 0]
-        alpha = joints[:, 1 : 1 + n] * setup.gain + setup.offset
-        for i in range(n):
-            if setup.backlash[i] > 0.0:
-                alpha[:, i] = play(np.ascontiguousarray(alpha[:, i]), setup.backlash[i])
-        beta = joints[:, 1 + n : 1 + 2 * n] + setup.beta_offset
+        position = actuators.behind_backlash(actuators.forward(joints[:, 1 : 1 + 2 * n]))
+        alpha, beta = position[:, :n], position[:, n:]
         steps = np.diff(t)
         turned = smooth(t, alpha)
         slides = np.diff(beta, axis=0) / steps[:, None]
@@ -101,13 +95,13 @@ class ForwardModel:
 
         def rows(times: Floats) -> Floats:
             out = np.zeros((len(times), width))
-            out[:, :n], out[:, n : 2 * n] = turned(times - setup.actuator_delay)
+            out[:, :n], out[:, n : 2 * n] = turned(times - actuators.delay)
             for i in range(n):
                 out[:, 2 * n + i] = np.interp(times, t, beta[:, i])
             if len(load):
                 for i in range(6):
-                    out[:, 3 * n + i] = np.interp(times - setup.load_shift, load[:, 0], load[:, 1 + i])
-            out[:, 3 * n : 3 * n + 3] += setup.tip_force
+                    out[:, 3 * n + i] = np.interp(times - plant.load_delay, load[:, 0], load[:, 1 + i])
+            out[:, 3 * n : 3 * n + 3] += plant.tip_force
             if extended:
                 interval = np.clip(np.searchsorted(t, times, side="left") - 1, 0, len(steps) - 1)
                 out[:, 3 * n + 6 :] = np.where(
@@ -117,37 +111,36 @@ class ForwardModel:
 
         return rows
 
-    def _observe(self, setup: Setup, trajectory: Trajectory) -> tuple[Floats, Floats]:
-        """(position (s, 3), quaternion (s, 4)) that the tracker chain makes of a trajectory."""
-        stamps = self.recording.stamps
-        times = stamps / (1.0 + setup.skew) - setup.delay
-        tip = trajectory.tip[:, :7]
-        rows = _mean(tip, trajectory.t, times, _window(setup))
-        h = rows[:, 3:] / np.linalg.norm(rows[:, 3:], axis=1, keepdims=True)
-        point = setup.tracker_scale * (rows[:, :3] + rotate(h, setup.lever))
-        position = rotate(setup.rotation, point) + setup.translation + setup.drift * stamps[:, None]
-        return position, product(setup.rotation, h)
+    def _observe(self, plant: Plant, trajectory: Trajectory) -> tuple[Floats, Floats]:
+        """(position (s, 3), quaternion (s, 4)) that the tracker reports of a trajectory."""
+
+        def tip_at(times: Floats) -> Floats:
+            tip = at_times(trajectory.tip[:, :7], trajectory.t, times)
+            tip[:, 3:] /= np.linalg.norm(tip[:, 3:], axis=1, keepdims=True)
+            return tip
+
+        return plant.tracker.forward(self.recording.stamps, tip_at)
 
     # -- predictions --
 
     def predict(self, point: Point) -> Prediction:
         """The tracker's readings at ``point``; where the simulation ends early they are NaN."""
-        setup = self.setup(point)
-        trajectory = self._run(setup, setup.extended)
-        position, quaternion = self._observe(setup, trajectory)
+        plant = self.plant(point)
+        trajectory = self._run(plant, plant.extended)
+        position, quaternion = self._observe(plant, trajectory)
         if trajectory.failure:
             late = self.recording.stamps > trajectory.t[-1]
             position[late], quaternion[late] = np.nan, np.nan
         return Prediction(position, quaternion, trajectory, trajectory.failure)
 
-    def _run(self, setup: Setup, extended: bool, **columns: object) -> Trajectory:
+    def _run(self, plant: Plant, extended: bool, **columns: object) -> Trajectory:
         return run(
             self._models[extended],
             self.scheme,
-            setup.block,
-            self.inputs(setup, extended),
+            plant.block,
+            self.inputs(plant, extended),
             self.recording.duration,
-            events=(self._load_events + setup.load_shift).tolist(),
+            events=(self._load_events + plant.load_delay).tolist(),
             **columns,  # type: ignore[arg-type]
         )
 
@@ -156,7 +149,9 @@ class ForwardModel:
         return np.hstack(
             [
                 self.recording.position - prediction.position,
-                to_vectors(product(conjugated(prediction.quaternion), self.recording.quaternion)),
+                to_vector_rows(
+                    multiply_rows(conjugate_rows(prediction.quaternion), self.recording.quaternion)
+                ),
             ]
         )
 
@@ -170,14 +165,12 @@ class ForwardModel:
 
     def jacobian(self, point: Point, wanted: Sequence[Quantity]) -> tuple[Prediction, Floats]:
         """Prediction at ``point`` and its derivatives (s, 6, len(wanted)) by the coordinates of ``wanted``, each times its ``scale``."""
-        setup = self.setup(point)
-        changed = [self.setup(moved(point, q, FRACTION)) for q in wanted]
+        plant = self.plant(point)
+        changed = [self.plant(moved(point, q, FRACTION)) for q in wanted]
         kinds: list[str] = []
         for other in changed:
-            model = not np.array_equal(other.block, setup.block) or any(
-                not np.array_equal(getattr(other, name), getattr(setup, name)) for name in _INPUTS
-            )
-            needs = model and (setup.extended or other.extended)
+            model = not np.array_equal(other.block, plant.block) or not other.has_inputs_of(plant)
+            needs = model and (plant.extended or other.extended)
             kinds.append("tracker" if not model else "extended" if needs else "plain")
         numbers = {kind: [i for i, k in enumerate(kinds) if k == kind] for kind in ("plain", "extended")}
         if numbers["extended"] and len(numbers["plain"]) <= -len(numbers["extended"]) % PACK:
@@ -189,34 +182,35 @@ class ForwardModel:
         for kind, chosen in numbers.items():
             if not chosen and not (kind == "extended" and prediction is None):
                 continue
-            extended = kind == "extended" and (bool(chosen) or setup.extended)
-            trajectory = self._columns(setup, [changed[i] for i in chosen], extended)
-            position, quaternion = self._observe(setup, trajectory)
+            extended = kind == "extended" and (bool(chosen) or plant.extended)
+            trajectory = self._columns(plant, [changed[i] for i in chosen], extended)
+            position, quaternion = self._observe(plant, trajectory)
             if trajectory.failure:
                 position[self.recording.stamps > trajectory.t[-1]] = np.nan
             if prediction is None or trajectory.failure:
                 prediction = Prediction(position, quaternion, trajectory, trajectory.failure)
             if chosen:
-                columns[:, :, chosen] = self._through(setup, trajectory)
+                columns[:, :, chosen] = self._through(plant, trajectory)
         assert prediction is not None
         for i, kind in enumerate(kinds):
             if kind == "tracker":
                 position, quaternion = self._observe(changed[i], prediction.trajectory)
                 columns[:, :3, i] = (position - prediction.position) / FRACTION
                 columns[:, 3:, i] = (
-                    to_vectors(product(conjugated(prediction.quaternion), quaternion)) / FRACTION
+                    to_vector_rows(multiply_rows(conjugate_rows(prediction.quaternion), quaternion))
+                    / FRACTION
                 )
         return prediction, np.nan_to_num(columns)
 
-    def _columns(self, setup: Setup, changed: Sequence[Setup], extended: bool) -> Trajectory:
+    def _columns(self, plant: Plant, changed: Sequence[Plant], extended: bool) -> Trajectory:
         if not changed:
-            return self._run(setup, extended)
-        effect = np.stack([(other.block - setup.block) / FRACTION for other in changed], axis=1)
-        base = self.inputs(setup, extended)
+            return self._run(plant, extended)
+        effect = np.stack([(other.block - plant.block) / FRACTION for other in changed], axis=1)
+        base = self.inputs(plant, extended)
         moving = [
             (i, self.inputs(other, extended))
             for i, other in enumerate(changed)
-            if any(not np.array_equal(getattr(other, name), getattr(setup, name)) for name in _INPUTS)
+            if not other.has_inputs_of(plant)
         ]
         width = self._models[extended].input_count
 
@@ -227,32 +221,17 @@ class ForwardModel:
                 out[:, :, i] = (rows(times) - here) / FRACTION
             return out
 
-        return self._run(setup, extended, effect=effect, input_effect=input_effect)
+        return self._run(plant, extended, effect=effect, input_effect=input_effect)
 
-    def _through(self, setup: Setup, trajectory: Trajectory) -> Floats:
+    def _through(self, plant: Plant, trajectory: Trajectory) -> Floats:
         """Columns of the tip as columns of the readings, (s, 6, r)."""
         assert trajectory.columns is not None
-        times = self.recording.stamps / (1.0 + setup.skew) - setup.delay
-        flat = trajectory.columns[:, :7].reshape(len(trajectory.t), -1)
-        tip = trajectory.tip[:, :7]
-        parts = _window(setup)
-        rows = _mean(flat, trajectory.t, times, parts).reshape(len(times), 7, -1)
-        h = _mean(tip, trajectory.t, times, parts)[:, 3:]
-        norm2 = np.sum(h * h, axis=1)[:, None]
-        r = rows.shape[2]
-        back = conjugated(h)
-        # body rotation vector of a change of a quaternion of any length: 2 vec(h^-1 dh) / |h|^2
-        dh = rows[:, 3:].transpose(0, 2, 1)
-        turn = 2.0 * product(back[:, None, :].repeat(r, axis=1).reshape(-1, 4), dh.reshape(-1, 4))[:, 1:]
-        turn = turn.reshape(len(times), r, 3) / norm2[:, :, None]
-        swing = np.cross(turn, setup.lever)
-        unit = h / np.sqrt(norm2)
-        swing = rotate(unit[:, None, :].repeat(r, axis=1).reshape(-1, 4), swing.reshape(-1, 3)).reshape(
-            len(times), r, 3
+        tip, flat = trajectory.tip[:, :7], trajectory.columns[:, :7].reshape(len(trajectory.t), -1)
+        return plant.tracker.derivative(
+            self.recording.stamps,
+            lambda times: at_times(tip, trajectory.t, times),
+            lambda times: at_times(flat, trajectory.t, times),
         )
-        shift = setup.tracker_scale * (rows[:, :3].transpose(0, 2, 1) + swing)
-        shift = rotate(setup.rotation, shift.reshape(-1, 3)).reshape(len(times), r, 3)
-        return np.concatenate([shift, turn], axis=2).transpose(0, 2, 1)
 
 
 def moved(point: Point, quantity: Quantity, share: float) -> dict[tuple[str, str], float]:
@@ -308,55 +287,3 @@ def smooth(t: Floats, values: Floats) -> Callable[[Floats], tuple[Floats, Floats
         return value, np.where(inside[:, None], rate, 0.0)
 
     return at
-
-
-def _window(setup: Setup) -> list[tuple[float, float]]:
-    """(age in s, weight) of what a tracker averages."""
-    if setup.averaging <= 0.0:
-        return [(0.0, 1.0)]
-    return [
-        (float(x) * setup.averaging, float(w)) for x, w in zip(AVERAGE_POINTS, AVERAGE_WEIGHTS, strict=True)
-    ]
-
-
-def _mean(values: Floats, t: Floats, times: Floats, parts: Sequence[tuple[float, float]]) -> Floats:
-    """Weighted mean of ``values`` at ``times`` minus the ages of ``parts``."""
-    out = np.zeros((len(times), values.shape[1]))
-    for age, weight in parts:
-        out += weight * at_times(values, t, times - age)
-    return out
-
-
-def conjugated(h: Floats) -> Floats:
-    """Inverses of unit quaternions (k, 4)."""
-    return h * np.array([1.0, -1.0, -1.0, -1.0])
-
-
-def product(a: Floats, b: Floats) -> Floats:
-    """Hamilton products of quaternions (k, 4) or (4,), row by row."""
-    aw, ax, ay, az = np.moveaxis(np.atleast_2d(a), -1, 0)
-    bw, bx, by, bz = np.moveaxis(np.atleast_2d(b), -1, 0)
-    return np.stack(
-        [
-            aw * bw - ax * bx - ay * by - az * bz,
-            aw * bx + ax * bw + ay * bz - az * by,
-            aw * by - ax * bz + ay * bw + az * bx,
-            aw * bz + ax * by - ay * bx + az * bw,
-        ],
-        axis=-1,
-    )
-
-
-def rotate(h: Floats, v: Floats) -> Floats:
-    """Vectors (k, 3) or (3,) turned by unit quaternions (k, 4) or (4,), row by row."""
-    h, v = np.atleast_2d(h), np.atleast_2d(v)
-    w, u = h[:, :1], h[:, 1:]
-    return v + 2.0 * np.cross(u, np.cross(u, v) + w * v)
-
-
-def to_vectors(h: Floats) -> Floats:
-    """Rotation vectors (k, 3) rad, shorter than pi, of unit quaternions (k, 4)."""
-    h = np.where(h[:, :1] < 0.0, -h, h)
-    norm = np.linalg.norm(h[:, 1:], axis=1, keepdims=True)
-    angle = 2.0 * np.arctan2(norm, h[:, :1])
-    return h[:, 1:] * np.where(norm > 1e-12, angle / np.maximum(norm, 1e-12), 2.0)

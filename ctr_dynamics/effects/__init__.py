@@ -1,20 +1,34 @@
-"""The catalogue of effects: what the model can be extended by, and what diagnosis looks for."""
+"""The catalogue of effects: what the model can be extended by, and what diagnosis looks for; and the plant that they act on."""
 
-from ctr_dynamics.effects import drive, friction, structure, surroundings, tracking
-from ctr_dynamics.effects.registry import EFFECTS, Effect, Parameter, Quantity, apply_effects, quantities
-from ctr_dynamics.effects.setup import Setup, make_setup
-from ctr_dynamics.kernels.backlash import play
+from ctr_dynamics.effects import catalogue
+from ctr_dynamics.effects.plant import Plant
+from ctr_dynamics.effects.registry import (
+    EFFECTS,
+    Effect,
+    EffectParameter,
+    Quantity,
+    Values,
+    apply_effects,
+    effect,
+    make_plant,
+    per_tube,
+    quantities,
+    register,
+)
 
 __all__ = [
     "EFFECTS",
     "Effect",
-    "Parameter",
+    "EffectParameter",
+    "Plant",
     "Quantity",
-    "Setup",
+    "Values",
     "apply_effects",
-    "make_setup",
-    "play",
+    "effect",
+    "make_plant",
+    "per_tube",
     "quantities",
+    "register",
 ]
 
-_ = (structure, friction, drive, surroundings, tracking)  # registered in this order
+register(*catalogue.CATALOGUE)

@@ -9,7 +9,7 @@ from typing import Any
 
 from pydantic_core import PydanticCustomError
 
-from ctr_dynamics.effects.registry import EFFECTS, Parameter
+from ctr_dynamics.effects.registry import EFFECTS, EffectParameter
 from ctr_dynamics.errors import InputError
 from ctr_dynamics.robot.quantity import number
 
@@ -47,7 +47,7 @@ def check_extensions(given: Mapping[str, Mapping[str, Any]], n_tubes: int) -> No
             _check_value(name, key, value, effect.find(key))
 
 
-def _check_value(name: str, key: str, value: float, parameter: Parameter) -> None:
+def _check_value(name: str, key: str, value: float, parameter: EffectParameter) -> None:
     """Bounds are those of the parameter's coordinate, a power of its value."""
     found = f"extension '{name}': '{key}' is {value:g} {parameter.unit}"
     if parameter.power < 0 and value <= 0.0:

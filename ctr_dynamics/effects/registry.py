@@ -1,8 +1,8 @@
-"""What the model can be extended by: effects, their parameters, and how a parameter's value changes the prediction.
+"""What the model can be extended by: effects, their parameters, and how a parameter's value changes the plant.
 
-An effect is declared once, with the names, units and signs under which findings and robot files know it. It acts on a :class:`Setup`: the
-model's parameter block, the way from encoder readings to actuators, and the way from the tip to a tracker's reading. At the off-values
-of its parameters it leaves the setup as it is, bit for bit.
+An effect is declared once, with the names, units and signs under which findings and robot files know it. It acts on a
+:class:`ctr_dynamics.effects.plant.Plant`: the model's parameters, the drives, or the tracker. At the off-values of its parameters it leaves the
+plant as it is, bit for bit. How to write one: docs/extending.md.
 """
 
 from __future__ import annotations
@@ -11,22 +11,22 @@ import math
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-if TYPE_CHECKING:
-    from ctr_dynamics.effects.setup import Setup
-    from ctr_dynamics.robot import Robot
+from ctr_dynamics.effects.plant import Plant
+from ctr_dynamics.robot import Robot
 
 Floats = NDArray[np.float64]
 Values = Mapping[str, float]
-Nominal = Callable[["Robot", int], float]  # of a robot and a tube (from 0)
+Nominal = Callable[[Robot, int], float]  # of a robot and a tube (from 0)
+Apply = Callable[[Plant, Values], None]
 
 
 @dataclass(frozen=True)
-class Parameter:
+class EffectParameter:
     """One parameter of an effect.
 
     Attributes:
@@ -70,12 +70,12 @@ class Parameter:
 
 @dataclass(frozen=True)
 class Effect:
-    """One entry of the catalogue.
+    """One entry of the catalogue; :func:`effect` makes it from the function that applies it.
 
     Attributes:
         name: its ID.
         parameters: what it takes.
-        apply: changes a setup by values by name (all names present, ``tubeN`` expanded).
+        apply: changes a plant by values by name (all names present, ``tubeN`` expanded).
         text: what it models, one sentence. source: where the physics comes from.
         extended: whether it needs the extended kernels.
         probes: sizes, in scales, at which it is tried where its derivative at the off-value says little; empty where that serves.
@@ -89,8 +89,8 @@ class Effect:
     """
 
     name: str
-    parameters: tuple[Parameter, ...]
-    apply: Callable[[Setup, Values], None]
+    parameters: tuple[EffectParameter, ...]
+    apply: Apply
     text: str
     source: str
     extended: bool = False
@@ -108,24 +108,40 @@ class Effect:
             re.fullmatch(re.escape(p.name).replace("tubeN", "tube[1-9]"), name) for p in self.parameters
         )
 
-    def find(self, name: str) -> Parameter:
+    def find(self, name: str) -> EffectParameter:
         """The parameter called ``name``, with a tube's number or without."""
         generic = re.sub(r"^tube[1-9]", "tubeN", name)
         return next(p for p in self.parameters if p.name in (name, generic))
 
 
+def effect(
+    name: str, *parameters: EffectParameter, text: str, source: str, **options: Any
+) -> Callable[[Apply], Effect]:
+    """Declare a function that changes a plant as an :class:`Effect`.
+
+    Args:
+        name: ID of the effect, as in findings and robot files.
+        parameters: what it takes.
+        text: what it models, one sentence.
+        source: where the physics comes from.
+        options: the other attributes of :class:`Effect`.
+    """
+    return lambda apply: Effect(name, parameters, apply, text, source, **options)
+
+
 EFFECTS: dict[str, Effect] = {}
+"""The catalogue by ID, in the order in which effects were registered."""
 
 
-def register(effect: Effect) -> Effect:
-    """Make ``effect`` known.
+def register(*effects: Effect) -> None:
+    """Make effects known to robot files, simulation, estimator and diagnosis.
 
     Raises:
-        ValueError: another effect has its name.
+        ValueError: another effect has the name.
     """
-    if EFFECTS.setdefault(effect.name, effect) is not effect:
-        raise ValueError(f"effect '{effect.name}' is registered twice")
-    return effect
+    for entry in effects:
+        if EFFECTS.setdefault(entry.name, entry) is not entry:
+            raise ValueError(f"effect '{entry.name}' is registered twice")
 
 
 @dataclass(frozen=True)
@@ -144,7 +160,7 @@ class Quantity:
     scale: float
     low: float
     high: float
-    parameter: Parameter = field(compare=False)
+    parameter: EffectParameter = field(compare=False)
 
     @property
     def key(self) -> tuple[str, str]:
@@ -166,47 +182,57 @@ def _number(x: float | Nominal, robot: Robot, tube: int) -> float:
     return float(x(robot, tube)) if callable(x) else float(x)
 
 
+def _expanded(p: EffectParameter, robot: Robot) -> list[tuple[str, int]]:
+    """Names of a parameter with the tube (from 0) that each is for; 0 where it is for none."""
+    tubes = range(robot.n_tubes) if p.name.startswith("tubeN") else [0]
+    return [(p.name.replace("tubeN", f"tube{tube + 1}"), tube) for tube in tubes]
+
+
 def quantities(robot: Robot) -> list[Quantity]:
     """Every parameter of every registered effect for ``robot``, tubes expanded."""
     found = []
-    for effect in EFFECTS.values():
-        for p in effect.parameters:
-            for tube in range(robot.n_tubes) if p.name.startswith("tubeN") else [0]:
+    for entry in EFFECTS.values():
+        for p in entry.parameters:
+            for name, tube in _expanded(p, robot):
                 scale = _number(p.scale, robot, tube)
                 if scale <= 0.0:
                     continue
                 off = p.coordinate(_number(p.off, robot, tube))
                 tolerance = p.tolerance(robot, tube) if p.tolerance else 0.0
                 found.append(
-                    Quantity(
-                        effect.name,
-                        p.name.replace("tubeN", f"tube{tube + 1}"),
-                        off,
-                        tolerance,
-                        scale,
-                        max(p.low, -math.inf),
-                        p.high,
-                        p,
-                    )
+                    Quantity(entry.name, name, off, tolerance, scale, max(p.low, -math.inf), p.high, p)
                 )
     return found
 
 
-def apply_effects(setup: Setup, given: Mapping[str, Mapping[str, Any]]) -> None:
-    """Change ``setup`` by effects and values by name; parameters that are not given stay at their off-values.
+def apply_effects(plant: Plant, given: Mapping[str, Mapping[str, Any]]) -> None:
+    """Change ``plant`` by effects and values by name; parameters that are not given stay at their off-values.
 
     Raises:
         KeyError: no such effect or parameter (robot files are checked when they are loaded).
     """
     # what is uncertain in an effect's form comes after the effect
     for name, values in sorted(given.items(), key=lambda item: EFFECTS[item[0]].nuisance):
-        effect = EFFECTS[name]
-        full: dict[str, float] = {}
-        for p in effect.parameters:
-            for tube in range(setup.n) if p.name.startswith("tubeN") else [0]:
-                full[p.name.replace("tubeN", f"tube{tube + 1}")] = _number(p.off, setup.robot, tube)
+        entry = EFFECTS[name]
+        full = {
+            expanded: _number(p.off, plant.robot, tube)
+            for p in entry.parameters
+            for expanded, tube in _expanded(p, plant.robot)
+        }
         unknown = set(values) - set(full)
         if unknown:
             raise KeyError(f"{name} has no parameter {sorted(unknown)}")
         full.update({k: float(v) for k, v in values.items()})
-        effect.apply(setup, full)
+        entry.apply(plant, full)
+
+
+def make_plant(robot: Robot) -> Plant:
+    """Plant of a robot file with the effects that it names under ``extensions``."""
+    plant = Plant.of_robot(robot)
+    apply_effects(plant, robot.extensions)
+    return plant
+
+
+def per_tube(plant: Plant, values: Values, name: str) -> Floats:
+    """(N,) values of the parameter ``tubeN.name``."""
+    return np.array([values[f"tube{i + 1}.{name}"] for i in range(plant.n)])

@@ -2,176 +2,144 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
-from ctr_dynamics.effects.registry import Effect, Parameter, Values, register
+from ctr_dynamics.effects.plant import Plant
+from ctr_dynamics.effects.registry import EffectParameter, Values, effect
 from ctr_dynamics.kernels.rotations import from_vector, matrix, multiply
 
-if TYPE_CHECKING:
-    from ctr_dynamics.effects.setup import Setup
 
-
-def _rotation(setup: Setup, values: Values) -> None:
+@effect(
+    "registration_rotation",
+    *(
+        EffectParameter(
+            f"r{a}_rad",
+            "rad",
+            0.0,
+            0.03,
+            lambda robot, i: float(np.max(robot.tracker.registration_rotation.tolerance)),
+            text=f"turn about {a}",
+        )
+        for a in "xyz"
+    ),
+    text="The tracker's frame is turned against the base frame.",
+    source="reading = R p + t",
+    joint=True,
+)
+def registration_rotation(plant: Plant, values: Values) -> None:
     turn = np.array([values["rx_rad"], values["ry_rad"], values["rz_rad"]])
     if turn.any():
         extra = from_vector(turn)
-        setup.rotation = multiply(extra, setup.rotation)
-        setup.translation = matrix(extra) @ setup.translation
+        tracker = plant.tracker
+        plant.change_tracker(
+            rotation=multiply(extra, tracker.rotation), translation=matrix(extra) @ tracker.translation
+        )
 
 
-def _translation(setup: Setup, values: Values) -> None:
-    setup.translation = setup.translation + [values["tx_m"], values["ty_m"], values["tz_m"]]
-
-
-def _lever(setup: Setup, values: Values) -> None:
-    setup.lever = setup.lever + [values["x_m"], values["y_m"], values["z_m"]]
-
-
-def _drift(setup: Setup, values: Values) -> None:
-    setup.drift = setup.drift + [values["x_m_per_s"], values["y_m_per_s"], values["z_m_per_s"]]
-
-
-register(
-    Effect(
-        "registration_rotation",
-        tuple(
-            Parameter(
-                f"r{a}_rad",
-                "rad",
-                0.0,
-                0.03,
-                lambda robot, i: float(np.max(robot.tracker.registration_rotation.tolerance)),
-                text=f"turn about {a}",
-            )
-            for a in "xyz"
-        ),
-        _rotation,
-        "The tracker's frame is turned against the base frame.",
-        "reading = R p + t",
-        joint=True,
-    )
+@effect(
+    "registration_translation",
+    *(
+        EffectParameter(
+            f"t{a}_m",
+            "m",
+            0.0,
+            0.004,
+            lambda robot, i: float(np.max(robot.tracker.registration_translation.tolerance)),
+            text=f"shift along {a}",
+        )
+        for a in "xyz"
+    ),
+    text="The tracker's frame is shifted against the base frame.",
+    source="reading = R p + t",
+    joint=True,
 )
-register(
-    Effect(
-        "registration_translation",
-        tuple(
-            Parameter(
-                f"t{a}_m",
-                "m",
-                0.0,
-                0.004,
-                lambda robot, i: float(np.max(robot.tracker.registration_translation.tolerance)),
-                text=f"shift along {a}",
-            )
-            for a in "xyz"
-        ),
-        _translation,
-        "The tracker's frame is shifted against the base frame.",
-        "reading = R p + t",
-        joint=True,
-    )
+def registration_translation(plant: Plant, values: Values) -> None:
+    shift = [values["tx_m"], values["ty_m"], values["tz_m"]]
+    plant.change_tracker(translation=plant.tracker.translation + shift)
+
+
+@effect(
+    "tracker_lever_arm",
+    *(
+        EffectParameter(
+            f"{a}_m",
+            "m",
+            0.0,
+            0.004,
+            lambda robot, i: float(np.max(robot.tracker.lever_arm.tolerance)),
+            text=f"sensor position in the tip frame, {a}",
+        )
+        for a in "xyz"
+    ),
+    text="The sensor does not sit where the robot file says.",
+    source="reading = p + R lever",
+    joint=True,
 )
-register(
-    Effect(
-        "tracker_lever_arm",
-        tuple(
-            Parameter(
-                f"{a}_m",
-                "m",
-                0.0,
-                0.004,
-                lambda robot, i: float(np.max(robot.tracker.lever_arm.tolerance)),
-                text=f"sensor position in the tip frame, {a}",
-            )
-            for a in "xyz"
-        ),
-        _lever,
-        "The sensor does not sit where the robot file says.",
-        "reading = p + R lever",
-        joint=True,
-    )
+def tracker_lever_arm(plant: Plant, values: Values) -> None:
+    plant.change_tracker(lever=plant.tracker.lever + [values["x_m"], values["y_m"], values["z_m"]])
+
+
+@effect(
+    "tracker_latency",
+    EffectParameter(
+        "delay_s",
+        "s",
+        0.0,
+        0.015,
+        lambda robot, i: robot.tracker.delay.tolerance,
+        text="how much older than its stamp a pose is",
+    ),
+    text="Tracker poses are older than their stamps.",
+    source="reading(stamp) = pose(stamp - delay)",
 )
+def tracker_latency(plant: Plant, values: Values) -> None:
+    plant.change_tracker(delay=plant.tracker.delay + values["delay_s"])
 
 
-def _latency(setup: Setup, values: Values) -> None:
-    setup.delay += values["delay_s"]
-
-
-def _averaging(setup: Setup, values: Values) -> None:
-    setup.averaging += values["window_s"]
-
-
-def _skew(setup: Setup, values: Values) -> None:
-    setup.skew += values["rate"]
-
-
-def _tracker_scale(setup: Setup, values: Values) -> None:
-    setup.tracker_scale *= values["scale"]
-
-
-register(
-    Effect(
-        "tracker_latency",
-        (
-            Parameter(
-                "delay_s",
-                "s",
-                0.0,
-                0.015,
-                lambda robot, i: robot.tracker.delay.tolerance,
-                text="how much older than its stamp a pose is",
-            ),
-        ),
-        _latency,
-        "Tracker poses are older than their stamps.",
-        "reading(stamp) = pose(stamp - delay)",
-    )
+@effect(
+    "tracker_averaging",
+    EffectParameter("window_s", "s", 0.0, 0.04, low=0.0, text="length of the average before the stamp"),
+    text="The tracker averages over a time before its stamp: delay and loss of amplitude.",
+    source="moving average",
 )
-register(
-    Effect(
-        "tracker_averaging",
-        (Parameter("window_s", "s", 0.0, 0.04, low=0.0, text="length of the average before the stamp"),),
-        _averaging,
-        "The tracker averages over a time before its stamp: delay and loss of amplitude.",
-        "moving average",
-    )
+def tracker_averaging(plant: Plant, values: Values) -> None:
+    plant.change_tracker(averaging=plant.tracker.averaging + values["window_s"])
+
+
+@effect(
+    "clock_skew",
+    EffectParameter("rate", "s/s", 0.0, 2e-3, text="tracker stamp = true time * (1 + rate)"),
+    text="The tracker's clock runs at another rate.",
+    source="linear clock model",
 )
-register(
-    Effect(
-        "clock_skew",
-        (Parameter("rate", "s/s", 0.0, 2e-3, text="tracker stamp = true time * (1 + rate)"),),
-        _skew,
-        "The tracker's clock runs at another rate.",
-        "linear clock model",
-    )
+def clock_skew(plant: Plant, values: Values) -> None:
+    plant.change_tracker(skew=plant.tracker.skew + values["rate"])
+
+
+@effect(
+    "tracker_scale",
+    EffectParameter(
+        "scale",
+        "1",
+        1.0,
+        0.01,
+        low=0.5,
+        text="reported distance over true distance from the base frame's origin",
+    ),
+    text="The tracker reports all positions too large or too small.",
+    source="reading = scale * p",
 )
-register(
-    Effect(
-        "tracker_scale",
-        (
-            Parameter(
-                "scale",
-                "1",
-                1.0,
-                0.01,
-                low=0.5,
-                text="reported distance over true distance from the base frame's origin",
-            ),
-        ),
-        _tracker_scale,
-        "The tracker reports all positions too large or too small.",
-        "reading = scale * p",
-    )
+def tracker_scale(plant: Plant, values: Values) -> None:
+    plant.change_tracker(scale=plant.tracker.scale * values["scale"])
+
+
+@effect(
+    "drift",
+    *(EffectParameter(f"{a}_m_per_s", "m/s", 0.0, 2e-4, text=f"speed along {a}") for a in "xyz"),
+    text="The tracker's readings wander off steadily, whatever the robot does.",
+    source="reading = p + drift * t",
+    joint=True,
 )
-register(
-    Effect(
-        "drift",
-        tuple(Parameter(f"{a}_m_per_s", "m/s", 0.0, 2e-4, text=f"speed along {a}") for a in "xyz"),
-        _drift,
-        "The tracker's readings wander off steadily, whatever the robot does.",
-        "reading = p + drift * t",
-        joint=True,
-    )
-)
+def drift(plant: Plant, values: Values) -> None:
+    speed = [values["x_m_per_s"], values["y_m_per_s"], values["z_m_per_s"]]
+    plant.change_tracker(drift=plant.tracker.drift + speed)

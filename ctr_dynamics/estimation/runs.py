@@ -25,7 +25,6 @@ from ctr_dynamics.model.paired_steps import Pair
 from ctr_dynamics.model.simulator import Simulator, State, StepResult
 from ctr_dynamics.model.time_scheme import make_scheme
 from ctr_dynamics.parameters import Settings, axes_mask
-from ctr_dynamics.sensing.tracker import registered, tracker_model
 
 Floats = NDArray[np.float64]
 DT = seconds(1)
@@ -60,8 +59,7 @@ class Runs:
         self.simulator = Simulator(model, scheme, tolerance)
         self.reference = Simulator(model, scheme, tolerance)
         self.pair = Pair(self.simulator, self.reference)
-        self.tracker = tracker_model(
-            model.setup,
+        self.tracker = model.plant.tracker.corrected(
             delay=float(settings["tracker.delay_s"]),
             lever=np.array(settings["tracker.lever_arm_m"]),
             rotation=np.array(settings["tracker.registration_rotation_rad"]),
@@ -85,7 +83,7 @@ class Runs:
         self._by_theta = self.fusion.uncertainty.effect[rows]  # encoder offsets and tip force
         self._signals = Signals(model, inputs)
         self._load = np.zeros(model.input_count)  # of the robot file
-        self._load[3 * model.n : 3 * model.n + 3] = model.setup.tip_force
+        self._load[3 * model.n : 3 * model.n + 3] = model.plant.tip_force
         # the model alone has no parameters
         self._bare = Actuation(self._signals, self._load, self._by_theta[:, :0].copy(), np.zeros(0))
         self.clear()
@@ -178,10 +176,10 @@ class Runs:
             assert self.fused is not None
             self._keep_alone_tip(t)
             self.fusion.propagate(self.fused, both[0], t)
-            for sample, time_s, position in self.inputs.due_samples(self.tracker, math.inf)[:1]:
+            for _, time_s, position, quaternion in self.inputs.due_samples(self.tracker, math.inf)[:1]:
                 time_s = min(time_s, t + self.tracker.delay)
-                self._compare(time_s, position, sample.quaternion)
-                self.fusion.update(self.fused, time_s, position, sample.quaternion)
+                self._compare(time_s, position, quaternion)
+                self.fusion.update(self.fused, time_s, position, quaternion)
             self.fusion.tip_estimate()
         self.restore(here)
 
@@ -221,16 +219,16 @@ class Runs:
         rate = float(self.alone.inputs.beta_rate[0]) * (1.0 - self.fusion.insertion_fraction)
         self.alone_tips.append(t, self.alone.nodes[-1], self._no_columns, rate)
 
-    def _fuse(self, k: int, due: list[tuple[Sample, float, Floats]]) -> None:
+    def _fuse(self, k: int, due: list[tuple[Sample, float, Floats, Floats]]) -> None:
         """Compare and fuse the samples ``due`` after step ``k``."""
         assert self.fused is not None
-        for sample, time_s, position in due:
+        for sample, time_s, position, quaternion in due:
             sample.fused_k = k
-            moment, left = self._compare(time_s, position, sample.quaternion)
+            moment, left = self._compare(time_s, position, quaternion)
             if self.health.fusing:
-                update = self.fusion.update(self.fused, time_s, position, sample.quaternion)
+                update = self.fusion.update(self.fused, time_s, position, quaternion)
             else:
-                update = self.fusion.compare(time_s, position, sample.quaternion)
+                update = self.fusion.compare(time_s, position, quaternion)
             if update.dof:
                 self.sampled_ns = max(self.sampled_ns or 0, sample.stamp_ns)
             else:
@@ -253,16 +251,16 @@ class Runs:
     ) -> tuple[Moment | None, Floats | None]:
         """The moment of a reading, before its update, and how far it lies from the fused tip that was published for its time."""
         n = self.model.n
-        own_s = time_s - self.tracker.delay
-        fused = self.fusion.tips.at(own_s, DT, columns=False)
-        alone = self.alone_tips.at(own_s, DT, columns=False)
-        earlier = self.alone_tips.at(own_s - 2 * DT, DT, columns=False) or alone
+        own_s, observed = time_s - self.tracker.delay, self.tracker.observed_tip
+        fused = observed(lambda s: self.fusion.tips.at(s, DT, columns=False), own_s)
+        alone = observed(lambda s: self.alone_tips.at(s, DT, columns=False), own_s)
+        earlier = observed(lambda s: self.alone_tips.at(s, DT, columns=False), own_s - 2 * DT) or alone
         if fused is None or alone is None or earlier is None:
             return None, None
         position, _ = self.tracker.to_base(position, quaternion, fused.quaternion)
-        estimate = registered(self.tracker, self.fusion.bias, fused)[:3]
+        estimate = self.tracker.registered(self.fusion.bias, fused)[:3]
         assert self.inputs.t0_ns is not None
-        joints, rates = self.inputs.joints.at(self.inputs.t0_ns + own_s * 1e9)
+        joints, rates = self.inputs.joints.at(self.inputs.t0_ns + (time_s - self.tracker.age) * 1e9)
         acceleration = (alone.velocity - earlier.velocity) / (2 * DT)
         moment = Moment(
             position - alone.position, alone.position, alone.quaternion, alone.velocity, acceleration,

@@ -1,4 +1,8 @@
-"""Rotations: small helpers on unit quaternions (w, x, y, z) and rotation vectors, in plain Python that numba compiles too (kernels.py)."""
+"""Rotations: unit quaternions (w, x, y, z), rotation matrices and rotation vectors.
+
+Functions of one rotation are plain Python that numba compiles too (:mod:`ctr_dynamics.kernels.filter_steps`). Those whose name ends in ``_rows``
+take arrays of rotations, row by row.
+"""
 
 from __future__ import annotations
 
@@ -64,3 +68,38 @@ def conjugate(h: Floats) -> Floats:
 def skew(v: Floats) -> Floats:
     """(3, 3) with skew(v) w = v x w."""
     return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
+
+
+def conjugate_rows(h: Floats) -> Floats:
+    """Inverses of unit quaternions (k, 4)."""
+    return h * np.array([1.0, -1.0, -1.0, -1.0])
+
+
+def multiply_rows(a: Floats, b: Floats) -> Floats:
+    """Hamilton products (k, 4) of quaternions (k, 4) or (4,)."""
+    aw, ax, ay, az = np.moveaxis(np.atleast_2d(a), -1, 0)
+    bw, bx, by, bz = np.moveaxis(np.atleast_2d(b), -1, 0)
+    return np.stack(
+        [
+            aw * bw - ax * bx - ay * by - az * bz,
+            aw * bx + ax * bw + ay * bz - az * by,
+            aw * by - ax * bz + ay * bw + az * bx,
+            aw * bz + ax * by - ay * bx + az * bw,
+        ],
+        axis=-1,
+    )
+
+
+def rotate_rows(h: Floats, v: Floats) -> Floats:
+    """Vectors (k, 3) or (3,) turned by unit quaternions (k, 4) or (4,), (k, 3)."""
+    h, v = np.atleast_2d(h), np.atleast_2d(v)
+    w, u = h[:, :1], h[:, 1:]
+    return v + 2.0 * np.cross(u, np.cross(u, v) + w * v)
+
+
+def to_vector_rows(h: Floats) -> Floats:
+    """Rotation vectors (k, 3) rad, shorter than pi, of unit quaternions (k, 4)."""
+    h = np.where(h[:, :1] < 0.0, -h, h)
+    norm = np.linalg.norm(h[:, 1:], axis=1, keepdims=True)
+    angle = 2.0 * np.arctan2(norm, h[:, :1])
+    return h[:, 1:] * np.where(norm > 1e-12, angle / np.maximum(norm, 1e-12), 2.0)

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ctr_dynamics.effects import make_setup
-from ctr_dynamics.kernels.layout import Layout
+from ctr_dynamics.effects import make_plant
 from ctr_dynamics.kernels.shooting import buffers, lanes_for
 from ctr_dynamics.kernels.workspace import workspace_rows
 from ctr_dynamics.model.mesh import (
@@ -22,7 +21,6 @@ from ctr_dynamics.model.mesh import (
 from ctr_dynamics.robot import Robot
 
 LOAD_KINK = 0.02  # of the force and moment that bend the robot
-PLAY_MOMENT = 0.01  # N m at which 70 % of a tube's play is taken up
 
 
 class Model:
@@ -34,8 +32,7 @@ class Model:
         extended: whether those are in use: when the robot file names an extension that changes the physics.
         jacobian_lanes: lanes of the Jacobian's sweep.
         layout: rows of the parameter block.
-        plain_parameters: (NP,) block at the robot file's values without its extensions; actuators and tip wrench are 0.
-        setup: what a prediction needs besides, extensions included. parameters: its block.
+        plant: the robot file with its extensions. parameters: (NP,) its block; actuators and tip wrench are 0.
         scale: (5 + N,) N and N m, unit of each shooting residual; step: (5 + N,) perturbation of each unknown for Newton's
             method; tangent_step: a much smaller one, for tangents: strong friction between tubes bends the imbalance, and errors of a tangent grow
             from step to step.
@@ -48,7 +45,8 @@ class Model:
         self.n = n = robot.n_tubes
         self.lane = ()
         self.jacobian_lanes = lanes_for(6 + n)
-        self.layout = Layout(n)
+        self.plant = make_plant(robot)
+        self.layout, self.parameters = self.plant.layout, self.plant.block
         self.nodes = nodes
         self.base_cells = base_cells
         self.segments: Tubes = tuple(
@@ -60,32 +58,7 @@ class Model:
             )
             for tube in robot.tubes
         )
-        bodies = [tube.end_body for tube in robot.tubes]
-        inertia = np.array([body.inertia.value if body else (0.0, 0.0, 0.0) for body in bodies])
-        self.plain_parameters = self.layout.pack(
-            bending_stiffness=[tube.bending_stiffness for tube in robot.tubes],
-            torsional_stiffness=[tube.torsion_stiffness for tube in robot.tubes],
-            mass_per_length=[tube.density.value * tube.area for tube in robot.tubes],
-            inertia_per_length=[tube.density.value * tube.second_moment for tube in robot.tubes],
-            bending_damping=[tube.bending_damping.value for tube in robot.tubes],
-            torsion_damping=[tube.torsion_damping.value for tube in robot.tubes],
-            precurvature=1.0,
-            body_mass=[body.mass.value if body else 0.0 for body in bodies],
-            body_inertia_x=inertia[:, 0],
-            body_inertia_y=inertia[:, 1],
-            body_inertia_z=inertia[:, 2],
-            gravity=robot.gravity.value,
-            tube_coulomb=robot.friction.tubes.coulomb.value,
-            tube_viscous=robot.friction.tubes.viscous.value,
-            epsilon=robot.friction.epsilon.value,
-            base_coulomb=robot.friction.base.coulomb.value,
-            base_viscous=robot.friction.base.viscous.value,
-            play_moment=PLAY_MOMENT,
-            play_share=1.0,
-        )
-        self.setup = make_setup(self)
-        self.parameters = self.setup.block
-        self.extended = extended or self.setup.extended
+        self.extended = extended or self.plant.extended
         self.tubes: tuple[float, ...] = (0.0,) * n if self.extended else (0,) * n
         reach = float(robot.lengths[0] + robot.rest.beta.value[0])
         stiffness = robot.tubes[0].bending_stiffness

@@ -76,13 +76,15 @@ class ReplayLog:
         whole = self.tracker.mask[3:].all()
         times, points = [], []
         for pose in self.poses:
-            t = (pose.stamp_ns - (self.first_ns or 0)) * 1e-9 - self.tracker.delay
+            stamp = (pose.stamp_ns - (self.first_ns or 0)) * 1e-9
             q = np.array(pose.quaternion_xyzw)[[3, 0, 1, 2]]
             if not whole:
+                t = float(self.tracker.observed_times(np.array(stamp)))
                 q = self.turned[min(int(np.searchsorted(self.t, t)), len(self.t) - 1)]
             if np.isfinite(q).all() and np.isfinite(pose.position).all() and 0.9 < np.linalg.norm(q) < 1.1:
-                times.append(t)
-                points.append(self.tracker.to_base(np.array(pose.position), q, q)[0])
+                time, point, _ = self.tracker.inverse(stamp, np.array(pose.position), q, q)
+                times.append(time)
+                points.append(point)
         return np.array(times), np.array(points).reshape(-1, 3)
 
 

@@ -12,12 +12,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ctr_dynamics.effects import make_plant
 from ctr_dynamics.errors import InputError
 from ctr_dynamics.io.bag_reader import open_bag
 from ctr_dynamics.io.messages.cdr import PoseIn, decode_point_cloud, decode_pose_stamped
-from ctr_dynamics.model.model import Model
 from ctr_dynamics.robot import Robot
-from ctr_dynamics.sensing.tracker import TrackerModel, tracker_model
+from ctr_dynamics.sensing import TrackerModel
 
 SETTLE_S = 0.5
 """Left out at the start of comparisons with the truth."""
@@ -78,7 +78,7 @@ def trace_of(messages: Sequence[Received], start_ns: int) -> Trace:
 
 def nominal_tracker(robot: Robot) -> TrackerModel:
     """The tracker of a robot file."""
-    return tracker_model(Model(robot, nodes=12).setup)
+    return make_plant(robot).tracker
 
 
 def tracker_of(bag: Path, start_ns: int, tracker: TrackerModel) -> Trace:
@@ -88,8 +88,9 @@ def tracker_of(bag: Path, start_ns: int, tracker: TrackerModel) -> Trace:
     for pose in sorted(poses):
         q = np.array(pose.quaternion_xyzw)[[3, 0, 1, 2]]
         if np.isfinite(pose.position).all() and np.isfinite(q).all() and 0.9 < np.linalg.norm(q) < 1.1:
-            t.append((pose.stamp_ns - start_ns) * 1e-9 - tracker.delay)
-            p.append(tracker.to_base(np.array(pose.position), q)[0])
+            time, point, _ = tracker.inverse((pose.stamp_ns - start_ns) * 1e-9, np.array(pose.position), q)
+            t.append(time)
+            p.append(point)
     return Trace(np.array(t), np.array(p).reshape(-1, 3))
 
 

@@ -108,59 +108,6 @@ class Signal:
         return found
 
 
-class Drives(Signal):
-    """Actuators (alpha rad, beta m of every tube) from drives whose angles reach the tubes through play and a delay.
-
-    Args:
-        n: number of tubes. backlash: (N,) rad, whole dead zone of every tube's rotation; the first sample stands in its middle.
-        delay_ns: alpha follows this much later; beta does not.
-    """
-
-    def __init__(self, n: int, backlash: Floats, delay_ns: int) -> None:
-        super().__init__(2 * n)
-        self.n, self.delay_ns = n, delay_ns
-        self.half = 0.5 * backlash if backlash.any() else None
-        self._given: list[Floats] = []  # samples before the play
-
-    def add(self, stamp_ns: int, value: Floats) -> str:
-        """Insert the drives' position; samples after a late one are played again."""
-        kind = super().add(stamp_ns, value)
-        if self.half is None or kind == "duplicate":
-            return kind
-        first = self.stamps.index(stamp_ns) if kind == "late" else len(self.stamps) - 1
-        self._given.insert(first, value)
-        for i in range(first, len(self.stamps)):
-            played, n = self._given[i].copy(), self.n
-            if i:
-                played[:n] = np.clip(self.values[i - 1][:n], played[:n] - self.half, played[:n] + self.half)
-            self.values[i] = played
-        return kind
-
-    def forget(self, before_ns: int) -> None:
-        """Drop samples that no time from ``before_ns`` on needs, delayed as they are."""
-        super().forget(before_ns - max(self.delay_ns, 0))
-        if self.half is not None:
-            del self._given[: len(self._given) - len(self.values)]
-
-    def at(self, time_ns: float, extrapolate_ns: int = 0) -> tuple[Floats, Floats]:
-        """Actuators and their rates at a time; see :meth:`Signal.at`."""
-        value, rate = super().at(time_ns, extrapolate_ns)
-        if not self.delay_ns:
-            return value, rate
-        alpha, alpha_rate = super().at(time_ns - self.delay_ns, extrapolate_ns)
-        n = self.n
-        return np.concatenate([alpha[:n], value[n:]]), np.concatenate([alpha_rate[:n], rate[n:]])
-
-    def around(self, first_ns: int, last_ns: int, extrapolate_ns: int = 0) -> Samples | None:
-        """See :meth:`Signal.around`; angles that follow later than positions do not lie on their lines."""
-        return None if self.delay_ns else super().around(first_ns, last_ns, extrapolate_ns)
-
-    @property
-    def known_until(self) -> int:
-        """ns up to which actuators are known without extrapolation."""
-        return self.stamps[-1] + min(self.delay_ns, 0)
-
-
 @lru_cache(maxsize=16)  # of a driver, it is the same in every message
 def joint_order(names: tuple[str, ...], n: int) -> tuple[int, ...] | str:
     """Positions in a JointState's names of tube1_rotation.., tube1_translation..; or what is missing or double, in words."""

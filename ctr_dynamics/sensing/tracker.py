@@ -1,37 +1,86 @@
-"""The tracker's measurement: registration, lever arm, delay and drift between the model's tip and a reported pose (docs/filter.md).
+"""The tip tracker: what it reports of a pose, what a report says of the pose, and how both change (docs/filter.md).
 
-reading = R_reg (p + R lever) + t_reg + drift, R_reading = R_reg R, both of the time stamp - delay. What effects add (a scale, a steady drift, a
-clock of another rate) is taken off the readings first, an average over a window counts as a delay by half of it.
+A reading of stamp t shows the time t / (1 + skew) - delay, averaged over a window before it:
+
+    position = R_reg scale (p + R lever) + t_reg + drift t,        rotation = R_reg R,
+
+and then passes the corrections. The estimator carries errors of registration, lever arm, delay and drift as states of its own
+(``STATE_NAMES``). Its kernels know registration and lever arm alone; the rest is taken off a reading before
+(:meth:`TrackerModel.undistorted`).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ctr_dynamics.effects import Setup
-from ctr_dynamics.estimation.filter.tip_window import Tip
-from ctr_dynamics.kernels.filter_steps import from_vector, matrix, multiply
+from ctr_dynamics.kernels.rotations import (
+    conjugate_rows,
+    from_vector,
+    matrix,
+    multiply,
+    multiply_rows,
+    rotate_rows,
+)
 from ctr_dynamics.kernels.tracker_measurement import innovation_rows, pose_in_base, registered_pose
+from ctr_dynamics.robot import Robot
+from ctr_dynamics.sensing.measurement import SENSORS, At, Tip
 
 Floats = NDArray[np.float64]
 
-ROTATION, TRANSLATION, LEVER, DELAY, DRIFT = slice(0, 3), slice(3, 6), slice(6, 9), 9, slice(10, 13)
+STATE_NAMES = (
+    ("registration_rotation", 3),
+    ("registration_translation", 3),
+    ("lever_arm", 3),
+    ("delay", 1),
+    ("drift", 3),
+)
+"""Errors of the tracker that the estimator carries: name and number of axes, in their order."""
 STATES = 13
+ROTATION, TRANSLATION, LEVER, DELAY, DRIFT = slice(0, 3), slice(3, 6), slice(6, 9), 9, slice(10, 13)
+
+# Gauss and Legendre's rule of five points on [0, 1]: the mean over the averaging window
+AVERAGE_POINTS = np.array([0.04691008, 0.23076534, 0.5, 0.76923466, 0.95308992])
+AVERAGE_WEIGHTS = np.array([0.11846344, 0.23931434, 0.28444444, 0.23931434, 0.11846344])
 
 
-@dataclass(frozen=True)
+class TrackerCorrection(Protocol):
+    """A further link between tip and reading, behind the registration; it must be equal (``==``) to another one that does the same.
+
+    ``stamps`` (s,) in s, ``position`` (s, 3) in m and ``quaternion`` (s, 4) wxyz are in the tracker's frame.
+    """
+
+    def forward(self, stamps: Floats, position: Floats, quaternion: Floats) -> tuple[Floats, Floats]:
+        """What the tracker reports instead of a position and quaternion."""
+        ...
+
+    def inverse(self, stamps: Floats, position: Floats, quaternion: Floats) -> tuple[Floats, Floats]:
+        """Inverse of :meth:`forward`."""
+        ...
+
+    def derivative(self, stamps: Floats, position: Floats, quaternion: Floats, columns: Floats) -> Floats:
+        """Small changes of what :meth:`forward` returns, from those of its arguments.
+
+        Both (s, 6, r): of the position in m, and the rotation vector about the sensor's axes in rad, for each of r parameters.
+        """
+        ...
+
+
+@dataclass(frozen=True, eq=False)
 class TrackerModel:
-    """Nominal geometry and noise of the tracker.
+    """Geometry, timing and noise of a tracker.
 
     Attributes:
         rotation: (4,) wxyz of R_reg; translation: (3,) m; lever: (3,) m in the tip frame; delay: s, > 0 when a pose is older than its stamp.
         mask: (6,) measured axes: position x, y, z in the tracker's frame, then rotation about the sensor's x, y, z.
-        variance: (6,) white noise.
+        variance: (6,) white noise. state_sigma: (13,) prior deviations of ``STATE_NAMES``.
         scale: reported over true distance; drift: (3,) m/s; skew: s/s, stamp = true time (1 + skew).
+        averaging: s, length of the window over which poses are averaged. corrections: further links, in order.
     """
 
     rotation: Floats
@@ -40,9 +89,61 @@ class TrackerModel:
     delay: float
     mask: NDArray[np.bool_]
     variance: Floats
+    state_sigma: Floats = field(default_factory=lambda: np.zeros(STATES))
     scale: float = 1.0
     drift: Floats = field(default_factory=lambda: np.zeros(3))
     skew: float = 0.0
+    averaging: float = 0.0
+    corrections: tuple[TrackerCorrection, ...] = ()
+
+    @classmethod
+    def of_robot(cls, robot: Robot) -> TrackerModel:
+        """The tracker that a robot file describes, without the file's extensions."""
+        file = robot.tracker
+        noise = file.noise
+        return cls(
+            rotation=from_vector(np.array(file.registration_rotation.value)),
+            translation=np.array(file.registration_translation.value),
+            lever=np.array(file.lever_arm.value),
+            delay=file.delay.value,
+            mask=np.ones(6, dtype=bool),
+            variance=np.array([noise.position.value**2] * 3 + [noise.rotation.value**2] * 3),
+            state_sigma=np.concatenate(
+                [
+                    file.registration_rotation.tolerance,
+                    file.registration_translation.tolerance,
+                    file.lever_arm.tolerance,
+                    [file.delay.tolerance],
+                    np.full(3, noise.drift.value),
+                ]
+            ),
+        )
+
+    def changed(self, **values: Any) -> TrackerModel:
+        """A copy with other attributes."""
+        return replace(self, **values)
+
+    def corrected(
+        self,
+        *,
+        delay: float = 0.0,
+        lever: Floats | None = None,
+        rotation: Floats | None = None,
+        translation: Floats | None = None,
+        mask: tuple[bool, ...] = (True,) * 6,
+    ) -> TrackerModel:
+        """A copy with ``delay`` (s) and ``lever`` (3,) m added, ``rotation`` (3,) rad and ``translation`` (3,) m composed on top, and another
+        ``mask``."""
+        extra = from_vector(np.zeros(3) if rotation is None else np.asarray(rotation, float))
+        shift = np.zeros(3) if translation is None else np.asarray(translation, float)
+        return replace(
+            self,
+            rotation=multiply(extra, self.rotation),
+            translation=matrix(extra) @ self.translation + shift,
+            lever=self.lever + (np.zeros(3) if lever is None else np.asarray(lever, float)),
+            delay=self.delay + delay,
+            mask=np.array(mask, dtype=bool),
+        )
 
     @cached_property
     def axes(self) -> NDArray[np.int64]:
@@ -59,15 +160,119 @@ class TrackerModel:
         """1 to 3: the one rotation axis of the sensor that is not measured; 0 where none or several are not."""
         return 1 + int(np.argmin(self.mask[3:])) if self.mask[3:].sum() == 2 else 0
 
-    def reading(self, time_s: float, position: Floats) -> tuple[float, Floats]:
-        """Time (s) and position (m) of a reading of stamp ``time_s`` without the clock's rate, the steady drift and the scale."""
+    # -- time --
+
+    @cached_property
+    def window(self) -> tuple[tuple[float, float], ...]:
+        """(age in s, weight) of the poses that are averaged."""
+        if self.averaging <= 0.0:
+            return ((0.0, 1.0),)
+        parts = zip(AVERAGE_POINTS, AVERAGE_WEIGHTS, strict=True)
+        return tuple((float(x) * self.averaging, float(w)) for x, w in parts)
+
+    @property
+    def age(self) -> float:
+        """How much older than its stamp a reading is in the mean, s."""
+        return self.delay + 0.5 * self.averaging
+
+    def observed_times(self, stamps: Floats) -> Floats:
+        """Newest times (s,) of the robot that readings of ``stamps`` (s,) show."""
+        return stamps / (1.0 + self.skew) - self.delay
+
+    def averaged(self, at: At, times: Floats) -> Floats:
+        """Means (s, c) of what ``at`` gives over the windows that end at ``times`` (s,)."""
+        total = np.zeros(())
+        for age, weight in self.window:
+            total = total + weight * at(times - age)
+        return total
+
+    def observed_tip(self, at: Callable[[float], Tip | None], time: float) -> Tip | None:
+        """The tip that the tracker sees over the window that ends at ``time`` (s), when ``at`` gives that of one time; None where that does."""
+        if self.averaging <= 0.0:
+            return at(time)
+        tips = [at(time - age) for age, _ in self.window]
+        seen = [tip for tip in tips if tip is not None]
+        if len(seen) < len(tips):
+            return None
+        mean = sum((w * tip.mean for (_, w), tip in zip(self.window, seen, strict=True)), np.zeros(13))
+        mean[3:7] /= np.linalg.norm(mean[3:7])
+        columns = sum(
+            (w * tip.columns for (_, w), tip in zip(self.window, seen, strict=True)),
+            np.zeros_like(seen[0].columns),
+        )
+        return Tip(time, mean, columns)
+
+    # -- arrays of readings --
+
+    def forward(self, stamps: Floats, tip_at: At) -> tuple[Floats, Floats]:
+        """Positions (s, 3) m and quaternions (s, 4) wxyz that the tracker reports at ``stamps`` (s,), without noise.
+
+        ``tip_at`` gives the tip at times (s,): (s, 7) position and unit quaternion.
+        """
+        rows = self.averaged(tip_at, self.observed_times(stamps))
+        h = rows[:, 3:]
+        if self.averaging > 0.0:
+            h = h / np.linalg.norm(h, axis=1, keepdims=True)
+        position, quaternion = self._without_corrections(stamps, rows[:, :3], h)
+        for correction in self.corrections:
+            position, quaternion = correction.forward(stamps, position, quaternion)
+        return position, quaternion
+
+    def _without_corrections(self, stamps: Floats, p: Floats, h: Floats) -> tuple[Floats, Floats]:
+        point = self.scale * (p + rotate_rows(h, self.lever))
+        position = rotate_rows(self.rotation, point) + self.translation + self.drift * stamps[:, None]
+        return position, multiply_rows(self.rotation, h)
+
+    def derivative(self, stamps: Floats, tip_at: At, columns_at: At) -> Floats:
+        """Derivatives (s, 6, r) of the readings at ``stamps`` (s,) by r parameters: of the position in m, of the rotation vector about the
+        sensor's axes in rad.
+
+        ``tip_at`` as for :meth:`forward`, with quaternions of any length; ``columns_at`` gives their derivatives at times (s,): (s, 7 r).
+        """
+        times = self.observed_times(stamps)
+        rows = self.averaged(columns_at, times).reshape(len(times), 7, -1)
+        tip = self.averaged(tip_at, times)
+        h = tip[:, 3:]
+        norm2 = np.sum(h * h, axis=1)[:, None]
+        r = rows.shape[2]
+        back = conjugate_rows(h)
+        # body rotation vector of a change of a quaternion of any length: 2 vec(h^-1 dh) / |h|^2
+        dh = rows[:, 3:].transpose(0, 2, 1)
+        turn = (
+            2.0 * multiply_rows(back[:, None, :].repeat(r, axis=1).reshape(-1, 4), dh.reshape(-1, 4))[:, 1:]
+        )
+        turn = turn.reshape(len(times), r, 3) / norm2[:, :, None]
+        swing = np.cross(turn, self.lever)
+        unit = h / np.sqrt(norm2)
+        swing = rotate_rows(unit[:, None, :].repeat(r, axis=1).reshape(-1, 4), swing.reshape(-1, 3))
+        shift = self.scale * (rows[:, :3].transpose(0, 2, 1) + swing.reshape(len(times), r, 3))
+        shift = rotate_rows(self.rotation, shift.reshape(-1, 3)).reshape(len(times), r, 3)
+        columns = np.concatenate([shift, turn], axis=2).transpose(0, 2, 1)
+        position, quaternion = self._without_corrections(stamps, tip[:, :3], unit)
+        for correction in self.corrections:
+            columns = correction.derivative(stamps, position, quaternion, columns)
+            position, quaternion = correction.forward(stamps, position, quaternion)
+        return columns
+
+    # -- one reading --
+
+    def undistorted(self, stamp: float, position: Floats, quaternion: Floats) -> tuple[float, Floats, Floats]:
+        """Stamp (s), position (3,) m and quaternion (4,) of a reading as registration and lever arm alone would give them: the corrections, the
+        clock's rate, the steady drift and the scale are taken off."""
+        if self.corrections:
+            stamps = np.array([stamp])
+            p, q = position[None], quaternion[None]
+            for correction in reversed(self.corrections):
+                p, q = correction.inverse(stamps, p, q)
+            position, quaternion = p[0], q[0]
         shift = self.translation
-        return time_s / (1.0 + self.skew), (position - shift - self.drift * time_s) / self.scale + shift
+        position = (position - shift - self.drift * stamp) / self.scale + shift
+        return stamp / (1.0 + self.skew), position, quaternion
 
     def to_base(
         self, position: Floats, quaternion: Floats, tip: Floats | None = None
     ) -> tuple[Floats, Floats]:
-        """Reading as a tip pose in ``ctr_base`` with the nominal geometry.
+        """Undistorted reading as a tip pose in ``ctr_base`` with the nominal geometry.
 
         Where not all of the rotation is measured, that of the ``tip`` (4,) wxyz turns the lever arm, if it is given.
         """
@@ -76,64 +281,44 @@ class TrackerModel:
         pose = pose_in_base(position, quaternion, self.rotation, self.translation, self.lever)
         return pose[:3], pose[3:]
 
+    def inverse(
+        self, stamp: float, position: Floats, quaternion: Floats, tip: Floats | None = None
+    ) -> tuple[float, Floats, Floats]:
+        """Time (s), position (3,) m and quaternion (4,) of the tip in ``ctr_base`` that a reading shows; ``tip`` as for :meth:`to_base`."""
+        time, position, quaternion = self.undistorted(stamp, position, quaternion)
+        return time - self.age, *self.to_base(position, quaternion, tip)
 
-def tracker_model(
-    setup: Setup,
-    *,
-    delay: float = 0.0,
-    lever: Floats | None = None,
-    rotation: Floats | None = None,
-    translation: Floats | None = None,
-    mask: tuple[bool, ...] = (True,) * 6,
-) -> TrackerModel:
-    """Tracker of a robot file and its extensions with corrections.
+    def innovation(
+        self, bias: Floats, tip: Tip, pi: Floats, *reading: Floats
+    ) -> tuple[Floats, Floats, Floats, Floats]:
+        """An undistorted ``reading`` (position (3,) m, quaternion (4,) wxyz) against what the ``tip`` and the states ``bias`` (13,) predict.
 
-    ``delay`` (s) and ``lever`` (3,) m are added, ``rotation`` (3,) rad and ``translation`` (3,) m composed.
-    """
-    noise = setup.robot.tracker.noise
-    extra = from_vector(np.zeros(3) if rotation is None else np.asarray(rotation, float))
-    shift = np.zeros(3) if translation is None else np.asarray(translation, float)
-    return TrackerModel(
-        rotation=multiply(extra, setup.rotation),
-        translation=matrix(extra) @ setup.translation + shift,
-        lever=setup.lever + (np.zeros(3) if lever is None else np.asarray(lever, float)),
-        delay=setup.delay + 0.5 * setup.averaging + delay,
-        mask=np.array(mask, dtype=bool),
-        variance=np.array([noise.position.value**2] * 3 + [noise.rotation.value**2] * 3),
-        scale=setup.tracker_scale,
-        drift=setup.drift,
-        skew=setup.skew,
-    )
+        Returns:
+            On the k measured axes: innovation (k,), position in the tracker's axes, rotation vector in the sensor's; H (k, r + 13), the
+            derivative of the expected reading by the columns' coefficients and the tracker states; its covariance S (k, k) under ``pi``
+            (r + 13, r + 13); and the innovation whitened by the Cholesky root of S.
 
+        Where one rotation axis is not measured, the sensor's turn about it is arbitrary and often large. It is taken off first, or it would turn
+        the other two components.
+        """
+        position, quaternion = reading
+        axes = self.axes
+        nu, H, S = np.empty(len(axes)), np.empty((len(axes), len(pi))), np.empty((len(axes), len(axes)))
+        white = innovation_rows(
+            position, quaternion, tip.mean, tip.columns, self.rotation, self.translation, self.lever, bias, self.free, axes, self.variance,
+            pi, nu, H, S,
+        )  # fmt: skip
+        return nu, H, S, white
 
-def innovation(
-    model: TrackerModel, bias: Floats, tip: Tip, pi: Floats, position: Floats, quaternion: Floats
-) -> tuple[Floats, Floats, Floats, Floats]:
-    """A reading (position (3,) m, quaternion (4,) wxyz) against what the ``tip`` and the tracker states ``bias`` (13,) predict.
+    def registered(self, bias: Floats, tip: Tip) -> Floats:
+        """(7,) tip pose in ``ctr_base`` as the tracker realises it: position in m, quaternion wxyz.
 
-    Returns:
-        On the k measured axes: innovation (k,), position in the tracker's axes, rotation vector in the sensor's; H (k, r + 13), the derivative of
-        the expected reading by the columns' coefficients and the tracker states; its covariance S (k, k) under ``pi`` (r + 13, r + 13); and the
-        innovation whitened by the Cholesky root of S.
-
-    Where one rotation axis is not measured, the sensor's turn about it is arbitrary and often large. It is taken off first, or it would turn the
-    other two components.
-    """
-    axes = model.axes
-    nu, H, S = np.empty(len(axes)), np.empty((len(axes), len(pi))), np.empty((len(axes), len(axes)))
-    white = innovation_rows(
-        position, quaternion, tip.mean, tip.columns, model.rotation, model.translation, model.lever, bias, model.free, axes, model.variance,
-        pi, nu, H, S,
-    )  # fmt: skip
-    return nu, H, S, white
+        The base frame of a real robot is known through its registration only, so the estimated registration and lever-arm errors are part of the
+        pose: it is where a perfect tracker with the nominal geometry would see the tip. Drift and delay are left out.
+        """
+        pose = np.empty(7)
+        registered_pose(tip.mean, self.rotation, self.lever, bias, pose)
+        return pose
 
 
-def registered(model: TrackerModel, bias: Floats, tip: Tip) -> Floats:
-    """(7,) tip pose in ``ctr_base`` as the tracker realises it: position in m, quaternion wxyz.
-
-    The base frame of a real robot is known through its registration only, so the estimated registration and lever-arm errors are part of the
-    pose: it is where a perfect tracker with the nominal geometry would see the tip. Drift and delay are left out.
-    """
-    pose = np.empty(7)
-    registered_pose(tip.mean, model.rotation, model.lever, bias, pose)
-    return pose
+SENSORS["tracker"] = TrackerModel

@@ -6,31 +6,30 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ctr_dynamics import __version__
-from ctr_dynamics.effects import Setup
+from ctr_dynamics.effects import make_plant
 from ctr_dynamics.errors import InputError
 from ctr_dynamics.io.bag_writer import write_bag
 from ctr_dynamics.io.messages import topics
 from ctr_dynamics.io.messages.encode import encode_joint_state, encode_pose_stamped, encode_wrench_stamped
-from ctr_dynamics.kernels.backlash import play
 from ctr_dynamics.kernels.rotations import from_vector, matrix, multiply
 from ctr_dynamics.model.model import Model
 from ctr_dynamics.model.simulator import Inputs, Simulator
 from ctr_dynamics.model.statics import Statics
 from ctr_dynamics.model.time_scheme import make_scheme
 from ctr_dynamics.robot import Robot
+from ctr_dynamics.sensing import ActuatorModel
 from ctr_dynamics.simulation.scenario import Scenario
 
 Floats = NDArray[np.float64]
 Progress = Callable[[float], None]
 FRAME = "ctr_base"
-AVERAGED = 24  # instants in the window of a tracker that averages
 
 
 @dataclass
@@ -66,7 +65,7 @@ def _wrenches(scenario: Scenario, model: Model, inputs: Inputs) -> list[Floats]:
     for _ in range(200 if hung else 0):
         total = sum(
             (load.factor(0.0) * w for load, w in zip(scenario.loads, wrenches, strict=True)),
-            np.r_[model.setup.tip_force, 0.0, 0.0, 0.0],
+            np.r_[model.plant.tip_force, 0.0, 0.0, 0.0],
         )
         found = statics.solve(inputs.beta, inputs.alpha, total[:3], total[3:])
         if not found.converged:
@@ -93,17 +92,17 @@ Drive = Callable[[float], Inputs]
 Turning = Callable[[float], tuple[Floats, Floats]]  # angles and rates at a time in s
 
 
-def _behind_play(command: Turning, width: Floats, end: float, dt: float) -> Turning:
-    """(angles, rates) that the tubes follow to ``end`` s when play of ``width`` (N,) rad lies between them and the drives' ``command``."""
+def _behind_backlash(command: Turning, actuators: ActuatorModel, end: float, dt: float) -> Turning:
+    """(angles, rates) that the tubes follow to ``end`` s when the backlash of ``actuators`` lies between them and the drives' ``command``."""
     t = dt * np.arange(math.ceil(end / dt) + 2)
     driven = np.array([command(x)[0] for x in t])
-    found = np.stack([play(np.ascontiguousarray(driven[:, i]), width[i]) for i in range(len(width))], axis=1)
+    found = actuators.behind_backlash(np.hstack([driven, np.zeros_like(driven)]))[:, : actuators.n]
     slopes = np.diff(found, axis=0) / dt
 
     def follow(time: float) -> tuple[Floats, Floats]:
         i = min(max(math.ceil(time / dt) - 1, 0), len(slopes) - 1)
         if time <= 0.0:
-            return found[0].copy(), np.zeros(len(width))
+            return found[0].copy(), np.zeros(actuators.n)
         return found[i] + (time - t[i]) * slopes[i], slopes[i].copy()
 
     return follow
@@ -112,7 +111,7 @@ def _behind_play(command: Turning, width: Floats, end: float, dt: float) -> Turn
 def drives(scenario: Scenario, robot: Robot, model: Model) -> tuple[Drive, Drive]:
     """Actuators and load of ``scenario`` at a time in s: (what the tubes do under all loads, what is read of both: encoders and known loads).
 
-    The scenario moves the drives; play and delay that the robot file names lie between them and the tubes.
+    The scenario moves the drives; backlash and delay that the robot file names lie between them and the tubes.
 
     Raises:
         InputError: motions leave the actuators' range, are for more tubes than there are, or there is no
@@ -121,7 +120,7 @@ def drives(scenario: Scenario, robot: Robot, model: Model) -> tuple[Drive, Drive
     axes = scenario.axes(robot.n_tubes)
     rest_alpha, rest_beta = np.array(robot.rest.alpha.value), np.array(robot.rest.beta.value)
 
-    setup = model.setup
+    actuators, load_delay = model.plant.actuators, model.plant.load_delay
 
     def turned(t: float) -> tuple[Floats, Floats]:
         return (
@@ -130,13 +129,13 @@ def drives(scenario: Scenario, robot: Robot, model: Model) -> tuple[Drive, Drive
         )
 
     follow: Turning = turned
-    if setup.backlash.any():
-        end = scenario.duration_s + max(-setup.actuator_delay, 0.0)
-        follow = _behind_play(turned, setup.backlash, end, 0.2 * scenario.solver.dt_s)
+    if actuators.backlash.any():
+        end = scenario.duration_s + max(-actuators.delay, 0.0)
+        follow = _behind_backlash(turned, actuators, end, 0.2 * scenario.solver.dt_s)
 
     def late(t: float) -> tuple[Floats, Floats]:
-        if t > setup.actuator_delay or not setup.actuator_delay:
-            return follow(t - setup.actuator_delay)
+        if t > actuators.delay or not actuators.delay:
+            return follow(t - actuators.delay)
         return follow(0.0)[0], np.zeros(robot.n_tubes)
 
     def moving(t: float, wrench: Floats) -> Inputs:
@@ -146,16 +145,10 @@ def drives(scenario: Scenario, robot: Robot, model: Model) -> tuple[Drive, Drive
         return Inputs(alpha, alpha_rate, beta, beta_rate, wrench[:3], wrench[3:])
 
     def read(t: float, wrench: Floats) -> Inputs:
-        alpha, alpha_rate = turned(t)
-        given = moving(t, wrench)
-        return Inputs(
-            (alpha - setup.offset) / setup.gain,
-            alpha_rate / setup.gain,
-            given.beta - setup.beta_offset,
-            given.beta_rate,
-            wrench[:3],
-            wrench[3:],
-        )
+        moved = moving(t, wrench)
+        readings = actuators.inverse(np.concatenate([turned(t)[0], moved.beta]))
+        n = actuators.n
+        return replace(moved, alpha=readings[:n], beta=readings[n:])
 
     dt = scenario.solver.dt_s
     for k in range(0, math.ceil(scenario.duration_s / dt - 1e-9) + 1, 5):
@@ -164,12 +157,10 @@ def drives(scenario: Scenario, robot: Robot, model: Model) -> tuple[Drive, Drive
             raise InputError(f"at {k * dt:.3f} s {problem}", do="mend the translations", where="tubes")
     pairs = list(zip(scenario.loads, _wrenches(scenario, model, moving(0.0, np.zeros(6))), strict=True))
 
-    unseen = np.r_[setup.tip_force, 0.0, 0.0, 0.0]
+    unseen = np.r_[model.plant.tip_force, 0.0, 0.0, 0.0]
 
     def acting(t: float) -> Floats:
-        return sum(
-            (load.factor(t - setup.load_shift if load.known else t) * w for load, w in pairs), unseen.copy()
-        )
+        return sum((load.factor(t - load_delay if load.known else t) * w for load, w in pairs), unseen.copy())
 
     def told(t: float) -> Floats:
         return sum((load.factor(t) * w for load, w in pairs if load.known), np.zeros(6))
@@ -194,7 +185,7 @@ def simulate(scenario: Scenario, robot: Robot, progress: Progress | None = None)
     state = simulator.rest(at(0.0))
     tips = [state.nodes[-1, :7].copy()]
     failure = ""
-    shift = model.setup.load_shift
+    shift = model.plant.load_delay
     corners = [t + shift * load.known for load in scenario.loads for t, _ in load.corners()]
     for k in range(steps):
         events = [t for t in corners if k * dt < t < (k + 1) * dt]
@@ -226,13 +217,18 @@ def _stamps(rate: float, end: float) -> list[int]:
     return [round(k * 1e9 / rate) for k in range(math.floor(end * rate + 1e-9) + 1)]
 
 
-def _seen(recording: Recording, setup: Setup, time: float) -> tuple[Floats, Floats]:
-    """Tip position (3,) m and quaternion (4,) wxyz that a tracker sees, averaged over its window before ``time`` s."""
-    ages = (np.arange(AVERAGED) + 0.5) * setup.averaging / AVERAGED if setup.averaging > 0.0 else np.zeros(1)
-    times = np.clip(time - ages, 0.0, recording.t[-1])
-    p = np.array([np.interp(times, recording.t, x).mean() for x in recording.position.T])
-    h = np.array([np.interp(times, recording.t, x).mean() for x in recording.quaternion.T])
-    return p, h / np.linalg.norm(h)
+def _tip_at(recording: Recording) -> Callable[[Floats], Floats]:
+    """The tip (s, 7) at any times (s,) in s, held outside the run."""
+    poses = np.hstack([recording.position, recording.quaternion])
+
+    def at(times: Floats) -> Floats:
+        inside = np.clip(times, 0.0, recording.t[-1])
+        tip = np.stack([np.interp(inside, recording.t, x) for x in poses.T], axis=1)
+        for row in tip:
+            row[3:] /= np.linalg.norm(row[3:])
+        return tip
+
+    return at
 
 
 def messages(scenario: Scenario, robot: Robot, recording: Recording) -> list[tuple[int, str, bytes]]:
@@ -266,19 +262,15 @@ def messages(scenario: Scenario, robot: Robot, recording: Recording) -> list[tup
             )
         )
 
-    setup = Model(robot, nodes=scenario.solver.nodes).setup
-    registration, shift = setup.rotation, setup.translation
+    tracker = make_plant(robot).tracker.corrected(delay=scenario.tracker.delay_s)
+    stamps = _stamps(scenario.rates.tracker_hz, end)
+    positions, quaternions = tracker.forward(np.array(stamps) * 1e-9, _tip_at(recording))
     keep = math.exp(-1.0 / (scenario.rates.tracker_hz * drift_time))
     wander = drift * tracker_noise.standard_normal(3)
-    for ns in _stamps(scenario.rates.tracker_hz, end):
-        p, h = _seen(
-            recording, setup, ns * 1e-9 / (1.0 + setup.skew) - setup.delay - scenario.tracker.delay_s
-        )
+    for ns, p, h in zip(stamps, positions, quaternions, strict=True):
         wander = keep * wander + drift * math.sqrt(1.0 - keep * keep) * tracker_noise.standard_normal(3)
-        seen = setup.tracker_scale * (p + matrix(h) @ setup.lever)
-        reported = matrix(registration) @ seen + shift + setup.drift * (ns * 1e-9) + wander
-        reported += position * tracker_noise.standard_normal(3)
-        turned = multiply(multiply(registration, h), from_vector(rotation * tracker_noise.standard_normal(3)))
+        reported = p + wander + position * tracker_noise.standard_normal(3)
+        turned = multiply(h, from_vector(rotation * tracker_noise.standard_normal(3)))
         turned /= np.linalg.norm(turned)
         stamp = origin + ns
         message = encode_pose_stamped(stamp, FRAME, reported.tolist(), turned[[1, 2, 3, 0]].tolist())

@@ -17,12 +17,14 @@ from ctr_dynamics.diagnosis.inference.pair_ranking import rank_sets
 from ctr_dynamics.diagnosis.inference.search_stages import second_opinion
 from ctr_dynamics.diagnosis.inference.sensitivities import Linearisation
 from ctr_dynamics.diagnosis.pipeline import needed
-from ctr_dynamics.effects import EFFECTS, Parameter, Quantity
+from ctr_dynamics.effects import EFFECTS, EffectParameter, Quantity
 
 
 def quantity(effect, *, tolerance=0.0, low=-math.inf):
     """A coordinate of unit prior size, of no effect of the catalogue."""
-    return Quantity(effect, "size", 0.0, tolerance, 1.0, low, math.inf, Parameter("size", "1", 0.0, 1.0))
+    return Quantity(
+        effect, "size", 0.0, tolerance, 1.0, low, math.inf, EffectParameter("size", "1", 0.0, 1.0)
+    )
 
 
 class Linear:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ctr_dynamics.cli.main import spread
-from ctr_dynamics.diagnosis.forward_model import at_times, play, product, rotate, smooth, to_vectors
+from ctr_dynamics.diagnosis.forward_model import at_times, smooth
 from ctr_dynamics.diagnosis.inference.candidates import candidates
 from ctr_dynamics.diagnosis.inference.hypotheses import along
 from ctr_dynamics.diagnosis.inference.map_fit import _Descent, posterior
@@ -14,7 +14,9 @@ from ctr_dynamics.diagnosis.inference.sensitivities import PROBE_STEP
 from ctr_dynamics.diagnosis.pipeline import Validation
 from ctr_dynamics.diagnosis.verdict.residual_tests import block_bootstrap
 from ctr_dynamics.diagnosis.whitening import Whitener
-from ctr_dynamics.effects import EFFECTS, Parameter, Quantity, quantities
+from ctr_dynamics.effects import EFFECTS, EffectParameter, Quantity, quantities
+from ctr_dynamics.kernels.backlash import behind_backlash
+from ctr_dynamics.kernels.rotations import multiply_rows, rotate_rows, to_vector_rows
 from ctr_dynamics.robot_files import load_robot
 
 
@@ -65,7 +67,7 @@ def test_whitener_gives_unit_noise():
 
 def test_play_follows_after_the_dead_zone():
     x = np.concatenate([np.linspace(0, 1, 50), np.linspace(1, -1, 100)])
-    y = play(x, 0.2)
+    y = behind_backlash(x, 0.2, x[0])
     assert y[49] == pytest.approx(0.9)
     assert y[55] == pytest.approx(0.9)  # still inside the dead zone of the reversal
     assert y[-1] == pytest.approx(-0.9)
@@ -103,9 +105,11 @@ def test_rotations_by_rows():
     h = np.array([[math.cos(0.2), 0.0, 0.0, math.sin(0.2)], [1.0, 0.0, 0.0, 0.0]])
     v = np.array([[1.0, 0.0, 0.0], [0.0, 2.0, 0.0]])
     np.testing.assert_allclose(
-        rotate(h, v), [[math.cos(0.4), math.sin(0.4), 0.0], [0.0, 2.0, 0.0]], atol=1e-15
+        rotate_rows(h, v), [[math.cos(0.4), math.sin(0.4), 0.0], [0.0, 2.0, 0.0]], atol=1e-15
     )
-    np.testing.assert_allclose(to_vectors(product(h, h)), [[0.0, 0.0, 0.8], [0.0, 0.0, 0.0]], atol=1e-15)
+    np.testing.assert_allclose(
+        to_vector_rows(multiply_rows(h, h)), [[0.0, 0.0, 0.8], [0.0, 0.0, 0.0]], atol=1e-15
+    )
 
 
 def test_bootstrap_interval_holds_the_gain():
@@ -148,7 +152,7 @@ def test_a_validation_confirms_what_removes_most_of_a_visible_misfit(before, aft
 
 def quantity(name, low=-math.inf, high=math.inf, *, tolerance=0.0, scale=1.0, off=0.0):
     """A coordinate of no effect of the catalogue."""
-    return Quantity("made_up", name, off, tolerance, scale, low, high, Parameter(name, "1", off, scale))
+    return Quantity("made_up", name, off, tolerance, scale, low, high, EffectParameter(name, "1", off, scale))
 
 
 class Vibration:

@@ -9,7 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ctr_dynamics.effects import EFFECTS, Setup, apply_effects, make_setup, quantities
+from ctr_dynamics.effects import EFFECTS, Plant, apply_effects, make_plant, quantities
+from ctr_dynamics.effects.plant import same
 from ctr_dynamics.model.model import Model
 from ctr_dynamics.model.simulator import Inputs, Simulator
 from ctr_dynamics.model.time_scheme import make_scheme
@@ -42,13 +43,13 @@ def off_values(effect):
     return found
 
 
-def same(a: Setup, b: Setup) -> bool:
-    """Whether two setups hold the same bits."""
-    return all(
-        np.array_equal(x, y) if isinstance(x, np.ndarray) else x == y
-        for name, x in vars(a).items()
-        if name not in ("robot", "layout")
-        for y in [getattr(b, name)]
+def same_plants(a: Plant, b: Plant) -> bool:
+    """Whether two plants hold the same bits."""
+    return (
+        same(a.block, b.block)
+        and same(a.tracker, b.tracker)
+        and a.has_inputs_of(b)
+        and a.extended == b.extended
     )
 
 
@@ -87,12 +88,11 @@ def test_units_and_off_values_are_those_of_the_contract(name):
 
 
 @pytest.mark.parametrize("name", sorted(EFFECTS))
-def test_off_values_leave_every_bit_of_the_setup(name):
-    model = Model(ROBOT, nodes=12)
-    plain, changed = make_setup(model, extensions=False), make_setup(model, extensions=False)
+def test_off_values_leave_every_bit_of_the_plant(name):
+    plain, changed = make_plant(ROBOT), make_plant(ROBOT)
     for values in ({}, off_values(EFFECTS[name])):
         apply_effects(changed, {name: values})
-        assert same(changed, plain)
+        assert same_plants(changed, plain)
     assert not changed.extended
 
 
@@ -125,7 +125,7 @@ def test_one_scale_away_from_off_every_parameter_acts(name):
     host = next((e.name for e in EFFECTS.values() if name in e.form), "")
     data = copy.deepcopy(robot_to_dict(ROBOT))
     data["gravity"]["value"] = [2.0, -9.0, 3.0]  # a turn about gravity's own axis does nothing
-    model = Model(robot_from_dict(data), nodes=12)
+    robot = robot_from_dict(data)
     strengths = [q for q in quantities(ROBOT) if q.effect == name and not q.parameter.shape]
     assert strengths
 
@@ -134,22 +134,26 @@ def test_one_scale_away_from_off_every_parameter_acts(name):
 
     on = next((away(q) for q in quantities(ROBOT) if q.effect == host), {})
     for q in strengths:
-        setup, without = make_setup(model), make_setup(model)
+        plant, without = make_plant(robot), make_plant(robot)
         apply_effects(without, on)
-        apply_effects(setup, {**on, **away(q)})
-        assert not same(setup, without), q.name
-        assert setup.extended == (bool(on) or (effect.extended and not effect.nuisance)), q.name
+        apply_effects(plant, {**on, **away(q)})
+        assert not same_plants(plant, without), q.name
+        assert plant.extended == (bool(on) or (effect.extended and not effect.nuisance)), q.name
 
 
 SIGNS = {
-    "exposed_length": ("tube2.beta_offset_m", 2e-3, lambda s: s.beta_offset[1] == 2e-3),
-    "encoder_offset": ("tube1.offset_rad", 0.03, lambda s: s.offset[0] == ROBOT.encoders.offset.value + 0.03),
-    "encoder_gain": ("tube1.gain", 1.02, lambda s: s.gain[0] == 1.02),
-    "backlash": ("tube2.width_rad", 0.04, lambda s: s.backlash[1] == 0.04),
-    "actuator_latency": ("delay_s", 0.02, lambda s: s.actuator_delay == 0.02),
-    "tracker_latency": ("delay_s", 0.02, lambda s: s.delay == ROBOT.tracker.delay.value + 0.02),
-    "tracker_scale": ("scale", 1.01, lambda s: s.tracker_scale == 1.01),
-    "clock_skew": ("rate", 1e-4, lambda s: s.skew == 1e-4),
+    "exposed_length": ("tube2.beta_offset_m", 2e-3, lambda s: s.actuators.beta_offset[1] == 2e-3),
+    "encoder_offset": (
+        "tube1.offset_rad",
+        0.03,
+        lambda s: s.actuators.offset[0] == ROBOT.encoders.offset.value + 0.03,
+    ),
+    "encoder_gain": ("tube1.gain", 1.02, lambda s: s.actuators.gain[0] == 1.02),
+    "backlash": ("tube2.width_rad", 0.04, lambda s: s.actuators.backlash[1] == 0.04),
+    "actuator_latency": ("delay_s", 0.02, lambda s: s.actuators.delay == 0.02),
+    "tracker_latency": ("delay_s", 0.02, lambda s: s.tracker.delay == ROBOT.tracker.delay.value + 0.02),
+    "tracker_scale": ("scale", 1.01, lambda s: s.tracker.scale == 1.01),
+    "clock_skew": ("rate", 1e-4, lambda s: s.tracker.skew == 1e-4),
     "payload_mass": (
         "added_kg",
         2e-3,
@@ -172,17 +176,21 @@ SIGNS = {
     "registration_rotation": (
         "rx_rad",
         math.pi / 2,
-        lambda s: np.allclose(s.rotation, [math.sqrt(0.5), math.sqrt(0.5), 0, 0]),
+        lambda s: np.allclose(s.tracker.rotation, [math.sqrt(0.5), math.sqrt(0.5), 0, 0]),
     ),
-    "registration_translation": ("tz_m", 1e-3, lambda s: s.translation[2] == 1e-3),
-    "tracker_lever_arm": ("x_m", 1e-3, lambda s: s.lever[0] == ROBOT.tracker.lever_arm.value[0] + 1e-3),
+    "registration_translation": ("tz_m", 1e-3, lambda s: s.tracker.translation[2] == 1e-3),
+    "tracker_lever_arm": (
+        "x_m",
+        1e-3,
+        lambda s: s.tracker.lever[0] == ROBOT.tracker.lever_arm.value[0] + 1e-3,
+    ),
 }
 
 
 @pytest.mark.parametrize("name", sorted(SIGNS))
 def test_signs(name):
     parameter, value, holds = SIGNS[name]
-    assert holds(Model(extended_robot({name: {parameter: value}}), nodes=12).setup)
+    assert holds(Model(extended_robot({name: {parameter: value}}), nodes=12).plant)
 
 
 def test_only_physics_asks_for_the_extended_kernels():

@@ -8,11 +8,10 @@ import pytest
 from ctr_dynamics.estimation.estimator import Estimator
 from ctr_dynamics.io import open_bag
 from ctr_dynamics.io.messages.cdr import JointStateIn
-from ctr_dynamics.kernels import backlash as play
 from ctr_dynamics.parameters import Settings
 from ctr_dynamics.robot_files import load_robot, robot_from_dict, robot_to_dict
 from ctr_dynamics.runtime.replay import Player
-from ctr_dynamics.sensing.interpolation import Drives
+from ctr_dynamics.sensing import ActuatorModel, ActuatorSignal
 from ctr_dynamics.simulation import Scenario, simulate
 from ctr_dynamics.simulation.run import write_recording
 
@@ -138,19 +137,19 @@ def test_encoders_read_what_gain_and_offset_leave_of_the_angle(tmp_path):
     assert first.positions[1] + offset == pytest.approx(PLAIN.rest.alpha.value[1], abs=1e-12)
 
 
-def test_drives_pass_play_and_delay_in_whatever_order_samples_come():
+def test_drives_pass_backlash_and_delay_in_whatever_order_samples_come():
     rng = np.random.default_rng(3)
-    width, delay_ns = np.array([0.3, 0.0]), 20_000_000
+    actuators = ActuatorModel(np.ones(2), np.zeros(2), np.array([0.3, 0.0]), np.zeros(2), delay=0.02)
     values = np.concatenate(
         [np.cumsum(rng.normal(0, 0.1, (60, 2)), axis=0), rng.uniform(-0.3, -0.2, (60, 2))], axis=1
     )
     order = np.arange(60)
     order[[10, 11, 30, 31, 32]] = [11, 10, 32, 30, 31]
-    drives = Drives(2, width, delay_ns)
+    drives = ActuatorSignal(actuators)
     for i in order:
         drives.add(int(i) * 10_000_000, values[i])
     assert drives.add(10_000_000, values[0]) == "duplicate"
-    expected = np.stack([play(np.ascontiguousarray(values[:, 0]), 0.3), values[:, 1]], axis=1)
+    expected = actuators.behind_backlash(values)[:, :2]
     assert np.abs(np.array(drives.values)[:, :2] - expected).max() < 1e-15
     value, rate = drives.at(305_000_000)  # alpha of 285 ms, beta of 305 ms
     assert np.allclose(value[:2], 0.5 * (expected[28] + expected[29]))

@@ -19,13 +19,13 @@ from estimation_cases import (
 )
 from tracker_twin import expected
 
+from ctr_dynamics.effects import make_plant
 from ctr_dynamics.estimation.estimator import DT_NS, LOST
-from ctr_dynamics.estimation.filter.tip_window import Tip
 from ctr_dynamics.kernels.rotations import conjugate, from_vector, matrix, multiply
-from ctr_dynamics.model.model import Model
 from ctr_dynamics.parameters import PARAMETERS
 from ctr_dynamics.robot_files import load_robot, robot_from_dict, robot_to_dict
-from ctr_dynamics.sensing.tracker import STATES, tracker_model
+from ctr_dynamics.sensing import Tip
+from ctr_dynamics.sensing.tracker import STATES
 
 
 def reshaped(messages, change):
@@ -367,17 +367,17 @@ def test_parameters_compose_with_the_robot_file():
     q = rng.normal(size=4)
     mean = np.concatenate([rng.normal(size=3), q / np.linalg.norm(q), np.zeros(6)])
     tip = Tip(0.0, mean, np.zeros((12, 1)))
-    setup = Model(robot, nodes=12).setup
-    plain = expected(tracker_model(setup), np.zeros(STATES), tip)
-    both = tracker_model(setup, delay=0.002, lever=lever, rotation=turn, translation=shift)
+    tracker = make_plant(robot).tracker
+    plain = expected(tracker, np.zeros(STATES), tip)
+    both = tracker.corrected(delay=0.002, lever=lever, rotation=turn, translation=shift)
     assert both.delay == pytest.approx(0.006)
     position, quaternion = expected(both, np.zeros(STATES), tip)
     R = matrix(from_vector(turn))
     carried = plain[0] + matrix(plain[1]) @ lever
     assert np.allclose(position, R @ carried + shift, atol=1e-12)
     assert np.allclose(matrix(quaternion), R @ matrix(plain[1]), atol=1e-12)
-    bare = tracker_model(
-        setup, lever=lever, rotation=turn, translation=shift, mask=(True, True, True, True, True, False)
+    bare = tracker.corrected(
+        lever=lever, rotation=turn, translation=shift, mask=(True, True, True, True, True, False)
     )
     assert np.allclose(bare.to_base(position, np.array([1.0, 0, 0, 0]), tip.quaternion)[0], tip.position)
     assert np.allclose(both.to_base(position, quaternion, np.array([1.0, 0, 0, 0]))[0], tip.position)

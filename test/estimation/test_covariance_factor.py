@@ -6,7 +6,7 @@ import pytest
 import ctr_dynamics.estimation.filter.covariance_factor as factor_module
 from ctr_dynamics.estimation.filter.covariance_factor import CovarianceFactor
 from ctr_dynamics.estimation.filter.energy_norm import energy_rows, field_weights
-from ctr_dynamics.estimation.filter.parameter_priors import bias_sigma, model_uncertainty
+from ctr_dynamics.estimation.filter.parameter_priors import model_uncertainty
 from ctr_dynamics.kernels.workspace import base_rows
 from ctr_dynamics.model.mesh import build_mesh
 from ctr_dynamics.model.mesh_interpolation import coarse_key, transfer
@@ -14,6 +14,7 @@ from ctr_dynamics.model.model import Model
 from ctr_dynamics.model.simulator import Inputs, Simulator
 from ctr_dynamics.model.statics import Statics
 from ctr_dynamics.robot_files import load_robot
+from ctr_dynamics.sensing import TrackerModel
 
 BETA, ALPHA, ZERO = np.array([-0.2521, -0.1977]), np.array([1.5708, 1.5708]), np.zeros(2)
 DT = 0.003
@@ -84,7 +85,7 @@ def test_uncertain_parameters_are_the_robot_files(robot, model):
         column = unc.effect[model.layout["gravity"], unc.names.index(f"gravity_direction.{axis}")]
         assert column @ np.array(robot.gravity.value) == pytest.approx(0.0, abs=1e-12)
         assert np.linalg.norm(column) == pytest.approx(9.81, abs=0.01)
-    biases = bias_sigma(robot)
+    biases = TrackerModel.of_robot(robot).state_sigma
     assert biases[3:6] == pytest.approx([2e-4] * 3)
     assert biases[9] == pytest.approx(1e-3)
 
@@ -95,9 +96,10 @@ def test_every_axis_of_the_tracker_has_its_own_deviation(robot):
     changed = robot.model_copy(
         update={"tracker": tracker.model_copy(update={"registration_translation": translation})}
     )
-    assert bias_sigma(changed)[3:6].tolist() == [1e-4, 2e-4, 3e-3]
+    assert TrackerModel.of_robot(changed).state_sigma[3:6].tolist() == [1e-4, 2e-4, 3e-3]
     np.testing.assert_array_equal(
-        np.delete(bias_sigma(changed), [3, 4, 5]), np.delete(bias_sigma(robot), [3, 4, 5])
+        np.delete(TrackerModel.of_robot(changed).state_sigma, [3, 4, 5]),
+        np.delete(TrackerModel.of_robot(robot).state_sigma, [3, 4, 5]),
     )
 
 

@@ -6,10 +6,12 @@ import numpy as np
 import pytest
 
 from ctr_dynamics.estimation.inputs.actuation import Signals
-from ctr_dynamics.sensing.interpolation import Drives, Signal
+from ctr_dynamics.sensing import ActuatorModel, ActuatorSignal
+from ctr_dynamics.sensing.interpolation import Signal
 
 MS = 1_000_000
 RNG = np.random.default_rng(5)
+PLAIN = ActuatorModel(np.ones(2), np.zeros(2), np.zeros(2), np.zeros(2))
 
 
 def line(before, after, begin, end, times):
@@ -27,12 +29,12 @@ def signal(make):
     return made
 
 
-@pytest.fixture(params=["plain", "played", "delayed"])
+@pytest.fixture(params=["plain", "backlash", "delayed"])
 def sampled(request):
     makes = {
-        "plain": lambda: Drives(2, np.zeros(2), 0),
-        "played": lambda: Drives(2, np.array([0.3, 0.0]), 0),
-        "delayed": lambda: Drives(2, np.zeros(2), 4 * MS),
+        "plain": lambda: ActuatorSignal(PLAIN),
+        "backlash": lambda: ActuatorSignal(PLAIN.changed(backlash=np.array([0.3, 0.0]))),
+        "delayed": lambda: ActuatorSignal(PLAIN.changed(delay=4e-3)),
     }
     return signal(makes[request.param])
 

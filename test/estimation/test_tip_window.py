@@ -9,10 +9,11 @@ from scipy.spatial.transform import Rotation
 from tracker_twin import expected, residual
 
 from ctr_dynamics.estimation.filter.factor_reduction import through
-from ctr_dynamics.estimation.filter.tip_window import Tip, TipWindow, tip_rows
+from ctr_dynamics.estimation.filter.tip_window import TipWindow, tip_rows
 from ctr_dynamics.kernels.rotations import conjugate, from_vector, matrix, multiply, to_vector
 from ctr_dynamics.kernels.tracker_measurement import fused_tip
-from ctr_dynamics.sensing.tracker import DELAY, STATES, TrackerModel, innovation
+from ctr_dynamics.sensing import Tip
+from ctr_dynamics.sensing.tracker import DELAY, STATES, TrackerModel
 
 RNG = np.random.default_rng(11)
 COLUMNS, STEP = 5, 1e-6
@@ -87,7 +88,7 @@ def test_tip_rows_are_the_kinematics_and_their_derivative():
 
 def test_sensitivity_equals_finite_differences():
     tip, tracker, bias = random_tip(), random_tracker(), bias_of(0.0)
-    H = innovation(tracker, bias, tip, np.eye(COLUMNS + STATES), *expected(tracker, bias, tip))[1]
+    H = tracker.innovation(bias, tip, np.eye(COLUMNS + STATES), *expected(tracker, bias, tip))[1]
     assert H.shape == (6, COLUMNS + STATES)
     for column in range(COLUMNS + STATES):
         readings = []
@@ -109,10 +110,9 @@ def test_innovation_equals_its_numpy_twin(measured):
     tip, tracker, bias = random_tip(), replace(random_tracker(), mask=mask), bias_of(0.02)
     position, quaternion = expected(tracker, bias_of(0.02), tip)
     root = RNG.normal(size=(COLUMNS + STATES, COLUMNS + STATES))
-    nu, H, S, white = innovation(tracker, bias, tip, root @ root.T, position, quaternion)
-    everything = innovation(
-        replace(tracker, mask=np.ones(6, dtype=bool)), bias, tip, root @ root.T, position, quaternion
-    )[1]
+    nu, H, S, white = tracker.innovation(bias, tip, root @ root.T, position, quaternion)
+    whole = tracker.changed(mask=np.ones(6, dtype=bool))
+    everything = whole.innovation(bias, tip, root @ root.T, position, quaternion)[1]
     wanted = residual(position, quaternion, *expected(tracker, bias, tip), mask)[mask]
     np.testing.assert_allclose(nu, wanted, rtol=1e-10, atol=1e-13)
     np.testing.assert_array_equal(H, everything[mask])
@@ -130,7 +130,7 @@ def test_residual_of_a_masked_rotation_leaves_the_arbitrary_turn_out():
     five = replace(tracker, mask=np.array([1, 1, 1, 1, 1, 0], dtype=bool))
     for roll in (0.0, 1.0, -2.5, np.pi):
         read = multiply(multiply(quaternion, from_vector(tilt)), from_vector(np.array([0.0, 0.0, roll])))
-        nu = innovation(five, np.zeros(STATES), tip, np.eye(COLUMNS + STATES), position, read)[0]
+        nu = five.innovation(np.zeros(STATES), tip, np.eye(COLUMNS + STATES), position, read)[0]
         assert np.allclose(nu[3:5], tilt[:2], atol=1e-5)
 
 

@@ -97,7 +97,7 @@ def _search(forward_model: ForwardModel, residual: Floats, floor: float, workers
         first -= 1
     if recording.stamps[parted] - recording.stamps[first] > SUDDEN:
         return None
-    back = matrix(forward_model.nominal.rotation).T  # tracker's axes to base axes
+    back = matrix(forward_model.nominal.tracker.rotation).T  # tracker's axes to base axes
     calm = residual[max(first - 3, 0)] if first else np.zeros(3)
     begin = recording.stamps[parted]
 
@@ -105,7 +105,7 @@ def _search(forward_model: ForwardModel, residual: Floats, floor: float, workers
         normal = back @ (residual[k] - calm)
         normal = normal / max(float(np.linalg.norm(normal)), 1e-12)
         near = slice(max(first - 1, 0), parted + 3)
-        places = (recording.position[near] - forward_model.nominal.translation) @ back.T @ normal
+        places = (recording.position[near] - forward_model.nominal.tracker.translation) @ back.T @ normal
         x = np.array([math.log(stiffness), *normal, 1e2 * (np.nanmin(places) + INSIDE_M)])
         left = math.inf
         for span in FIRST_SPANS:

@@ -19,7 +19,7 @@ from ctr_dynamics.estimation.filter.factor_reduction import reduced
 from ctr_dynamics.estimation.filter.factor_schedule import FactorSchedule, ScheduleState
 from ctr_dynamics.estimation.filter.force_variance import ForceVariance, ForceVarianceState
 from ctr_dynamics.estimation.filter.gating import Gate, GateOptions
-from ctr_dynamics.estimation.filter.parameter_priors import bias_sigma, model_uncertainty
+from ctr_dynamics.estimation.filter.parameter_priors import model_uncertainty
 from ctr_dynamics.estimation.filter.process_noise import ProcessNoise
 from ctr_dynamics.estimation.filter.tip_window import TipWindow, TipWindowState
 from ctr_dynamics.estimation.step_output import FUSION_OFF
@@ -27,7 +27,8 @@ from ctr_dynamics.kernels.filter_steps import move_unknowns
 from ctr_dynamics.kernels.tracker_measurement import fused_tip
 from ctr_dynamics.model.model import Model
 from ctr_dynamics.model.simulator import Inputs, Simulator, State, StepResult
-from ctr_dynamics.sensing.tracker import DELAY, STATES, TrackerModel, innovation
+from ctr_dynamics.sensing import Tip, TrackerModel
+from ctr_dynamics.sensing.tracker import DELAY, STATES
 
 Floats = NDArray[np.float64]
 
@@ -138,9 +139,10 @@ class RodEkf:
         self.bias = np.zeros(STATES)
         self.pi = np.zeros((0, 0))
         self.factor = CovarianceFactor(self.model, self.uncertainty, options.rank)
-        # a measurement at the edge of the window shows a tip that is older still by the delay
+        # a measurement at the edge of the window shows tips that are older still by the delay and the tracker's averaging
         dt = simulator.scheme.dt
-        self.tips = TipWindow(math.ceil((options.window + max(0.0, tracker.delay)) / dt) + 5)
+        oldest = options.window + max(0.0, tracker.delay) + tracker.averaging
+        self.tips = TipWindow(math.ceil(oldest / dt) + 5)
         self.force_variance = ForceVariance(
             options.force_sigma, options.force_sigma_max, options.force_change
         )
@@ -163,8 +165,7 @@ class RodEkf:
         self.bias[:] = 0.0
         self.pi = np.zeros((r + STATES, r + STATES))
         self.pi[:r, :r] = pi_aa
-        sigma = bias_sigma(self.model.robot)
-        self.pi[r:, r:] = np.diag(sigma**2)
+        self.pi[r:, r:] = np.diag(self.tracker.state_sigma**2)
         # the unknown force starts with its stationary deviation, in columns of its own
         scale = np.diag(self.factor.theta)[self._force]
         for axis, size in enumerate(scale):
@@ -323,12 +324,16 @@ class RodEkf:
         outside = self.gate.outside(record.nis, record.dof)
         return record._replace(reason="outside the gate" if outside else FUSION_OFF)
 
+    def _tip_at(self, time: float) -> Tip | None:
+        """The tip of that time (s) with its columns."""
+        return self.tips.at(time, self.simulator.scheme.dt)
+
     def _comparison(self, stamp: float, position: Floats, quaternion: Floats) -> Update | Comparison:
         """A measurement against the tip of its time; the record alone where there is nothing to compare it with."""
-        tip = self.tips.at(stamp - self.tracker.delay - self.bias[DELAY], self.simulator.scheme.dt)
+        tip = self.tracker.observed_tip(self._tip_at, stamp - self.tracker.delay - self.bias[DELAY])
         if tip is None:
             return Update.impossible("outside the window of kept steps")
-        nu, H, S, whitened = innovation(self.tracker, self.bias, tip, self.pi, position, quaternion)
+        nu, H, S, whitened = self.tracker.innovation(self.bias, tip, self.pi, position, quaternion)
         if not math.isfinite(nu.sum() + S.sum() + whitened.sum()):
             return Update.impossible("the innovation is not finite")
         axes = self.tracker.axes
@@ -404,4 +409,4 @@ class RodEkf:
 
 def insertion_fraction(model: Model) -> float:
     """Of d beta_1 / dt, what the velocities of ``model`` hold already: 0 without the extension `insertion_velocity`."""
-    return float(model.setup.block[model.layout["insertion"]][0]) if model.extended else 0.0
+    return float(model.plant.block[model.layout["insertion"]][0]) if model.extended else 0.0

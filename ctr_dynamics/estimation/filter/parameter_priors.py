@@ -19,15 +19,6 @@ FORCE = ("tip_force.x", "tip_force.y", "tip_force.z")
 # Ranges that a robot can have: of relative changes of a quantity, from a tenth of it to ten times, and of angles in rad (29 deg).
 RELATIVE, ANGLE = (-0.9, 9.0), (-0.5, 0.5)
 
-# Tracker states: name and number of axes, in their order in the filter.
-BIASES = (
-    ("registration_rotation", 3),
-    ("registration_translation", 3),
-    ("lever_arm", 3),
-    ("delay", 1),
-    ("drift", 3),
-)
-
 
 @dataclass(frozen=True)
 class ModelUncertainty:
@@ -135,9 +126,12 @@ def model_uncertainty(model: Model) -> ModelUncertainty:
             column = np.zeros(layout.size)
             column[layout["gravity"]] = np.cross(direction, g)
             add(f"gravity_direction.{axis}", robot.gravity.direction_tolerance, column, ANGLE)
+    actuators = model.plant.actuators
+    rest = actuators.inverse(np.array([*robot.rest.alpha.value, *robot.rest.beta.value]))
+    by_offset = actuators.derivative("offset", rest)
     for i in range(n):
         column = np.zeros(layout.size)
-        column[layout["alpha"].start + i] = 1.0
+        column[layout["alpha"].start + i] = by_offset[i]
         add(f"encoder_offset.tube{i + 1}", robot.encoders.offset.tolerance, column, ANGLE)
     for number, name in enumerate(FORCE):
         column = np.zeros(layout.size)
@@ -148,17 +142,3 @@ def model_uncertainty(model: Model) -> ModelUncertainty:
         ranges.append((-np.inf, np.inf))
     lowest, highest = np.array(ranges).T
     return ModelUncertainty(tuple(names), np.array(sigma), np.array(effect).T, lowest, highest)
-
-
-def bias_sigma(robot: Robot) -> np.ndarray:
-    """(13,) prior deviations of the tracker states in the order of ``BIASES``."""
-    tracker = robot.tracker
-    return np.concatenate(
-        [
-            tracker.registration_rotation.tolerance,
-            tracker.registration_translation.tolerance,
-            tracker.lever_arm.tolerance,
-            [tracker.delay.tolerance],
-            np.full(3, tracker.noise.drift.value),
-        ]
-    )

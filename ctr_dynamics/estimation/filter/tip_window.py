@@ -13,39 +13,9 @@ from numpy.typing import NDArray
 
 from ctr_dynamics.estimation.filter.factor_reduction import BasisChange
 from ctr_dynamics.kernels.filter_steps import interpolate_columns, shift_tips, tip_between, tip_rows
+from ctr_dynamics.sensing import Tip
 
 Floats = NDArray[np.float64]
-
-
-class Tip(NamedTuple):
-    """Pose and twist in ``ctr_base`` at one time, with the first variation by the coefficients of the covariance factor.
-
-    Attributes:
-        stamp: s from the first step.
-        mean: (13,) position, quaternion, velocity and rate in one vector, of which these are parts:
-        position (3,) m, quaternion (4,) wxyz, velocity (3,) m/s (insertion included), rate (3,) rad/s (base axes).
-        columns: (12, r): position, rotation vector (base axes), velocity, angular velocity by every coefficient.
-    """
-
-    stamp: float
-    mean: Floats
-    columns: Floats
-
-    @property
-    def position(self) -> Floats:
-        return self.mean[0:3]
-
-    @property
-    def quaternion(self) -> Floats:
-        return self.mean[3:7]
-
-    @property
-    def velocity(self) -> Floats:
-        return self.mean[7:10]
-
-    @property
-    def rate(self) -> Floats:
-        return self.mean[10:13]
 
 
 class TipWindowState(NamedTuple):

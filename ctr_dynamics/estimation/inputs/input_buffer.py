@@ -23,8 +23,8 @@ from ctr_dynamics.estimation.inputs.input_validation import (
 from ctr_dynamics.estimation.monitoring.health import Health
 from ctr_dynamics.model.model import Model
 from ctr_dynamics.parameters import Settings
-from ctr_dynamics.sensing.interpolation import Drives, Signal
-from ctr_dynamics.sensing.tracker import TrackerModel
+from ctr_dynamics.sensing import ActuatorSignal, TrackerModel
+from ctr_dynamics.sensing.interpolation import Signal
 
 Floats = NDArray[np.float64]
 DT_NS = 3_000_000
@@ -64,16 +64,15 @@ class InputBuffer:
         self.window_ns = round(float(settings["filter.window_s"]) * 1e9)
         self.timeout_ns = round(float(settings["input_timeout_s"]) * 1e9)
         self.predicting = settings["output.policy"] == "predict"
-        self._load_delay_ns = round(model.setup.load_shift * 1e9)
+        self._load_delay_ns = round(model.plant.load_delay * 1e9)
         self._load_bend = model.load_kink / (DT_NS * 1e-9)
         self.load = Signal(6)
         self.clear()
 
     def clear(self) -> None:
         """Forget everything but the last known load, which goes on acting."""
-        setup = self.model.setup
         self.t0_ns: int | None = None
-        self.joints = Drives(setup.n, setup.backlash, round(setup.actuator_delay * 1e9))
+        self.joints = ActuatorSignal(self.model.plant.actuators)
         self.carry_load(self.load)
         self._opening: int | None = None  # ns of the sample without load that was put before the first load
         self.samples: list[Sample] = []
@@ -98,7 +97,7 @@ class InputBuffer:
     ) -> int | None:
         """Take in a joint state after step ``k``; returns the ns from which on actuators are known otherwise than before."""
         try:
-            value = joint_values(self.model.setup, stamp_ns, names, positions)
+            value = joint_values(self.model.plant, stamp_ns, names, positions)
         except Unusable as problem:
             self.health.note("joints", problem.kind, problem.text)
             return None
@@ -255,15 +254,18 @@ class InputBuffer:
         bends = self.load.bends(end_ns - DT_NS, end_ns, self._load_bend)
         return [(stamp - self.t0_ns) * 1e-9 for stamp in bends]
 
-    def due_samples(self, tracker: TrackerModel, t: float) -> list[tuple[Sample, float, Floats]]:
-        """Samples not yet used whose own time is past, ``t`` (s) included, with the time and position of their readings."""
+    def due_samples(self, tracker: TrackerModel, t: float) -> list[tuple[Sample, float, Floats, Floats]]:
+        """Samples not yet used whose own time is past, ``t`` (s) included, with stamp (s), position and quaternion of the undistorted reading."""
         assert self.t0_ns is not None
         due = []
         for sample in self.samples:
             if sample.fused_k is None:
-                time_s, position = tracker.reading((sample.stamp_ns - self.t0_ns) * 1e-9, sample.position)
+                stamp_s = (sample.stamp_ns - self.t0_ns) * 1e-9
+                time_s, position, quaternion = tracker.undistorted(
+                    stamp_s, sample.position, sample.quaternion
+                )
                 if time_s - tracker.delay <= t + 1e-9:
-                    due.append((sample, time_s, position))
+                    due.append((sample, time_s, position, quaternion))
         return due
 
     def covers_no_more(self, k: int) -> bool:

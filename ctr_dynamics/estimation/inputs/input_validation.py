@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from ctr_dynamics.effects.setup import Setup
+from ctr_dynamics.effects import Plant
 from ctr_dynamics.io.messages.topics import accepts_frame
 from ctr_dynamics.sensing.interpolation import finite, joint_order
 
@@ -24,13 +24,13 @@ class Unusable(Exception):
         self.kind, self.text = kind, text
 
 
-def joint_values(setup: Setup, stamp_ns: int, names: Sequence[str], positions: Sequence[float]) -> Floats:
-    """(2 N,) alpha in rad and beta in m of every tube from a joint state's lists, with the robot file's gains and offsets.
+def joint_values(plant: Plant, stamp_ns: int, names: Sequence[str], positions: Sequence[float]) -> Floats:
+    """(2 N,) drive positions, rad and m, from a joint state's lists.
 
     Raises:
         Unusable: joints are missing or double, numbers are missing or not finite, or the robot cannot be there.
     """
-    n = setup.n
+    n = plant.n
     order = joint_order(tuple(names), n)
     if isinstance(order, str):
         raise Unusable("names", order)
@@ -43,10 +43,9 @@ def joint_values(setup: Setup, stamp_ns: int, names: Sequence[str], positions: S
         raise Unusable(
             "not finite", f"joint state at {stamp_ns} ns holds a value that is not finite; it was left out"
         )
-    value[:n] = setup.gain * value[:n] + setup.offset
-    value[n:] += setup.beta_offset
+    value = plant.actuators.forward(value)
     numbers = value.tolist()
-    reason = setup.robot.actuator_problem(numbers[n:], numbers[:n])
+    reason = plant.robot.actuator_problem(numbers[n:], numbers[:n])
     if reason:
         raise Unusable("out of range", f"{reason}; the joint state was left out")
     return value

@@ -1,0 +1,48 @@
+"""Every effect of this package, in the order in which findings list them. A further effect is one file beside these and one line here."""
+
+from __future__ import annotations
+
+from ctr_dynamics.effects import drivetrain, environment, friction, kinematics, structure, tracking
+
+CATALOGUE = (
+    drivetrain.exposed_length,
+    drivetrain.encoder_offset,
+    drivetrain.encoder_gain,
+    drivetrain.backlash,
+    drivetrain.drivetrain_compliance,
+    drivetrain.actuator_latency,
+    kinematics.insertion_velocity,
+    kinematics.clearance,
+    kinematics.play_kinematics,
+    environment.load_time,
+    friction.base_coulomb,
+    friction.base_viscous,
+    friction.tube_coulomb,
+    friction.tube_viscous,
+    friction.stribeck,
+    friction.distributed_friction,
+    friction.air_drag,
+    structure.youngs_modulus,
+    structure.shear_modulus,
+    structure.precurvature,
+    structure.density,
+    structure.payload_mass,
+    structure.payload_inertia,
+    structure.bending_damping,
+    structure.torsion_damping,
+    structure.ovality,
+    structure.oval_mean,
+    structure.softening,
+    environment.gravity_direction,
+    environment.tip_force,
+    environment.tip_spring,
+    environment.contact,
+    tracking.registration_rotation,
+    tracking.registration_translation,
+    tracking.tracker_lever_arm,
+    tracking.tracker_latency,
+    tracking.tracker_averaging,
+    tracking.clock_skew,
+    tracking.tracker_scale,
+    tracking.drift,
+)
