@@ -27,7 +27,7 @@ Floats = NDArray[np.float64]
 TOLERANCE, LIMIT = 1e-7, 40
 
 
-@njit(nogil=True, error_model="numpy")
+@njit(cache=False, nogil=True, error_model="numpy")
 def _euler_cells(tubes, W, present, cells, h, point, node, ust, c0, hist, shared, own, out, nodes, kept):
     """As :func:`ctr_dynamics.kernels.rod._cells`, with the slope at the beginning of every cell alone."""
     S, F = state_rows(len(tubes)), field_rows(len(tubes))
@@ -49,13 +49,13 @@ def _euler_cells(tubes, W, present, cells, h, point, node, ust, c0, hist, shared
 def _with(kernel: Any, **replaced: Any) -> Any:
     """The ``kernel`` with other functions in place of those it calls by these names."""
     function = FunctionType(kernel.py_func.__code__, {**vars(kernels), **replaced})
-    return njit(nogil=True, error_model="numpy")(function)
+    return njit(cache=False, nogil=True, error_model="numpy")(function)
 
 
 _sweep = _with(kernels._sweep, _section=_with(kernels._section, _cells=_euler_cells))
 
 
-@njit(nogil=True, error_model="numpy")
+@njit(cache=False, nogil=True, error_model="numpy")
 def euler_sweep(tubes, W, c0, mesh, par, seclen, x, hist, histb, out, outb, nodes, res):
     """:func:`ctr_dynamics.kernels.rod.sweep` of one lane by Euler's method."""
     given = rows((), hist, 0, 1)

@@ -27,7 +27,6 @@ import numba
 from numba.core import caching, types
 
 PACKAGE = Path(__file__).resolve().parents[1]
-LAYOUT = 2  # of what is stored; another number begins a new cache
 KEPT_DAYS = 30.0  # caches that nobody has used for so long are removed
 
 
@@ -93,7 +92,7 @@ def source_digest(path: Path) -> str:
         if file not in reached:
             reached.add(file)
             waiting.extend(_imported(file))
-    digest = hashlib.sha256(f"{numba.__version__} {LAYOUT}".encode())
+    digest = hashlib.sha256(numba.__version__.encode())
     for file in sorted(reached):
         digest.update(os.path.relpath(file, PACKAGE).encode() + b"\0" + file.read_bytes() + b"\0")
     return digest.hexdigest()[:16]
@@ -231,17 +230,21 @@ class _KernelCache(caching.FunctionCache):
 
 
 def njit(*, cache: bool = True, **options: Any) -> Callable[[Callable[..., Any]], Any]:
-    """:func:`numba.njit` with the cache of this module.
+    """:func:`numba.njit` with the cache of this module; ``cache=False`` compiles in every process.
 
-    Kernels have no closures: what they use stands in their module or in one that it imports.
+    What a cached kernel uses stands in its module or in one that it imports.
+
+    Raises:
+        TypeError: the function is a closure or has other globals than its module: the cache would not see what it is made of.
     """
 
     def decorate(function: Callable[..., Any]) -> Any:
         compiled = numba.njit(**options)(function)
         if cache and Path(function.__code__.co_filename).is_file():
-            if function.__closure__:
+            module = sys.modules.get(function.__module__)
+            if function.__closure__ or (module is not None and function.__globals__ is not vars(module)):
                 raise TypeError(
-                    f"{function.__qualname__} is a closure: the cache would not see what it holds"
+                    f"{function.__qualname__} uses more than its module holds; compile it with cache=False"
                 )
             compiled._cache = _KernelCache(function)
         return compiled

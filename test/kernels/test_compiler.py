@@ -11,10 +11,11 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from types import FunctionType
 
 import pytest
 
-from ctr_dynamics.kernels import compiler
+from ctr_dynamics.kernels import compiler, rotations
 
 FILES = {
     "__init__.py": "",
@@ -172,3 +173,15 @@ def test_a_folder_that_cannot_be_written_is_said_once(tmp_path):
     assert set(state.values()) == {"compiled"}
     assert said.count("cannot be kept") == 1
     assert "set NUMBA_CACHE_DIR" in said
+
+
+def test_a_function_that_its_module_does_not_explain_is_not_cached():
+    """Its file, name and types are those of the original: the cache would take one for the other."""
+    original = rotations.multiply
+    changed = FunctionType(original.__code__, {**vars(rotations), "np": None})
+    with pytest.raises(TypeError, match="cache=False"):
+        compiler.njit()(changed)
+    compiler.njit(cache=False)(changed)
+    factor = 2.0
+    with pytest.raises(TypeError, match="cache=False"):
+        compiler.njit()(lambda x: factor * x)
