@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ctr_dynamics.benchmarks.machine import best_of
+from ctr_dynamics.benchmarks.machine_info import best_of
 from ctr_dynamics.benchmarks.release import DT, Release, release_robot, sampled
 from ctr_dynamics.effects import apply_effects
 from ctr_dynamics.model.batch import LANES, run_many

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from ctr_dynamics.benchmarks.machine import best_of
+from ctr_dynamics.benchmarks.machine_info import best_of
 from ctr_dynamics.kernels.snap_newton import back_solve, factorise, residual
 from ctr_dynamics.robot_files import load_robot
 from ctr_dynamics.snap.experiment import Plan, run

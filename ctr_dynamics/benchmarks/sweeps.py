@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from ctr_dynamics.benchmarks.machine import best_of
+from ctr_dynamics.benchmarks.machine_info import best_of
 from ctr_dynamics.kernels.paired_time_step import PAIR_LANES
 from ctr_dynamics.kernels.rod import sweep
 from ctr_dynamics.kernels.sections import section_lengths

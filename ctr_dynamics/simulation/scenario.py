@@ -13,7 +13,7 @@ from pydantic import Field, FiniteFloat, PrivateAttr, ValidationError, model_val
 
 from ctr_dynamics.errors import InputError
 from ctr_dynamics.io.yaml_files import read_yaml
-from ctr_dynamics.simulation.motion import AnyPrimitive, Axis, Block, Seconds
+from ctr_dynamics.simulation.motion_primitives import AnyPrimitive, Axis, Block, Seconds
 
 Floats = NDArray[np.float64]
 MAX_BYTES = 10_000_000

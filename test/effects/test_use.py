@@ -13,7 +13,7 @@ from ctr_dynamics.robot_files import load_robot, robot_from_dict, robot_to_dict
 from ctr_dynamics.runtime.replay import Player
 from ctr_dynamics.sensing import ActuatorModel, ActuatorSignal
 from ctr_dynamics.simulation import Scenario, simulate
-from ctr_dynamics.simulation.run import write_recording
+from ctr_dynamics.simulation.scenario_run import write_recording
 
 PLAIN = load_robot("till2020_tissue")
 SCENARIO = Scenario.model_validate(

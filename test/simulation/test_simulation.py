@@ -12,8 +12,8 @@ from ctr_dynamics.io import open_bag
 from ctr_dynamics.io.messages.cdr import JointStateIn, PoseIn
 from ctr_dynamics.robot_files import load_robot
 from ctr_dynamics.simulation import Scenario, load_scenario, scenario_names, simulate
-from ctr_dynamics.simulation.motion import Axis, Hold, Multisine, Ramp, Sine, Table
-from ctr_dynamics.simulation.run import messages
+from ctr_dynamics.simulation.motion_primitives import Axis, Hold, Multisine, Ramp, Sine, Table
+from ctr_dynamics.simulation.scenario_run import messages
 
 SHORT = {
     "duration_s": 0.3,

@@ -18,8 +18,8 @@ from ctr_dynamics.diagnosis.whitening import Whitener
 from ctr_dynamics.errors import InputError
 from ctr_dynamics.model.model import Model
 from ctr_dynamics.robot import Robot
-from ctr_dynamics.simulation.run import drives
 from ctr_dynamics.simulation.scenario import Scenario, load_scenario
+from ctr_dynamics.simulation.scenario_run import drives
 
 Floats = NDArray[np.float64]
 LIBRARY = ("release", "light_release", "reversals", "turns")
