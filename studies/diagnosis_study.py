@@ -31,6 +31,7 @@ def one(stratum: str, seed: int) -> dict[str, Any]:
     from ctr_dynamics.diagnosis.output.findings import findings
     from ctr_dynamics.diagnosis.pipeline import diagnose
     from ctr_dynamics.diagnosis.recording import read_recording
+    from ctr_dynamics.diagnosis.run_context import RunContext
     from ctr_dynamics.robot_files import load_robot
 
     with tempfile.TemporaryDirectory() as folder:
@@ -39,7 +40,10 @@ def one(stratum: str, seed: int) -> dict[str, Any]:
         made = time.time() - begin
         robot = load_robot(case.robot)
         result = diagnose(
-            robot, [read_recording(case.protocol, robot)], [read_recording(case.sweep, robot)], workers=1
+            robot,
+            [read_recording(case.protocol, robot)],
+            [read_recording(case.sweep, robot)],
+            context=RunContext(workers=1),
         )
         content = findings(result, "", None)
         answer = case.unseal()
@@ -71,10 +75,10 @@ def one(stratum: str, seed: int) -> dict[str, Any]:
 
 def separations(result: Any, answer: dict[str, Any]) -> dict[str, float]:
     """d_sep of every true cause, from the true effects fitted to the data, against the nearest rival."""
-    from ctr_dynamics.diagnosis.inference.candidates import causes_of
-    from ctr_dynamics.diagnosis.inference.hypotheses import with_nuisances
-    from ctr_dynamics.diagnosis.inference.map_fit import fit
-    from ctr_dynamics.diagnosis.inference.sensitivities import linearise, separation
+    from ctr_dynamics.diagnosis.inference.hypotheses import fit_hypothesis
+    from ctr_dynamics.diagnosis.inference.sensitivities import sensitivities_at
+    from ctr_dynamics.diagnosis.inference.separation import separation
+    from ctr_dynamics.diagnosis.run_context import RunContext
 
     problem, found = result.problem, result.search
     members, start = [], {}
@@ -95,16 +99,16 @@ def separations(result: Any, answer: dict[str, Any]) -> dict[str, float]:
                 start[q.key] = q.parameter.coordinate(values[q.name]["total"])
     if not members:
         return {}
-    causes = causes_of(members)
-    best = fit(with_nuisances(problem, members), causes, start)
-    lin = linearise(problem, best.point, found.pool, 1) if best else None
-    if best is None or lin is None:
+    context = RunContext(workers=1)
+    best = fit_hypothesis(problem, tuple(members), start)
+    here = sensitivities_at(problem, best.fit.point, found.pool, context) if best else None
+    if best is None or here is None:
         return {}
     own = {m.effect for m in members}
     out = {}
     for member in members:
-        rivals = [c for c in lin.signatures if c.effect not in own]
-        out[member.effect] = min(separation(problem, best, (member,), rival, lin) for rival in rivals)
+        rivals = [c for c in here.by_candidate if c.effect not in own]
+        out[member.effect] = min(separation(problem, best.fit, (member,), rival, here) for rival in rivals)
     return out
 
 

@@ -7,7 +7,7 @@ import shlex
 import sys
 import time
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
@@ -51,7 +51,8 @@ def diagnose(
     report: Annotated[bool, typer.Option("--report/--no-report", help="Write report.html.")] = True,
 ) -> int:
     """Find what the simulation gets wrong about the recorded robot, name the cause, extend the model and measure the gain."""
-    from ctr_dynamics.diagnosis.request import Request, run
+    from ctr_dynamics.diagnosis.request import Request, run, run_on_cluster
+    from ctr_dynamics.diagnosis.run_context import RunContext
 
     loaded = load_robot(robot)
     for path in (*bags, *(validate or [])):
@@ -76,11 +77,10 @@ def diagnose(
         if not as_json:
             print(f"[{time.perf_counter() - begin:6.1f} s] {text}", file=sys.stderr, flush=True)
 
-    content: dict[str, Any]
     if cluster:
-        content = _on_cluster(cluster, request)
+        content = run_on_cluster(request, cluster)
     else:
-        content = run(request, note)
+        content = run(request, RunContext(note, workers))
     if as_json:
         print(json.dumps(content, allow_nan=False, ensure_ascii=False))
     else:
@@ -91,22 +91,3 @@ def diagnose(
         print("\n".join(summary(content)))
         print(f"findings: {output / 'findings.json'}")
     return EXIT
-
-
-def _on_cluster(address: str, request: Any) -> dict[str, Any]:
-    try:
-        from dask.distributed import Client
-    except ImportError:
-        raise InputError(
-            "--cluster needs dask.distributed", do="pip install 'ctr_dynamics[cluster]'"
-        ) from None
-    from ctr_dynamics.diagnosis.request import run
-
-    try:
-        client = Client(address, timeout="10s")
-    except (OSError, TimeoutError, ValueError) as error:
-        raise InputError(
-            f"no Dask scheduler answers at '{address}' within 10 s ({error})", do="check the address"
-        ) from None
-    with client:
-        return client.submit(run, request, pure=False).result()

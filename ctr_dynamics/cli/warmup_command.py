@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 from joblib import Parallel, delayed
 
-from ctr_dynamics.diagnosis.kernel_warm_up import rehearse as rehearse_diagnosis
+from ctr_dynamics.diagnosis.kernel_warm_up import warm_up as warm_up_diagnosis
 from ctr_dynamics.kernels.compiler import cache_folder
 from ctr_dynamics.parameters import Settings
 from ctr_dynamics.robot_files import load_robot
@@ -50,5 +50,5 @@ def _extended(name: str) -> str:
 
 def _diagnosis(name: str, model: str) -> str:
     begin, robot = time.perf_counter(), load_robot(name)
-    rehearse_diagnosis(robot, (model,))
+    warm_up_diagnosis(robot, (model,))
     return f"{name}: diagnosis with the {model} model, {robot.n_tubes} tubes, {time.perf_counter() - begin:.1f} s"

@@ -1,24 +1,36 @@
-"""Mistakes of configuration: units, signs, orders. Tried one by one when the misfit is gross, each undone in the data or the robot file."""
+"""Configuration mistakes: units, signs and orders.
+
+In: a recording and a robot. Out: the mistake that makes a gross misfit, if one does. Each is undone in the data or the robot file, one by one.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
+from ctr_dynamics.diagnosis.diagnosis_options import DiagnosisOptions
 from ctr_dynamics.diagnosis.forward_model import ForwardModel
 from ctr_dynamics.diagnosis.recording import Recording
+from ctr_dynamics.diagnosis.run_context import RunContext
 from ctr_dynamics.diagnosis.whitening import noise_floor
 from ctr_dynamics.errors import InputError
 from ctr_dynamics.robot import Robot
 from ctr_dynamics.robot_files import robot_from_dict, robot_to_dict
 
 Pair = tuple[Recording, Robot]
-GROSS = 8.0  # times the noise floor: below, no mistake is looked for
-IMPROVEMENT = 0.25  # of the misfit: a mistake is named when undoing it leaves no more
+
+
+@dataclass(frozen=True)
+class FoundMistake:
+    """A mistake of the configuration: its name, and the misfit in m with it and without."""
+
+    name: str
+    misfit: float
+    misfit_undone: float
 
 
 def _alpha(change: Callable[[Any, int], Any]) -> Callable[[Recording, Robot], Pair]:
@@ -103,10 +115,13 @@ MISTAKES: dict[str, Callable[[Recording, Robot], Pair]] = {
 }
 
 
-def misfit(recording: Recording, robot: Robot) -> float:
-    """3-D rms in m of the reading against the nominal model, with the rotation's share in units of its noise; infinity where it fails."""
+def misfit(recording: Recording, robot: Robot, nodes: int) -> float:
+    """3-D rms in m of the measurement against the nominal model, infinity where it fails.
+
+    Rotations count by the ratio of the noise of positions to theirs.
+    """
     try:
-        forward_model = ForwardModel(recording, robot, nodes=16)
+        forward_model = ForwardModel(recording, robot, nodes=nodes)
         prediction = forward_model.predict({})
     except InputError:
         return math.inf
@@ -120,18 +135,19 @@ def misfit(recording: Recording, robot: Robot) -> float:
 
 
 def find_mistake(
-    recording: Recording, robot: Robot, note: Callable[[str], None]
-) -> tuple[str, float, float] | None:
-    """(name, misfit before, misfit after) of the mistake whose undoing leaves least, where the misfit is gross and it explains nearly all."""
-    before = misfit(recording, robot)
-    if before < GROSS * noise_floor(robot) * math.sqrt(2.0):
+    recording: Recording, robot: Robot, options: DiagnosisOptions, context: RunContext
+) -> FoundMistake | None:
+    """The mistake that leaves least when it is undone, where the misfit is gross and it explains nearly all."""
+    o, nodes = options.configuration, options.forward_model.fine_nodes
+    before = misfit(recording, robot, nodes)
+    if before < o.gross * noise_floor(robot) * math.sqrt(2.0):
         return None
-    note("gross misfit: trying mistakes of units, signs and orders")
+    context.report("gross misfit: trying mistakes of units, signs and orders")
     after: dict[str, float] = {}
     for name, undo in MISTAKES.items():
         try:
-            after[name] = misfit(*undo(recording, robot))
+            after[name] = misfit(*undo(recording, robot), nodes)
         except InputError:
             continue
     best = min(after, key=lambda name: after[name])
-    return (best, before, after[best]) if after[best] < IMPROVEMENT * before else None
+    return FoundMistake(best, before, after[best]) if after[best] < o.improvement * before else None

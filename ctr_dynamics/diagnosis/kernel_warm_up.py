@@ -1,4 +1,4 @@
-"""A dry run of what diagnosis compiles: plain and extended simulations with their sensitivities, on a moment of rest."""
+"""Kernel warm-up: a dry run of what diagnosis compiles, plain and extended simulations with their sensitivities, on a moment of rest."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from ctr_dynamics.robot import Robot
 MOMENT = 0.02  # s
 
 
-def rehearse(robot: Robot, models: Sequence[str] = ("plain", "extended")) -> None:
+def warm_up(robot: Robot, models: Sequence[str] = ("plain", "extended")) -> None:
     """Compile everything that a diagnosis of ``robot`` needs, or load it from the cache; ``models``: which kernels."""
     t = np.array([0.0, 0.5 * MOMENT, MOMENT])
     rest = np.concatenate([robot.rest.alpha.value, robot.rest.beta.value])

@@ -1,13 +1,18 @@
-"""What diagnosis reads of a bag: joints, known loads and tracker poses as arrays on one clock."""
+"""Data: what diagnosis reads of a bag.
+
+In: a bag and a robot. Out: joints, known loads and tracker poses as arrays on one clock, with notes on what was left out.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ctr_dynamics.diagnosis.diagnosis_options import RecordingOptions
 from ctr_dynamics.errors import InputError
 from ctr_dynamics.io.bag_reader import Bag, open_bag
 from ctr_dynamics.io.messages.cdr import JointStateIn, PoseIn
@@ -15,15 +20,7 @@ from ctr_dynamics.robot import Robot
 from ctr_dynamics.sensing.interpolation import finite, joint_order
 
 Floats = NDArray[np.float64]
-SHORTEST = 2.0  # s of joints and tracker together, below which nothing can be said
-GAP = 0.1  # s without joints in which the robot may have gone anywhere
-SETTLING = 0.5  # s after it that the tip still swings from what was not seen
-PAUSE = 10.0  # s without joints, or by which their clock was set, beyond which it is another recording
-LONGEST = 1000.0  # s of joints that fit into memory with all that a diagnosis keeps of them
-BEGINNING = 0.1  # s of joints that tell whether the robot stands at the start
-STANDING = (0.01, 2e-4)  # rad and m by which it may move in them, beside the encoders' noise
-UNSETTLED = 2.0  # s until a start in motion, which the model does not know, has died away (1 s leaves 0.3 mm)
-LOAD_GRACE = 0.1  # s; a first load that comes this soon after the joints is there from the start
+Samples = list[tuple[int, list[float]]]
 
 
 @dataclass(frozen=True)
@@ -65,13 +62,14 @@ class Recording:
         )
 
 
-def read_recording(path: str | Path, robot: Robot) -> Recording:
+def read_recording(path: str | Path, robot: Robot, options: RecordingOptions | None = None) -> Recording:
     """Read a bag for ``robot``.
 
     Raises:
-        InputError: not a bag, no complete joint state of this robot, no tracker, less than ``SHORTEST`` seconds of both, or more than
-            ``LONGEST``.
+        InputError: not a bag, no complete joint state of this robot, no tracker, or joints and tracker together shorter or longer than
+            the options say.
     """
+    o = options or RecordingOptions()
     bag = open_bag(path)
     bag.check_inputs()
     joints, poses, loads, notes, wrong = _collect(bag, robot)
@@ -87,7 +85,7 @@ def read_recording(path: str | Path, robot: Robot) -> Recording:
         raise InputError(
             "no usable tracker pose", do="diagnosis needs the tracker on /ctr/tracker/tip", where=where
         )
-    joints, loads, parted = _longest_part(_once(joints), _once(loads))
+    joints, loads, parted = _longest_part(_once(joints), _once(loads), o)
     notes += [parted] if parted else []
     t0 = joints[0][0]
     table = np.array([[(stamp - t0) * 1e-9, *value] for stamp, value in joints])
@@ -96,9 +94,9 @@ def read_recording(path: str | Path, robot: Robot) -> Recording:
         raise InputError(
             f"{reason}; is it a bag of this robot?", do="check the robot file and the units", where=where
         )
-    if table[-1, 0] > LONGEST:
+    if table[-1, 0] > o.longest_s:
         raise InputError(
-            f"joints of {table[-1, 0]:.0f} s, limit {LONGEST:g} s",
+            f"joints of {table[-1, 0]:.0f} s, limit {o.longest_s:g} s",
             do="cut the bag; ten seconds with motion are enough",
             where=where,
         )
@@ -109,35 +107,51 @@ def read_recording(path: str | Path, robot: Robot) -> Recording:
             f"{int((~inside).sum())} tracker poses lie outside the time of the joints and were left out"
         )
     tracker = tracker[inside]
-    unseen, note = _unseen(table[:, 0], tracker[:, 0])
+    unseen, note = _unseen(table[:, 0], tracker[:, 0], o)
     notes += [note] if note else []
-    moving = _moving(table, robot)
+    moving = _moving(table, robot, o)
     if moving:
         notes.append(
-            f"the recording begins in motion ({moving}), which the model does not know: tracker poses of the first {UNSETTLED:g} s were left out"
+            f"the recording begins in motion ({moving}), which the model does not know: tracker poses of the first {o.unsettled_s:g} s were left out"
         )
-        unseen |= tracker[:, 0] < UNSETTLED
+        unseen |= tracker[:, 0] < o.unsettled_s
     span = float(np.ptp(tracker[:, 0]) * np.mean(~unseen)) if len(tracker) else 0.0
     tracker = tracker[~unseen]
-    if span < SHORTEST:
+    if span < o.shortest_s:
         raise InputError(
-            f"tracker and joints overlap for {span:.2f} s, less than {SHORTEST:g} s{f' ({note})' if note else ''}",
+            f"tracker and joints overlap for {span:.2f} s, less than {o.shortest_s:g} s{f' ({note})' if note else ''}",
             do="record for longer; ten seconds with motion are enough",
             where=where,
         )
     load = np.array([[(stamp - t0) * 1e-9, *value] for stamp, value in loads]).reshape(-1, 7)
-    if len(load) and load[0, 0] > LOAD_GRACE:
+    if len(load) and load[0, 0] > o.first_load_s:
         load = np.vstack([np.r_[load[0, 0] - 1e-9, np.zeros(6)], load])
     return Recording(
         bag.path.name, where, bag.sha256(), table, load, tracker[:, 0], tracker[:, 1:4], _continuous(tracker[:, 4:8]), tuple(notes)
     )  # fmt: skip
 
 
-def _longest_part(joints: Samples, loads: Samples) -> tuple[Samples, Samples, str]:
-    """The longest stretch of ``joints`` without a pause, the ``loads`` in it with the one that acts at its beginning, and a note on what was left
-    out."""
+def measured_axes(recordings: Sequence[Recording], notes: list[str]) -> NDArray[np.bool_]:
+    """(6,) axes that carry information in every recording: a tracker that sends one and the same rotation has three degrees of freedom.
+
+    ``notes`` takes what an engineer should know of them.
+    """
+    mask = np.ones(6, bool)
+    if any(np.ptp(r.quaternion, axis=0).max(initial=0.0) < 1e-9 for r in recordings):
+        mask[3:] = False
+        notes.append(
+            "the tracker sends no rotation (three degrees of freedom); causes are judged by position alone"
+        )
+    return mask
+
+
+def _longest_part(joints: Samples, loads: Samples, options: RecordingOptions) -> tuple[Samples, Samples, str]:
+    """The longest part of ``joints`` without a long gap, the ``loads`` in it, and a note on what was left out.
+
+    The load that acts at its beginning is among them.
+    """
     stamps = np.array([stamp for stamp, _ in joints])
-    ends = np.flatnonzero(np.diff(stamps) > PAUSE * 1e9)
+    ends = np.flatnonzero(np.diff(stamps) > options.pause_s * 1e9)
     if not len(ends):
         return joints, loads, ""
     parts = list(zip([0, *(ends + 1)], [*ends, len(stamps) - 1], strict=True))
@@ -148,16 +162,17 @@ def _longest_part(joints: Samples, loads: Samples) -> tuple[Samples, Samples, st
     return (
         joints[first : last + 1],
         acting + [load for load in loads if begin < load[0] <= end],
-        f"joints are missing for up to {longest:.0f} s (limit {PAUSE:g} s): of {len(parts)} parts, only the longest was used, "
+        f"joints are missing for up to {longest:.0f} s (limit {options.pause_s:g} s): of {len(parts)} parts, only the longest was used, "
         f"{(end - begin) * 1e-9:.1f} s from {(begin - stamps[0]) * 1e-9:.0f} s on",
     )
 
 
-def _moving(joints: Floats, robot: Robot) -> str:
+def _moving(joints: Floats, robot: Robot, options: RecordingOptions) -> str:
     """Which actuator moves most at the beginning of ``joints`` (k, 1 + 2N), in words; empty where all stand."""
     n = robot.n_tubes
-    rows = joints[joints[:, 0] <= BEGINNING]
-    least = np.repeat([STANDING[0] + 6.0 * robot.encoders.noise.value, STANDING[1]], n)
+    rows = joints[joints[:, 0] <= options.start_s]
+    noise = options.start_noise * robot.encoders.noise.value
+    least = np.repeat([options.start_rad + noise, options.start_m], n)
     travel = np.ptp(rows[:, 1:], axis=0)
     most = int(np.argmax(travel / least))
     if travel[most] <= least[most]:
@@ -171,23 +186,20 @@ def _moving(joints: Floats, robot: Robot) -> str:
     return f"tube {most % n + 1} {kind}"
 
 
-def _unseen(joints: Floats, poses: Floats) -> tuple[NDArray[np.bool_], str]:
-    """Which of ``poses`` (s) fall into gaps of ``joints`` (s) or so soon behind that the tip may still swing from them, and a note about them."""
-    gaps = np.flatnonzero(np.diff(joints) > GAP)
+def _unseen(joints: Floats, poses: Floats, options: RecordingOptions) -> tuple[NDArray[np.bool_], str]:
+    """Which of ``poses`` (s) fall into gaps of ``joints`` (s), or so soon behind that vibration from them persists, and a note."""
+    gaps = np.flatnonzero(np.diff(joints) > options.gap_s)
     unseen = np.zeros(len(poses), bool)
     for i in gaps:
-        unseen |= (poses > joints[i]) & (poses < joints[i + 1] + SETTLING)
+        unseen |= (poses > joints[i]) & (poses < joints[i + 1] + options.settling_s)
     if not len(gaps):
         return unseen, ""
     longest = float(np.diff(joints).max())
     times = "once" if len(gaps) == 1 else f"{len(gaps)} times"
     return unseen, (
-        f"joints are missing {times}, for up to {longest:.2f} s (limit {GAP:g} s): {int(unseen.sum())} of {len(poses)} tracker poses, "
-        f"up to {SETTLING:g} s after, were left out"
+        f"joints are missing {times}, for up to {longest:.2f} s (limit {options.gap_s:g} s): {int(unseen.sum())} of {len(poses)} tracker poses, "
+        f"up to {options.settling_s:g} s after, were left out"
     )
-
-
-Samples = list[tuple[int, list[float]]]
 
 
 def _collect(bag: Bag, robot: Robot) -> tuple[Samples, Samples, Samples, list[str], str]:

@@ -2,23 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import yaml
 
-from ctr_dynamics.diagnosis.kernel_warm_up import rehearse
+from ctr_dynamics.diagnosis.kernel_warm_up import warm_up
 from ctr_dynamics.diagnosis.output.findings import findings, write
 from ctr_dynamics.diagnosis.output.findings_report import write_report
 from ctr_dynamics.diagnosis.pipeline import diagnose
 from ctr_dynamics.diagnosis.recording import Recording, read_recording
-from ctr_dynamics.diagnosis.verdict.next_experiment import Plan, plan
+from ctr_dynamics.diagnosis.run_context import RunContext
+from ctr_dynamics.diagnosis.verdict.next_experiment import NextExperiment, next_experiment
 from ctr_dynamics.errors import InputError
 from ctr_dynamics.io.atomic_files import atomic_file, output_folder
 from ctr_dynamics.robot import Robot
-from ctr_dynamics.simulation.scenario import Scenario
 
 SCENARIO = "next_experiment.yaml"
 
@@ -36,36 +35,57 @@ class Request:
     report: bool = True
 
 
-def _quiet(text: str) -> None:
-    pass
-
-
-def run(request: Request, note: Callable[[str], None] = _quiet) -> dict[str, Any]:
+def run(request: Request, context: RunContext | None = None) -> dict[str, Any]:
     """Read, diagnose, write; returns the content of findings.json.
+
+    ``context`` is by default a silent one with the workers of ``request``.
 
     Raises:
         InputError: a bag that cannot be used, or that is given twice; a folder that cannot be written to.
     """
+    context = context or RunContext(workers=request.workers)
     directory = output_folder(Path(request.output))
-    note("reading")
+    context.report("reading")
     recordings = [read_recording(path, request.robot) for path in request.bags]
     others = [read_recording(path, request.robot) for path in request.validation]
     _all_different([*recordings, *others])
-    note("kernels: compiled at the first use")
-    rehearse(request.robot)
-    diagnosis = diagnose(request.robot, recordings, others, note=note, workers=request.workers)
+    context.report("kernels: compiled at the first use")
+    warm_up(request.robot)
+    diagnosis = diagnose(request.robot, recordings, others, context=context)
     if not others:
         diagnosis.notes.append(
             "without a validation bag the gain is not measured, and a wrong cause that fits is not found out"
         )
-    note("next experiment")
-    planned = plan(diagnosis)
-    content = findings(diagnosis, request.command, _experiment(planned, directory))
+    context.report("next experiment")
+    content = findings(diagnosis, request.command, _write_scenario(next_experiment(diagnosis), directory))
     write(directory, diagnosis, content)
     if request.report:
-        note("report")
+        context.report("report")
         write_report(directory / "report.html", diagnosis, content)
     return content
+
+
+def run_on_cluster(request: Request, address: str) -> dict[str, Any]:
+    """:func:`run` as one task of the Dask scheduler at ``address``.
+
+    Raises:
+        InputError: Dask is not installed, or no scheduler answers.
+    """
+    try:
+        from dask.distributed import Client
+    except ImportError:
+        raise InputError(
+            "--cluster needs dask.distributed", do="pip install 'ctr_dynamics[cluster]'"
+        ) from None
+    try:
+        client = Client(address, timeout="10s")
+    except (OSError, TimeoutError, ValueError) as error:
+        raise InputError(
+            f"no Dask scheduler answers at '{address}' within 10 s ({error})", do="check the address"
+        ) from None
+    with client:
+        content: dict[str, Any] = client.submit(run, request, pure=False).result()
+        return content
 
 
 def _all_different(recordings: list[Recording]) -> None:
@@ -86,18 +106,16 @@ def _all_different(recordings: list[Recording]) -> None:
         seen[content] = recording.path
 
 
-def _experiment(planned: Plan | None, directory: Path) -> dict[str, Any] | None:
-    if planned is None:
+def _write_scenario(proposed: NextExperiment | None, directory: Path) -> dict[str, Any] | None:
+    """The scenario of ``proposed`` as a file; its entry in the findings."""
+    if proposed is None:
         return None
+    content = proposed.scenario.model_dump(exclude_none=True, mode="json")
     with atomic_file(directory / SCENARIO) as part:
-        part.write_text(_yaml(planned.scenario), encoding="utf-8")
+        part.write_text(yaml.safe_dump(content, sort_keys=False), encoding="utf-8")
     return {
-        "description": planned.description,
+        "description": proposed.description,
         "scenario_file": SCENARIO,
-        "separation_before": planned.before,
-        "separation_after": planned.after,
+        "separation_before": proposed.before,
+        "separation_after": proposed.after,
     }
-
-
-def _yaml(scenario: Scenario) -> str:
-    return yaml.safe_dump(scenario.model_dump(exclude_none=True, mode="json"), sort_keys=False)

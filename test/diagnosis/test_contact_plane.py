@@ -1,4 +1,4 @@
-"""A wall that the tip runs into, hidden by the truth's own simulator, and found from the moment of the first impact."""
+"""A contact plane that the tip runs into, hidden by the truth's own simulator, and found from the moment of the first impact."""
 
 import json
 from dataclasses import replace
@@ -8,10 +8,12 @@ import pytest
 from truth.cases import make_case
 
 from ctr_dynamics.diagnosis.inference.candidates import Candidate, causes_of
-from ctr_dynamics.diagnosis.inference.contact_plane import wall
-from ctr_dynamics.diagnosis.inference.hypotheses import Explanation, look_closer
-from ctr_dynamics.diagnosis.inference.map_fit import fit, make_problem
+from ctr_dynamics.diagnosis.inference.contact_plane import find_contact_plane
+from ctr_dynamics.diagnosis.inference.fit_problem import make_problem
+from ctr_dynamics.diagnosis.inference.hypotheses import Hypothesis, check_time_error
+from ctr_dynamics.diagnosis.inference.map_fit import fit
 from ctr_dynamics.diagnosis.recording import read_recording
+from ctr_dynamics.diagnosis.run_context import RunContext
 from ctr_dynamics.effects import quantities
 from ctr_dynamics.robot_files import load_robot
 
@@ -50,7 +52,7 @@ def _angle(a, b) -> float:
 
 def test_the_first_impacts_tell_plane_and_stiffness(hit, known):
     problem, truth = hit
-    found = wall(problem, known, 2)
+    found = find_contact_plane(problem, known, RunContext())
     assert isinstance(found, Candidate)
     start = dict(found.start)
     assert _angle([start[key] for key in NORMAL], [truth[name] for _, name in NORMAL]) < 15.0
@@ -63,10 +65,10 @@ def test_the_first_impacts_tell_plane_and_stiffness(hit, known):
     assert 0.5 < result.point[STIFFNESS] / truth["stiffness_N_per_m"] < 2.0
 
 
-def test_a_delay_is_no_wall(tmp_path, robot, known):
-    """A late tracker parts from the model as suddenly, when the weight is cut."""
+def test_a_delay_is_no_contact_plane(tmp_path, robot, known):
+    """A late tracker and the model diverge as suddenly, when the weight is cut."""
     problem, _ = _problem(tmp_path, robot, known, "tracker_latency", 91021)
-    assert wall(problem, known, 2) is None
+    assert find_contact_plane(problem, known, RunContext()) is None
 
 
 def test_what_impacts_leave_is_measured_against_the_error_in_time(hit, known):
@@ -87,9 +89,9 @@ def test_what_impacts_leave_is_measured_against_the_error_in_time(hit, known):
             residual=residual,
             chi2=problem.size + left,
         )
-        explanation = Explanation((candidate,), at_truth)
-        look_closer(problem, explanation)
-        assert explanation.resolved == resolved
-        elsewhere = Explanation((), at_truth)
-        look_closer(problem, elsewhere)
+        hypothesis = Hypothesis((candidate,), at_truth)
+        check_time_error(problem, hypothesis)
+        assert hypothesis.resolved == resolved
+        elsewhere = Hypothesis((), at_truth)
+        check_time_error(problem, elsewhere)
         assert elsewhere.resolved

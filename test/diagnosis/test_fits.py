@@ -5,18 +5,25 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ctr_dynamics.diagnosis.forward_model import NODES, ForwardModel
-from ctr_dynamics.diagnosis.inference import discretisation_error as numerics
+from ctr_dynamics.diagnosis.diagnosis_options import DiagnosisOptions, DiscretisationOptions
+from ctr_dynamics.diagnosis.forward_model import ForwardModel
+from ctr_dynamics.diagnosis.inference import discretisation_error
 from ctr_dynamics.diagnosis.inference.candidates import candidates, causes_of
-from ctr_dynamics.diagnosis.inference.hypotheses import Explanation
-from ctr_dynamics.diagnosis.inference.hypothesis_search import _replace, _stand_ins
-from ctr_dynamics.diagnosis.inference.map_fit import REACH, corrected, fit, make_problem
-from ctr_dynamics.diagnosis.inference.sensitivities import far_probes, linearise, screen
+from ctr_dynamics.diagnosis.inference.discretisation_error import correct_discretisation, renew_correction
+from ctr_dynamics.diagnosis.inference.fit_problem import make_problem
+from ctr_dynamics.diagnosis.inference.hypotheses import Hypothesis
+from ctr_dynamics.diagnosis.inference.map_fit import corrected, fit
+from ctr_dynamics.diagnosis.inference.screening import screen
+from ctr_dynamics.diagnosis.inference.search_moves import SearchState, alternatives, fit_alternatives
+from ctr_dynamics.diagnosis.inference.sensitivities import sensitivities_at, with_large_sizes
 from ctr_dynamics.diagnosis.recording import Recording
+from ctr_dynamics.diagnosis.run_context import RunContext
 from ctr_dynamics.effects import quantities
 from ctr_dynamics.model import trajectory
 from ctr_dynamics.robot_files import load_robot
 
+SILENT = RunContext(workers=1)
+OPTIONS = DiagnosisOptions()
 PAYLOAD = ("payload_mass", "added_kg")
 AIR = ("air_drag", "linear_Ns_per_m2")
 STIFFNESS = ("youngs_modulus", "tube1.scale")
@@ -72,7 +79,7 @@ def test_columns_together_are_those_apart(recording, robot, known, monkeypatch):
     assert np.abs(together[:, :3, 1] - slope).max() < 0.03 * np.abs(slope).max()
 
 
-def test_a_fit_finds_the_payload_and_a_hopeless_one_does_not_move(recording, robot, known):
+def test_a_fit_finds_the_payload_and_one_without_a_chance_does_not_move(recording, robot, known):
     nuisances = [known[key] for key in known if key[0] in ("registration_translation", "encoder_offset")]
     problem = make_problem(robot, [recording], nuisances, np.ones(6, bool))
     found = fit(problem, [known[PAYLOAD]], {})
@@ -81,21 +88,22 @@ def test_a_fit_finds_the_payload_and_a_hopeless_one_does_not_move(recording, rob
     assert abs(found.point[PAYLOAD] - 3e-4) < 0.3 * sigma
     assert found.chi2 < 1.0
     # without the payload no tolerance reaches that
-    hopeless = fit(problem, (), {}, limit=found.cost + 1.0)
+    given_up = fit(problem, (), {}, limit=found.cost + 1.0)
     best = fit(problem, (), {})
-    assert hopeless is not None
+    assert given_up is not None
     assert best is not None
-    assert hopeless.cost > best.cost > found.cost + 1.0
-    assert np.all(hopeless.values == [q.off for q in problem.nuisances])
+    assert given_up.cost > best.cost > found.cost + 1.0
+    assert np.all(given_up.values == [q.off for q in problem.nuisances])
 
 
-def test_more_nodes_where_the_data_can_see_them(recording, robot, monkeypatch):
+def test_more_nodes_where_the_data_can_see_them(recording, robot):
     problem = make_problem(robot, [recording], [], np.ones(6, bool))
-    errors = numerics.add_numerics(problem, {}, 1)
-    assert problem.forward_models[0].nodes == NODES
-    monkeypatch.setattr(numerics, "SPACE_LIMIT", 0.0)
-    finer = numerics.add_numerics(problem, {}, 1)
-    assert problem.forward_models[0].nodes == numerics.MOST_NODES
+    errors = correct_discretisation(problem, {}, SILENT)
+    assert problem.forward_models[0].nodes == OPTIONS.forward_model.nodes
+    keen = DiscretisationOptions(space_limit=0.0)
+    problem.options = replace(OPTIONS, discretisation=keen)
+    finer = correct_discretisation(problem, {}, SILENT)
+    assert problem.forward_models[0].nodes == keen.most_nodes
     assert finer["space_error_m"] < 0.3 * errors["space_error_m"]
     assert finer["time_error_m"] == pytest.approx(errors["time_error_m"], rel=0.2)
 
@@ -105,19 +113,19 @@ def test_the_error_of_the_solver_is_that_of_the_point(recording, robot, known, m
     problem = make_problem(
         robot, [recording], [known["encoder_offset", "tube1.offset_rad"]], np.ones(6, bool)
     )
-    numerics.add_numerics(problem, {}, 1)
+    correct_discretisation(problem, {}, SILENT)
     friction = known["tube_coulomb", "mu"]
     there = fit(problem, [friction], {friction.key: friction.off + 0.1}, iterations=0)
     assert there is not None
-    assert numerics.renew_numerics(problem, there.point, 1) is None  # about the same: all stays
+    assert renew_correction(problem, there.point, SILENT) is None  # about the same: all stays
     np.testing.assert_array_equal(problem.residual(there.point), there.residual)
-    measured = numerics.differences
+    measured = discretisation_error.differences
     monkeypatch.setattr(
-        numerics, "differences", lambda *given: tuple(20.0 * part for part in measured(*given))
+        discretisation_error, "differences", lambda *given: tuple(20.0 * part for part in measured(*given))
     )
-    change = numerics.renew_numerics(problem, there.point, 1)
+    change = renew_correction(problem, there.point, SILENT)
     assert change is not None
-    assert np.linalg.norm(change) >= numerics.RENEWED
+    assert np.linalg.norm(change) >= OPTIONS.discretisation.renewed
     moved = corrected(problem, there, change)
     np.testing.assert_allclose(moved.residual, problem.residual(there.point), atol=1e-9)
     again = fit(problem, [friction], there.point, iterations=0)
@@ -127,22 +135,28 @@ def test_the_error_of_the_solver_is_that_of_the_point(recording, robot, known, m
 
 
 def test_a_shorter_step_that_fails_is_followed_by_a_longer_one(recording, robot, monkeypatch):
-    forward_model = ForwardModel(recording, robot)
-    half = numerics._shorter(forward_model, {})
-    plain = ForwardModel.residual_at
+    """Its difference is brought to that of half a step; where none succeeds there is no correction."""
+    problem = make_problem(robot, [recording], [], np.ones(6, bool))
+    plain, dt = ForwardModel.residual_at, problem.forward_models[0].scheme.dt
 
-    def failing(other, point):
-        return None if other.scheme.dt < 0.6 * forward_model.scheme.dt else plain(other, point)
+    def errors():
+        return correct_discretisation(problem, {}, SILENT)["time_error_m"], problem.offset
 
-    monkeypatch.setattr(ForwardModel, "residual_at", failing)
-    longer = numerics._shorter(forward_model, {})
-    base = plain(forward_model, {})
-    errors = [factor * (base - found) for found, factor in (half, longer)]
-    assert half[1] == 1.0 < longer[1]
-    sizes = [np.linalg.norm(e[5:]) for e in errors]
-    assert sizes[1] == pytest.approx(sizes[0], rel=0.5)
-    monkeypatch.setattr(ForwardModel, "residual_at", lambda *_: None)
-    assert numerics._shorter(forward_model, {})[0] is None
+    half, offset = errors()
+    monkeypatch.setattr(
+        ForwardModel,
+        "residual_at",
+        lambda model, point: None if model.scheme.dt < 0.6 * dt else plain(model, point),
+    )
+    longer, other = errors()
+    assert not np.array_equal(offset, other)
+    assert longer == pytest.approx(half, rel=0.5)
+    monkeypatch.setattr(
+        ForwardModel,
+        "residual_at",
+        lambda model, point: None if model.scheme.dt < dt else plain(model, point),
+    )
+    assert errors()[0] == 0.0
 
 
 def test_the_misfit_is_a_smooth_function_of_delays(robot, known):
@@ -180,7 +194,7 @@ def test_nuisances_stay_near_their_tolerances_unless_they_may_go_far(recording, 
     assert near is not None
     assert far is not None
     assert cause is not None
-    assert near.values[0] == pytest.approx(REACH * nuisance.tolerance)
+    assert near.values[0] == pytest.approx(OPTIONS.calibration.reach * nuisance.tolerance)
     assert 7 < far.values[0] / nuisance.tolerance < 11
     assert 7 < cause.values[0] / nuisance.tolerance < 11
 
@@ -196,14 +210,14 @@ def test_large_sizes_are_looked_at_where_the_misfit_is_large(recording, robot, k
         if c.effect in ("payload_inertia", "density")
     ]
     clean = fit(problem, (), {})
-    near = linearise(problem, {}, pool, 1)
+    near = sensitivities_at(problem, {}, pool, SILENT)
     assert clean is not None
     assert near is not None
-    far = far_probes(problem, near, pool, 1)
-    assert not near.probes
+    far = with_large_sizes(problem, near, pool, SILENT)
+    assert not near.trials
     (inertia,) = [c for c in pool if c.effect == "payload_inertia"]
-    assert [p.shift[heavy] for p in far.probes[inertia]] == pytest.approx([0.55, 0.75, 1.25, 1.45, 1.7])
-    np.testing.assert_array_equal(near.signatures[inertia], far.signatures[inertia])
+    assert [p.shift[heavy] for p in far.trials[inertia]] == pytest.approx([0.55, 0.75, 1.25, 1.45, 1.7])
+    np.testing.assert_array_equal(near.by_candidate[inertia], far.by_candidate[inertia])
     best = screen(problem, far, clean, (), pool)[0]
     assert best.candidate is inertia
 
@@ -219,10 +233,11 @@ def test_what_looks_like_a_cause_is_fitted_in_its_place(recording, robot, known)
     other = next(c for c in pool if c.effect == "density")
     wrong = fit(problem, causes_of([other]), {})
     assert wrong is not None
-    found = [Explanation((other,), wrong)]
-    lin = linearise(problem, wrong.point, pool, 1, again=wrong)
-    assert lin is not None
-    new = _replace(problem, found, _stand_ins(problem, found, lin), lin, 1)
+    state = SearchState(problem, pool, wrong, SILENT, [Hypothesis((other,), wrong)])
+    here = sensitivities_at(problem, wrong.point, pool, SILENT, again=wrong)
+    assert here is not None
+    new = fit_alternatives(state, alternatives(problem, state.found, here), here)
     (right,) = [e for e in new if e.effects == ("payload_mass",)]
     assert right.fit.cost < wrong.cost - 1.0
-    assert not [s for s in _stand_ins(problem, found + new, lin) if s[0].effect == "payload_mass"]
+    known_ones = [*state.found, *new]
+    assert not [s for s in alternatives(problem, known_ones, here) if s[0].effect == "payload_mass"]

@@ -1,27 +1,37 @@
-"""Sets of causes on problems that are linear: what a search one by one misses, and what bags that were not fitted say."""
+"""Pairs of causes on problems that are linear: what a search one by one misses, and what bags that were not fitted say."""
 
 import math
-from collections import defaultdict
+from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
 import pytest
 
-from ctr_dynamics.diagnosis.inference import hypotheses as explanations
-from ctr_dynamics.diagnosis.inference import hypothesis_search as exploration
+from ctr_dynamics.diagnosis.diagnosis_options import DiagnosisOptions, SearchOptions
 from ctr_dynamics.diagnosis.inference.candidates import Candidate, causes_of
-from ctr_dynamics.diagnosis.inference.hypotheses import Explanation
-from ctr_dynamics.diagnosis.inference.hypothesis_search import Search, probabilities, weigh
+from ctr_dynamics.diagnosis.inference.evidence import (
+    WeighedHypotheses,
+    probabilities,
+    weigh,
+    weigh_by_prediction,
+)
+from ctr_dynamics.diagnosis.inference.hypotheses import Hypothesis
 from ctr_dynamics.diagnosis.inference.map_fit import fit
-from ctr_dynamics.diagnosis.inference.pair_ranking import rank_sets
-from ctr_dynamics.diagnosis.inference.search_stages import second_opinion
-from ctr_dynamics.diagnosis.inference.sensitivities import Linearisation
-from ctr_dynamics.diagnosis.pipeline import needed
-from ctr_dynamics.effects import EFFECTS, EffectParameter, Quantity
+from ctr_dynamics.diagnosis.inference.screening import rank_pairs
+from ctr_dynamics.diagnosis.inference.search_moves import SearchState, add_pairs
+from ctr_dynamics.diagnosis.inference.sensitivities import Sensitivities
+from ctr_dynamics.diagnosis.run_context import RunContext
+from ctr_dynamics.diagnosis.verdict.decision import needed_hypothesis
+from ctr_dynamics.effects import EffectParameter, Quantity
+
+OPTIONS = DiagnosisOptions()
+SILENT = RunContext(workers=1)
+# any effects of the catalogue
+EFFECT = {"one": "density", "two": "payload_mass", "both": "youngs_modulus", "other": "tip_force"}
 
 
 def quantity(effect, *, tolerance=0.0, low=-math.inf):
-    """A coordinate of unit prior size, of no effect of the catalogue."""
+    """A coordinate of unit prior size."""
     return Quantity(
         effect, "size", 0.0, tolerance, 1.0, low, math.inf, EffectParameter("size", "1", 0.0, 1.0)
     )
@@ -30,7 +40,7 @@ def quantity(effect, *, tolerance=0.0, low=-math.inf):
 class Linear:
     """A problem with one column for every quantity; ``data`` (m,) whitened."""
 
-    reach = 4.0
+    reach, options = OPTIONS.calibration.reach, OPTIONS
 
     def __init__(self, columns, data, nuisances, numerics):
         self.columns, self.data, self.nuisances, self.numerics = columns, data, nuisances, numerics
@@ -51,8 +61,7 @@ class Linear:
 def made():
     """(problem, candidates by name, held-out problem): ``both`` looks nearly like ``one`` and ``two`` together, in the fitted data alone."""
     rng = np.random.default_rng(5)
-    names = ("one", "two", "both", "other")
-    causes = {n: quantity(n, low=0.0 if n == "other" else -math.inf) for n in names}
+    causes = {n: quantity(e, low=0.0 if n == "other" else -math.inf) for n, e in EFFECT.items()}
     nuisance = quantity("nuisance", tolerance=0.5)
     problems = []
     for held_out in (False, True):
@@ -63,16 +72,20 @@ def made():
         columns[causes["other"].key] -= 3.0 * one  # of the wrong sign
         data = one - two + 0.2 * columns[nuisance.key] + rng.normal(size=300)
         problems.append(Linear(columns, data, (nuisance,), rng.normal(size=(300, 1))))
-    return problems[0], {n: Candidate(n, (q,)) for n, q in causes.items()}, problems[1]
+    return problems[0], {n: Candidate(q.effect, (q,)) for n, q in causes.items()}, problems[1]
 
 
-def linearised(problem, pool, result):
-    signatures = {c: problem.columns[c.quantities[0].key][:, None] for c in pool}
-    return Linearisation(result.point, result.residual, dict(problem.columns), signatures)
+def sensitivities(problem, pool, result):
+    by_candidate = {c: problem.columns[c.quantities[0].key][:, None] for c in pool}
+    return Sensitivities(result.point, result.residual, dict(problem.columns), by_candidate)
 
 
-def explained(problem, *members):
-    return Explanation(members, fit(problem, causes_of(members), {}), finished=True)
+def fitted(problem, *members):
+    return Hypothesis(members, fit(problem, causes_of(members), {}), exact=True)
+
+
+def ranked_at(problem, result, pool):
+    return rank_pairs(problem, sensitivities(problem, pool, result), result, pool, pool)
 
 
 def test_the_pair_is_first_where_its_likeness_stands(made):
@@ -80,12 +93,12 @@ def test_the_pair_is_first_where_its_likeness_stands(made):
     problem, pool, _ = made
     clean = fit(problem, (), {})
     everything = list(pool.values())
-    first = rank_sets(problem, linearised(problem, everything, clean), clean, everything, everything)
+    first = ranked_at(problem, clean, everything)
     singles = [members for _, members in first if len(members) == 1]
     assert singles[0] == (pool["both"],)
     assert (pool["other"],) not in singles
-    best = explained(problem, pool["both"])
-    ranked = rank_sets(problem, linearised(problem, everything, best.fit), best.fit, everything, everything)
+    best = fitted(problem, pool["both"])
+    ranked = ranked_at(problem, best.fit, everything)
     assert set(ranked[0][1]) == {pool["one"], pool["two"]}
 
 
@@ -93,10 +106,10 @@ def test_the_evidence_of_sets_is_that_of_their_fits(made):
     """Where the model is linear and nuisances stay inside."""
     problem, pool, _ = made
     everything = list(pool.values())
-    start = explained(problem, pool["both"]).fit
-    ranked = rank_sets(problem, linearised(problem, everything, start), start, everything, everything)
-    found = [explained(problem, *members) for _, members in ranked]
-    weigh(found, everything)
+    start = fitted(problem, pool["both"]).fit
+    ranked = ranked_at(problem, start, everything)
+    found = [fitted(problem, *members) for _, members in ranked]
+    weigh(found, everything, OPTIONS)
     exact = {e.keys: e.score for e in found}
     linear = {frozenset().union(*(c.keys for c in members)): score for score, members in ranked}
     assert len(linear) > 4
@@ -104,19 +117,22 @@ def test_the_evidence_of_sets_is_that_of_their_fits(made):
         assert score == pytest.approx(exact[keys], rel=1e-3, abs=0.5)
 
 
-def test_pairs_of_what_helps_most_alone(made, monkeypatch):
+def test_pairs_of_what_helps_most_by_itself(made):
     """Each of a few effects with each other, once."""
     problem, pool, _ = made
-    monkeypatch.setattr(explanations, "EFFECTS", defaultdict(lambda: EFFECTS["density"]))
-    monkeypatch.setattr(exploration, "HELPFUL", 3)
-    found = [explained(problem, c) for c in pool.values()]
-    alone = sorted(found, key=lambda e: e.fit.cost)
-    pairs = exploration._pairs(problem, found, 1)
-    assert {e.keys for e in pairs} == {a.keys | b.keys for a, b in combinations(alone[:3], 2)}
+    problem.options = replace(OPTIONS, search=SearchOptions(pair_effects=3))
+    found = [fitted(problem, c) for c in pool.values()]
+    single = sorted(found, key=lambda e: e.fit.cost)
+    state = SearchState(problem, list(pool.values()), found[0].fit, SILENT, list(found))
+    add_pairs(state)
+    pairs = [e for e in state.found if len(e.members) == 2]
+    assert {e.keys for e in pairs} == {a.keys | b.keys for a, b in combinations(single[:3], 2)}
     best = min(pairs, key=lambda e: e.fit.cost)
-    assert best.effects == ("one", "two")
-    assert best.fit.chi2 == pytest.approx(explained(problem, pool["one"], pool["two"]).fit.chi2, abs=0.1)
-    assert not exploration._pairs(problem, found + pairs, 1)
+    assert set(best.members) == {pool["one"], pool["two"]}
+    assert best.fit.chi2 == pytest.approx(fitted(problem, pool["one"], pool["two"]).fit.chi2, abs=0.1)
+    before = list(state.found)
+    add_pairs(state)
+    assert state.found == before
 
 
 def test_bags_that_were_not_fitted_have_a_say(made):
@@ -128,28 +144,28 @@ def test_bags_that_were_not_fitted_have_a_say(made):
         + problem.columns[pool["two"].quantities[0].key]
     )
     everything = list(pool.values())
-    clean = Explanation((), fit(problem, (), {}))
-    right, wrong = explained(problem, pool["one"], pool["two"]), explained(problem, pool["both"])
-    found = [clean, right, wrong]
-    weigh(found, everything)
+    no_cause = Hypothesis((), fit(problem, (), {}))
+    right, wrong = fitted(problem, pool["one"], pool["two"]), fitted(problem, pool["both"])
+    found = [no_cause, right, wrong]
+    weigh(found, everything, OPTIONS)
     assert found[0] is wrong
-    result = Search(found, probabilities(found, problem), clean, None, [], everything)
-    second_opinion(result, problem, held_out, 1)
+    result = WeighedHypotheses(found, probabilities(found, problem), no_cause, None, [], everything)
+    weigh_by_prediction(result, problem, held_out, SILENT)
     assert result.best is right
     assert result.probabilities[0] > 0.99
     # who cannot simulate them loses, whoever it is; where nobody can, nothing changes
     for e in found:
-        e.held_out = None
+        e.predicted = None
     simulate = held_out.linearise
     held_out.linearise = lambda point, wanted: (
         None if len(point) == len(right.fit.point) else simulate(point, wanted)
     )
-    second_opinion(result, problem, held_out, 1)
+    weigh_by_prediction(result, problem, held_out, SILENT)
     assert result.best is wrong
     for e in found:
-        e.held_out = None
+        e.predicted = None
     held_out.linearise = lambda point, wanted: None
-    second_opinion(result, problem, held_out, 1)
+    weigh_by_prediction(result, problem, held_out, SILENT)
     assert result.best is wrong
     assert np.isfinite(result.probabilities).all()
 
@@ -157,8 +173,8 @@ def test_bags_that_were_not_fitted_have_a_say(made):
 def test_a_cause_that_gains_little_is_not_needed(made):
     _, pool, _ = made
     one, two, other = pool["one"], pool["two"], pool["other"]
-    three, pair, single = (Explanation(m, None) for m in ((one, two, other), (one, two), (one,)))
-    none = Explanation((), None)
+    three, pair, single = (Hypothesis(m, None) for m in ((one, two, other), (one, two), (one,)))
+    none = Hypothesis((), None)
     for found, scores, expected in (
         ((three, pair, single, none), (0.0, -3.0, -20.0, -40.0), pair),
         ((three, pair, single, none), (0.0, -5.0, -20.0, -40.0), three),
@@ -167,9 +183,9 @@ def test_a_cause_that_gains_little_is_not_needed(made):
         ((none, single), (0.0, -1.0), none),
     ):
         for e, score in zip(found, scores, strict=True):
-            e.score = e.fitted = score
-        assert needed(found) is expected
+            e.score = e.fitted_score = score
+        assert needed_hypothesis(found, OPTIONS.verdict.needed_gain) is expected
     # what only the other bags speak for
     three.score, pair.score, single.score, none.score = 0.0, -9.0, -20.0, -40.0
-    three.fitted, pair.fitted, single.fitted, none.fitted = 0.0, -1.0, -12.0, -40.0
-    assert needed((three, pair, single, none)) is pair
+    three.fitted_score, pair.fitted_score, single.fitted_score, none.fitted_score = 0.0, -1.0, -12.0, -40.0
+    assert needed_hypothesis((three, pair, single, none), OPTIONS.verdict.needed_gain) is pair

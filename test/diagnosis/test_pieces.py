@@ -6,18 +6,20 @@ import numpy as np
 import pytest
 
 from ctr_dynamics.cli.main import spread
+from ctr_dynamics.diagnosis.diagnosis_options import DiagnosisOptions
 from ctr_dynamics.diagnosis.forward_model import at_times, smooth
 from ctr_dynamics.diagnosis.inference.candidates import candidates
-from ctr_dynamics.diagnosis.inference.hypotheses import along
-from ctr_dynamics.diagnosis.inference.map_fit import _Descent, posterior
-from ctr_dynamics.diagnosis.inference.sensitivities import PROBE_STEP
-from ctr_dynamics.diagnosis.pipeline import Validation
-from ctr_dynamics.diagnosis.verdict.residual_tests import block_bootstrap
+from ctr_dynamics.diagnosis.inference.gaussian_posterior import posterior
+from ctr_dynamics.diagnosis.inference.hypotheses import best_size_nearby
+from ctr_dynamics.diagnosis.inference.map_fit import GaussNewton
+from ctr_dynamics.diagnosis.verdict.validation import Validation, block_bootstrap
 from ctr_dynamics.diagnosis.whitening import Whitener
 from ctr_dynamics.effects import EFFECTS, EffectParameter, Quantity, quantities
 from ctr_dynamics.kernels.backlash import behind_backlash
 from ctr_dynamics.kernels.rotations import multiply_rows, rotate_rows, to_vector_rows
 from ctr_dynamics.robot_files import load_robot
+
+OPTIONS = DiagnosisOptions()
 
 
 def test_posterior_is_bayes_rule():
@@ -65,7 +67,7 @@ def test_whitener_gives_unit_noise():
     np.testing.assert_allclose(whiten(values[:, :, None])[:, 0], white)
 
 
-def test_play_follows_after_the_dead_zone():
+def test_backlash_follows_after_the_dead_zone():
     x = np.concatenate([np.linspace(0, 1, 50), np.linspace(1, -1, 100)])
     y = behind_backlash(x, 0.2, x[0])
     assert y[49] == pytest.approx(0.9)
@@ -116,7 +118,7 @@ def test_bootstrap_interval_holds_the_gain():
     rng = np.random.default_rng(3)
     t = np.arange(400) / 40.0
     before, after = rng.chisquare(3, 400), 0.25 * rng.chisquare(3, 400)
-    low, high = block_bootstrap(before, after, t)
+    low, high = block_bootstrap(before, after, t, OPTIONS.validation)
     assert low < 1 - after.sum() / before.sum() < high
     assert 0.6 < low < high < 0.85
 
@@ -147,7 +149,7 @@ def test_validate_takes_every_bag_up_to_the_next_option():
     ],
 )
 def test_a_validation_confirms_what_removes_most_of_a_visible_misfit(before, after, confirmed):
-    assert Validation(1e-3, 1e-3, 0.0, (0.0, 0.0), before, after).confirms is confirmed
+    assert Validation(1e-3, 1e-3, 0.0, (0.0, 0.0), before, after).confirms(OPTIONS.validation) is confirmed
 
 
 def quantity(name, low=-math.inf, high=math.inf, *, tolerance=0.0, scale=1.0, off=0.0):
@@ -158,7 +160,7 @@ def quantity(name, low=-math.inf, high=math.inf, *, tolerance=0.0, scale=1.0, of
 class Vibration:
     """A problem whose prediction is a decaying vibration; ``reach`` as in the real one, no numerics."""
 
-    reach = 2.0
+    reach, options = 2.0, OPTIONS
 
     def __init__(self, truth, nuisances=()):
         self.t = np.linspace(0.0, 14.0, 500)
@@ -181,9 +183,9 @@ def test_a_size_is_looked_for_beyond_the_reach_of_its_column():
     """Half a turn of phase has run away before the vibration has decayed."""
     frequency = quantity("frequency")
     problem = Vibration({frequency.key: 0.4})
-    found = along(problem, {frequency.key: 0.3}, frequency)
+    found = best_size_nearby(problem, {frequency.key: 0.3}, frequency)
     assert found[frequency.key] == pytest.approx(0.4, abs=0.003)
-    assert problem.steps == [PROBE_STEP]
+    assert problem.steps == [OPTIONS.screening.finite_size_dt_s]
 
 
 def test_steps_are_the_best_inside_the_bounds():
@@ -191,7 +193,7 @@ def test_steps_are_the_best_inside_the_bounds():
     names = ("a", "b", "c", "d")
     nuisances = tuple(quantity(n, tolerance=0.5) for n in names)
     cause = quantity("size", low=0.0, scale=2.0)
-    descent = _Descent(Vibration({}, nuisances), (cause,), {})
+    descent = GaussNewton(Vibration({}, nuisances), (cause,), {})
     descent.columns, descent.residual = rng.normal(size=(500, 5)), 3.0 * rng.normal(size=500)
     descent.residual += descent.columns @ np.array([4.0, -3.0, 0.2, 0.1, -1.0])  # beyond the bounds of three
     descent.cost = descent.cost_at(descent.residual, descent.values)

@@ -5,14 +5,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ctr_dynamics.diagnosis.pipeline import measured_axes
-from ctr_dynamics.diagnosis.recording import GAP, SETTLING, SHORTEST, UNSETTLED, read_recording
+from ctr_dynamics.diagnosis.diagnosis_options import RecordingOptions
+from ctr_dynamics.diagnosis.recording import measured_axes, read_recording
 from ctr_dynamics.errors import InputError
 from ctr_dynamics.io.bag_writer import write_bag
 from ctr_dynamics.io.messages import topics
 from ctr_dynamics.io.messages.encode import encode_joint_state, encode_pose_stamped, encode_wrench_stamped
 from ctr_dynamics.robot_files import load_robot
 
+OPTIONS = RecordingOptions()
 START_NS = 1_700_000_000_000_000_000
 
 
@@ -52,7 +53,7 @@ def test_poses_in_gaps_of_the_joints_and_soon_after_are_left_out(robot, bag):
     joints, poses = np.arange(0.0, 10.0, 0.01), np.arange(0.0, 9.9, 0.025)
     gap = (joints > 4.0) & (joints < 4.7)
     found = read_recording(bag(joints[~gap], poses), robot)
-    kept = (poses <= 4.001) | (poses >= 4.7 + SETTLING - 1e-6)
+    kept = (poses <= 4.001) | (poses >= 4.7 + OPTIONS.settling_s - 1e-6)
     np.testing.assert_allclose(found.stamps, poses[kept], atol=1e-8)
     assert len(found.notes) == 1
     assert "joints are missing once, for up to 0.70 s" in found.notes[0]
@@ -72,7 +73,7 @@ def test_a_clock_that_jumps_makes_two_recordings_of_which_the_longer_is_used(rob
     assert "of 2 parts, only the longest was used, 5.0 s from 1000000 s on" in found.notes[0]
 
 
-def test_a_recording_that_no_memory_holds_is_refused(robot, bag):
+def test_a_recording_that_no_memory_holds_is_rejected(robot, bag):
     with pytest.raises(InputError, match=r"joints of 1005 s, limit 1000 s; cut the bag"):
         read_recording(bag(np.arange(0.0, 1006.0, 5.0), np.arange(0.0, 9.0, 0.025)), robot)
 
@@ -80,7 +81,7 @@ def test_a_recording_that_no_memory_holds_is_refused(robot, bag):
 def test_a_recording_that_begins_in_motion_says_so_and_its_start_is_left_out(robot, bag):
     joints, poses = np.arange(0.0, 10.0, 0.01), np.arange(0.0, 9.9, 0.025)
     found = read_recording(bag(joints, poses, rate=0.5), robot)
-    np.testing.assert_allclose(found.stamps, poses[poses >= UNSETTLED], atol=1e-8)
+    np.testing.assert_allclose(found.stamps, poses[poses >= OPTIONS.unsettled_s], atol=1e-8)
     assert len(found.notes) == 1
     assert "begins in motion (tube 1 turns at 0.5 rad/s)" in found.notes[0]
     assert not read_recording(bag(joints, poses, rate=1e-3), robot).notes
@@ -95,8 +96,10 @@ def test_joints_at_half_the_rate_are_no_gap(robot, bag):
 
 def test_joints_that_come_and_go_leave_nothing_to_say(robot, bag):
     joints = np.arange(0.0, 10.0, 0.01)
-    seen = joints % 0.5 < 0.5 - 2 * GAP
-    with pytest.raises(InputError, match=rf"less than {SHORTEST:g} s \(joints are missing 19 times"):
+    seen = joints % 0.5 < 0.5 - 2 * OPTIONS.gap_s
+    with pytest.raises(
+        InputError, match=rf"less than {OPTIONS.shortest_s:g} s \(joints are missing 19 times"
+    ):
         read_recording(bag(joints[seen], np.arange(0.0, 9.9, 0.025)), robot)
 
 

@@ -1,4 +1,7 @@
-"""Candidates: the ways in which a model may be wrong, and how likely each is before the data."""
+"""Candidates: the ways in which a model may be wrong, and how likely each is before the data.
+
+In: the quantities of the catalogue for one robot, and where its tip was. Out: candidates, and log prior probabilities of sets of them.
+"""
 
 from __future__ import annotations
 
@@ -9,12 +12,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ctr_dynamics.diagnosis.inference.map_fit import Key
+from ctr_dynamics.diagnosis.diagnosis_options import PriorOptions
+from ctr_dynamics.diagnosis.inference.fit_problem import Key
 from ctr_dynamics.effects import EFFECTS, Quantity
 
 Floats = NDArray[np.float64]
-LOG_PRIOR_CLEAN = math.log(0.5)
-PRIOR_SINGLE, PRIOR_PAIR, PRIOR_TRIPLE = 0.38, 0.1, 0.02
 
 
 @dataclass(frozen=True)
@@ -45,19 +47,26 @@ class Candidate:
         return frozenset(q.key for q in self.quantities + self.shapes)
 
 
-def candidates(known: Sequence[Quantity], positions: Floats) -> list[Candidate]:
+def candidates(
+    known: Sequence[Quantity], positions: Floats, options: PriorOptions | None = None
+) -> list[Candidate]:
     """Every candidate of the catalogue.
 
-    ``positions`` (s, 3) m of the tip say where springs are anchored to begin with, and where planes of contact may lie: on each of six sides,
-    so that a tenth of the samples is behind.
+    Args:
+        known: quantities of the catalogue for the robot.
+        positions: (s, 3) m of the tip. Springs are anchored at their mean to begin with. Contact planes lie on each of six sides, so
+            that a tenth of the positions is behind.
     """
+    options = options or PriorOptions()
     anchor = positions.mean(axis=0)
     planes: list[Mapping[str, float]] = []
     for axis in range(3):
         for sign in (1.0, -1.0):
             normal = dict.fromkeys(("nx", "ny", "nz"), 0.0)
             normal["n" + "xyz"[axis]] = sign
-            planes.append({**normal, "offset_m": float(np.quantile(sign * positions[:, axis], 0.1))})
+            planes.append(
+                {**normal, "offset_m": float(np.quantile(sign * positions[:, axis], options.behind_plane))}
+            )
     found: list[Candidate] = []
     for name, effect in EFFECTS.items():
         if effect.nuisance:
@@ -100,12 +109,12 @@ def tube_of(q: Quantity) -> str:
     return q.name.split(".")[0] if q.name.startswith("tube") else ""
 
 
-def log_prior(members: Sequence[Candidate], every: Sequence[Candidate]) -> float:
-    """Log prior probability of an explanation; variants of an effect share its part."""
+def log_prior(members: Sequence[Candidate], every: Sequence[Candidate], options: PriorOptions) -> float:
+    """Log prior probability of a set of candidates; variants of an effect share its probability."""
     if not members:
-        return LOG_PRIOR_CLEAN
+        return math.log(options.clean)
     effects = len({c.effect for c in every})
-    mass = {1: PRIOR_SINGLE, 2: PRIOR_PAIR}.get(len(members), PRIOR_TRIPLE)
+    mass = {1: options.single, 2: options.pair}.get(len(members), options.triple)
     count = math.comb(effects, len(members))
     variants = sum(math.log(max(1, sum(c.effect == m.effect for c in every))) for m in members)
     return math.log(mass / count) - variants

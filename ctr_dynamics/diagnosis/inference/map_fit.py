@@ -1,52 +1,47 @@
-"""Maximum a posteriori fits of effects and nuisances to recordings, and their Laplace evidence.
+"""Maximum a posteriori fits of causes and nuisances to recordings, with their Laplace evidence.
 
-The residual is whitened by the stated noise; tolerances of the robot file are 1-sigma priors of the nuisances, and plausible sizes those of
-causes. Gauss-Newton with exact columns at the start and Broyden's rank-one updates between, so that most iterations cost one simulation.
+In: a problem, the causes that are free, and where to start. Out: a :class:`Fit`. The residual is whitened by the stated noise; tolerances of
+the robot file are 1-sigma priors of the nuisances, and plausible sizes those of causes. Gauss-Newton steps with an exact Jacobian at the
+start and Broyden's rank-one updates after it, so that most iterations cost one simulation.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import lsq_linear
-from scipy.special import log_ndtr
 
-from ctr_dynamics.diagnosis.forward_model import NODES, ForwardModel
-from ctr_dynamics.diagnosis.recording import Recording
-from ctr_dynamics.diagnosis.whitening import Whitener
+from ctr_dynamics.diagnosis.inference.fit_problem import Key, Local, Problem
+from ctr_dynamics.diagnosis.inference.gaussian_posterior import (
+    cost,
+    numerics_part,
+    posterior,
+    prior_variance,
+    variances,
+    within_tolerance,
+)
 from ctr_dynamics.effects import Quantity
-from ctr_dynamics.errors import InputError
-from ctr_dynamics.robot import Robot
 
 Floats = NDArray[np.float64]
-Key = tuple[str, str]
-INSIDE = 2.9  # tolerances: an error beyond is not one of tolerance, and needs a cause
-REACH = 4.0  # tolerances: no fit takes a nuisance farther at first. The misfit of a large cause would carry them all away, and hide it
-WIDENING = 1.5  # of posterior deviations: errors of tuning cases were larger than stated by that much
-DIFFERENCE = 0.02  # of the scale, for columns by differences
-# how many times over a fit may gain what its columns promise, at its first steps and later: beyond, it cannot reach its limit
-SURPRISE = (12.0, 6.0, 4.0)
-DAMPING = (1e2, 1e3, 1e4, 1e5)  # in units of the priors' precision
-SETTLED = 0.05  # of the cost: what is not worth a simulation
-
-LOG_INSIDE = float(log_ndtr(INSIDE))
 
 
 @dataclass
 class Fit:
-    """One explanation at its best.
+    """A set of causes at its best.
 
     Attributes:
-        causes: quantities beyond tolerance. active: all quantities that were free, causes included.
-        values: (a,) coordinates. sigma: (a,) posterior deviations. covariance: (a, a).
-        chi2: whitened squares of the residual. cost: twice the negative log posterior density, tolerances ended.
+        causes: quantities that may leave their tolerance. active: all quantities that were free, causes included.
+        values: (a,) coordinates. covariance: (a, a) of the Laplace posterior.
+        chi2: sum of the squares of ``whitened``.
         log_evidence: relative to no model at all; only differences count.
-        residual, whitened: (m,) residuals at the best point, with the solver's own error and without.
-        columns: (m, a) their derivatives, in coordinates.
+        residual, whitened: (m,) residuals at the best point, with the discretisation error and without.
+        columns: (m, a) derivatives of the prediction by the coordinates.
+        cost: twice the negative log posterior density, tolerances limited.
+        inflation: of the posterior deviations, for what no model has (docs/diagnosis.md).
     """
 
     causes: tuple[Quantity, ...]
@@ -59,12 +54,13 @@ class Fit:
     whitened: Floats
     columns: Floats
     cost: float
+    inflation: float
 
     @property
     def sigma(self) -> Floats:
-        """(a,) posterior deviations of the coordinates, widened for what no model has (docs/diagnosis.md) and by what is left beyond noise."""
+        """(a,) posterior deviations of the coordinates, inflated also by what is left beyond noise."""
         left = max(1.0, self.chi2 / max(len(self.whitened), 1))
-        return WIDENING * np.sqrt(left * np.maximum(np.diag(self.covariance), 0.0))
+        return self.inflation * np.sqrt(left * np.maximum(np.diag(self.covariance), 0.0))
 
     @property
     def point(self) -> dict[Key, float]:
@@ -77,146 +73,14 @@ class Fit:
         return {q.key: self.columns[:, i] for i, q in enumerate(self.active)}
 
 
-@dataclass(frozen=True)
-class Local:
-    """The model around one point: whitened residual (m,), and derivatives (m,) of the prediction by coordinates."""
-
-    residual: Floats
-    columns: Mapping[Key, Floats]
-
-
-@dataclass
-class Problem:
-    """Recordings of one robot, prepared for fits.
-
-    Attributes:
-        forward_models, whiteners: one for each recording.
-        nuisances: quantities with a tolerance. numerics: (m, d) whitened directions of the solver's own error.
-        offset: (m,) whitened correction of the residual towards the finer solution.
-        reach: tolerances that fits take a nuisance at most.
-    """
-
-    robot: Robot
-    forward_models: list[ForwardModel]
-    whiteners: list[Whitener]
-    nuisances: tuple[Quantity, ...]
-    numerics: Floats
-    offset: Floats
-    reach: float = REACH
-
-    @property
-    def size(self) -> int:
-        """Number of whitened values."""
-        return sum(w.size for w in self.whiteners)
-
-    def with_step(self, dt: float) -> Problem:
-        """The same with another time step (s)."""
-        return replace(self, forward_models=[e.resolved(e.nodes, dt) for e in self.forward_models])
-
-    @property
-    def finer(self) -> Problem:
-        """The same with half the time step."""
-        return self.with_step(0.5 * self.forward_models[0].scheme.dt)
-
-    def residual(self, point: Mapping[Key, float]) -> Floats | None:
-        """(m,) whitened residual at ``point``; None where a simulation fails."""
-        parts = []
-        for forward_model, whiten in zip(self.forward_models, self.whiteners, strict=True):
-            left = forward_model.residual_at(point)
-            if left is None:
-                return None
-            parts.append(whiten(left))
-        return np.concatenate(parts) - self.offset
-
-    def linearise(
-        self, point: Mapping[Key, float], wanted: Sequence[Quantity]
-    ) -> tuple[Floats, Floats] | None:
-        """Whitened residual (m,) at ``point`` and derivatives (m, len(wanted)) of the prediction, each by its coordinate."""
-        residuals, columns = [], []
-        for forward_model, whiten in zip(self.forward_models, self.whiteners, strict=True):
-            try:
-                prediction, jacobian = forward_model.jacobian(point, wanted)
-            except InputError:
-                return None
-            if prediction.failure:
-                return None
-            residuals.append(whiten(forward_model.residual(prediction)))
-            columns.append(whiten(jacobian))
-        scale = np.array([q.scale for q in wanted])
-        return np.concatenate(residuals) - self.offset, np.concatenate(columns) / scale
-
-
-def make_problem(
-    robot: Robot,
-    recordings: Sequence[Recording],
-    nuisances: Sequence[Quantity],
-    mask: NDArray[np.bool_],
-    nodes: int = NODES,
-) -> Problem:
-    """Problem of ``recordings``; axes that are not finite or not in ``mask`` (6,) are left out."""
-    forward_models = [ForwardModel(r, robot, nodes) for r in recordings]
-    whiteners = []
-    for r in recordings:
-        used = np.isfinite(r.position).all(axis=1) & (r.stamps >= 0.0)
-        whiteners.append(Whitener(robot, r.stamps, mask, used))
-    size = sum(w.size for w in whiteners)
-    return Problem(robot, forward_models, whiteners, tuple(nuisances), np.zeros((size, 0)), np.zeros(size))
-
-
-def prior_variance(quantity: Quantity, cause: bool) -> float:
-    """Of a coordinate: tolerance^2, plus scale^2 where it may be a cause."""
-    return quantity.tolerance**2 + (quantity.scale**2 if cause else 0.0)
-
-
-def variances(
-    nuisances: Sequence[Quantity], causes: Sequence[Quantity]
-) -> tuple[tuple[Quantity, ...], Floats]:
-    """Free quantities and their prior variances: tolerance^2 for nuisances, plus scale^2 for causes."""
-    active = list(nuisances)
-    names = {q.key for q in nuisances}
-    active += [q for q in causes if q.key not in names]
-    wide = {q.key for q in causes}
-    return tuple(active), np.array([prior_variance(q, q.key in wide) for q in active])
-
-
-def posterior(
-    residual: Floats, columns: Floats, departure: Floats, variance: Floats, numerics: Floats
-) -> tuple[Floats, Floats, float]:
-    """One linear step: (new departures from off, covariance, log evidence) of y = J d + N e + noise with Gaussian priors.
-
-    ``residual`` (m,) at the present ``departure`` (a,); ``columns`` (m, a); ``numerics`` (m, d) with prior deviations of one.
-    """
-    count = len(variance)
-    J = np.hstack([columns, numerics])
-    prior = np.concatenate([variance, np.ones(J.shape[1] - count)])
-    target = residual + columns @ departure
-    root = np.sqrt(prior)
-    A = J * root
-    information = np.eye(J.shape[1]) + A.T @ A
-    factor = np.linalg.cholesky(information)
-    rhs = A.T @ target
-    z = np.linalg.solve(factor.T, np.linalg.solve(factor, rhs))
-    log_evidence = -0.5 * float(target @ target - rhs @ z) - float(np.log(np.diag(factor)).sum())
-    inverse = np.linalg.inv(information)
-    covariance = (root[:, None] * inverse * root)[:count, :count]
-    return (root * z)[:count], covariance, log_evidence
-
-
-def cost(residual: Floats, departure: Floats, variance: Floats, numerics: Floats) -> float:
-    """Twice the negative log posterior, with the numerics directions at their best."""
-    rhs = numerics.T @ residual
-    free = float(rhs @ np.linalg.solve(np.eye(numerics.shape[1]) + numerics.T @ numerics, rhs))
-    return float(residual @ residual) - free + float(np.sum(departure**2 / variance))
-
-
 def fit(
     problem: Problem,
     causes: Sequence[Quantity],
     start: Mapping[Key, float],
     known: Local | None = None,
     *,
-    iterations: int = 10,
-    renewals: int = 2,
+    iterations: int | None = None,
+    renewals: int | None = None,
     limit: float = math.inf,
     polish: bool = True,
 ) -> Fit | None:
@@ -224,20 +88,23 @@ def fit(
 
     Args:
         known: the model at ``start``, where it has been computed already; columns that it lacks are zero until the fit has moved.
-        renewals: how often columns may be computed exactly on the way.
+        iterations: steps at most, where not those of the options.
+        renewals: how often the Jacobian may be computed exactly on the way, where not that of the options.
         limit: cost beyond which the fit is given up early.
-        polish: whether to end on exact columns after a way on which they have changed.
+        polish: whether to end on an exact Jacobian after a way on which it has changed.
     Returns:
         None where no simulation succeeds.
     """
-    descent = _Descent(problem, causes, start)
+    o = problem.options.calibration
+    renewals = o.renewals if renewals is None else renewals
+    descent = GaussNewton(problem, causes, start)
     if not descent.begin(known):
         return None
-    stale = False  # columns have missed the last step
-    for number in range(iterations):
+    stale = False  # the columns have missed the last step
+    for number in range(o.iterations if iterations is None else iterations):
         step = descent.step()
         promise = descent.promise(step)
-        if descent.cost - SURPRISE[min(number, len(SURPRISE) - 1)] * promise > limit:
+        if descent.cost - o.surprise[min(number, len(o.surprise) - 1)] * promise > limit:
             return descent.result()
         if stale:
             if not descent.renew():
@@ -245,35 +112,37 @@ def fit(
             renewals -= 1
             step = descent.step()
             promise = descent.promise(step)
-        if promise < SETTLED and not descent.unseen:
+        if promise < o.settled and not descent.unseen:
             break
         size = float(np.linalg.norm(descent.columns @ step))
-        moved = descent.move(step, parts=2 if promise > 1.0 else 1)
+        moved = descent.move(step, parts=o.parts if promise > 1.0 else 1)
         if moved is None and promise > 1.0:
-            moved = descent.creep()
+            moved = descent.move_damped()
         if moved is None:  # not even a small part of the step is good: the columns are not
             stale = not descent.exact and renewals > 0
             if not stale:
                 break
             continue
         error, gain, factor = moved
-        blind = descent.see()
-        stale = error > 0.3 * size * factor and descent.travelled > 3.0 and renewals > 0 and not blind
-        if gain < SETTLED and factor == 1.0 and not (stale or blind):
+        new_columns = descent.difference_unseen()
+        missed = error > o.stale * size * factor and descent.travelled > o.travelled
+        stale = missed and renewals > 0 and not new_columns
+        if gain < o.settled and factor == 1.0 and not (stale or new_columns):
             break
-    if polish and renewals and descent.travelled > 3.0 and descent.renew():
+    if polish and renewals and descent.travelled > o.travelled and descent.renew():
         step = descent.step()
-        if descent.promise(step) > SETTLED:
+        if descent.promise(step) > o.settled:
             descent.move(step, parts=1, learn=False)
     return descent.result()
 
 
-class _Descent:
-    """Gauss-Newton with Broyden's updates on one set of quantities; the arrays are those of :class:`Fit`.
+class GaussNewton:
+    """Gauss-Newton steps with Broyden's updates on one set of quantities; the arrays are those of :class:`Fit`.
 
     Attributes:
-        exact: whether the columns were computed where the fit stands. travelled: whitened error of predictions since they were.
-        unseen: causes without a column, as shapes of an effect that is off.
+        exact: whether the columns were computed where the fit stands.
+        travelled: sum of the whitened errors of predictions since they were.
+        unseen: causes without a column yet, as shapes of an effect that is off.
     """
 
     def __init__(self, problem: Problem, causes: Sequence[Quantity], start: Mapping[Key, float]) -> None:
@@ -290,9 +159,11 @@ class _Descent:
         self.unseen: list[int] = []
 
     def point(self, values: Floats) -> dict[Key, float]:
+        """``values`` (a,) by quantity."""
         return {q.key: float(v) for q, v in zip(self.active, values, strict=True)}
 
     def begin(self, known: Local | None) -> bool:
+        """Take the model at the start, or compute it; False where it cannot be simulated."""
         if known is None:
             return self.renew()
         nothing = np.zeros(len(known.residual))
@@ -304,10 +175,11 @@ class _Descent:
         return True
 
     def cost_at(self, residual: Floats, values: Floats) -> float:
+        """Cost of ``residual`` (m,) at ``values`` (a,)."""
         return cost(residual, values - self.off, self.variance, self.problem.numerics)
 
     def renew(self) -> bool:
-        """Exact columns where the fit stands."""
+        """Exact columns where the fit stands; False where it cannot be simulated."""
         found = self.problem.linearise(self.point(self.values), self.active)
         if found is None:
             return False
@@ -315,11 +187,12 @@ class _Descent:
         self.cost, self.travelled, self.exact = self.cost_at(self.residual, self.values), 0.0, True
         return True
 
-    def see(self) -> bool:
-        """Columns of the unseen by differences; whether there were any."""
+    def difference_unseen(self) -> bool:
+        """Columns of the unseen by finite differences; whether there were any."""
+        fraction = self.problem.options.calibration.difference
         for i in self.unseen:
             q, trial = self.active[i], self.values.copy()
-            trial[i] += DIFFERENCE * q.scale * (1.0 if trial[i] + DIFFERENCE * q.scale <= q.high else -1.0)
+            trial[i] += fraction * q.scale * (1.0 if trial[i] + fraction * q.scale <= q.high else -1.0)
             new = self.problem.residual(self.point(trial))
             if new is not None:
                 self.columns[:, i] = (self.residual - new) / (trial[i] - self.values[i])
@@ -327,8 +200,10 @@ class _Descent:
         return seen
 
     def step(self, damping: float = 0.0) -> Floats:
-        """Gauss-Newton step inside the bounds; the unseen stay. ``damping``: precision, in units of the prior's, with which the fit is held where
-        it stands (Levenberg-Marquardt)."""
+        """Gauss-Newton step (a,) inside the bounds; the unseen stay.
+
+        ``damping``: precision, in units of the prior's, with which the fit is held where it stands (Levenberg-Marquardt).
+        """
         seen = np.ones(len(self.values), bool)
         seen[self.unseen] = False
         sigma, departure = np.sqrt(self.variance[seen]), (self.values - self.off)[seen]
@@ -355,9 +230,9 @@ class _Descent:
         full[seen] = np.clip(step, low, high)
         return full
 
-    def creep(self) -> tuple[float, float, float] | None:
-        """:meth:`move` by the least damped step that lowers the cost: where the misfit is large, a phase in time is beyond what columns say."""
-        for damping in DAMPING:
+    def move_damped(self) -> tuple[float, float, float] | None:
+        """:meth:`move` by the least damped step that lowers the cost: a large misfit moves a phase beyond what columns say."""
+        for damping in self.problem.options.calibration.damping:
             moved = self.move(self.step(damping), parts=1)
             if moved is not None:
                 error, gain, _ = moved
@@ -368,15 +243,22 @@ class _Descent:
         """What ``step`` takes off the cost if the columns are right."""
         return self.cost - self.cost_at(self.residual - self.columns @ step, self.values + step)
 
-    def move(self, step: Floats, parts: int = 4, learn: bool = True) -> tuple[float, float, float] | None:
-        """Go by ``step`` or a part of it that lowers the cost: (error of the prediction, gain, part); None where none does."""
+    def move(self, step: Floats, parts: int, learn: bool = True) -> tuple[float, float, float] | None:
+        """Go by ``step`` or a part of it that lowers the cost.
+
+        Args:
+            parts: how many lengths are tried.
+            learn: whether the columns take Broyden's update.
+        Returns:
+            Whitened error of the prediction, gain in cost, and part of the step; None where no length lowers the cost.
+        """
         factor = 1.0
         for _ in range(parts):
             trial = self.values + factor * step
             new = self.problem.residual(self.point(trial))
             if new is not None and (there := self.cost_at(new, trial)) < self.cost + 1e-9:
                 break
-            factor *= 0.35
+            factor *= self.problem.options.calibration.backtracking
         else:
             return None
         change = trial - self.values
@@ -391,11 +273,11 @@ class _Descent:
         return error, gain, factor
 
     def result(self) -> Fit:
-        """What was reached."""
-        return summary(self.problem, self.causes, self.active, self.values, self.residual, self.columns)
+        """The fit that was reached."""
+        return fit_at(self.problem, self.causes, self.active, self.values, self.residual, self.columns)
 
 
-def summary(
+def fit_at(
     problem: Problem,
     causes: tuple[Quantity, ...],
     active: tuple[Quantity, ...],
@@ -404,54 +286,34 @@ def summary(
     columns: Floats,
 ) -> Fit:
     """The fit that stands at ``values`` (a,), with its posterior and evidence."""
+    o, numerics = problem.options.calibration, problem.numerics
     wide = {q.key for q in causes}
     variance = np.array([prior_variance(q, q.key in wide) for q in active])
-    departure, numerics = values - np.array([q.off for q in active]), problem.numerics
+    departure = values - np.array([q.off for q in active])
     _, covariance, _ = posterior(residual, columns, departure, variance, numerics)
     J = np.hstack([columns * np.sqrt(variance), numerics])
     total = cost(residual, departure, variance, numerics)
     evidence = -0.5 * total - 0.5 * float(np.linalg.slogdet(np.eye(J.shape[1]) + J.T @ J)[1])
     evidence += math.log(2.0) * sum(q.one_sided for q in causes)
-    within = inside(active, wide, departure, covariance)
-    left = residual - _numerics_part(residual, numerics)
+    within = within_tolerance(active, wide, departure, covariance, o.tolerance_limit)
+    left = residual - numerics_part(residual, numerics)
     return Fit(
-        causes,
-        active,
-        values,
-        covariance,
-        float(left @ left),
-        evidence + within,
-        residual,
-        left,
-        columns,
-        total - 2.0 * within,
+        causes=causes,
+        active=active,
+        values=values,
+        covariance=covariance,
+        chi2=float(left @ left),
+        log_evidence=evidence + within,
+        residual=residual,
+        whitened=left,
+        columns=columns,
+        cost=total - 2.0 * within,
+        inflation=o.inflation,
     )
 
 
 def corrected(problem: Problem, result: Fit, change: Floats) -> Fit:
     """``result`` after ``problem.offset`` has changed by ``change`` (m,), where it stood."""
-    return summary(
+    return fit_at(
         problem, result.causes, result.active, result.values, result.residual - change, result.columns
-    )
-
-
-def inside(active: Sequence[Quantity], causes: set[Key], departure: Floats, covariance: Floats) -> float:
-    """Log probability that the nuisances lie within ``INSIDE`` tolerances, over that before the data.
-
-    A tolerance is the deviation of normal errors; what lies far outside is no error of tolerance, however small its share of the evidence.
-    """
-    total = 0.0
-    for i, q in enumerate(active):
-        if q.key in causes or q.tolerance <= 0.0:
-            continue
-        sigma = math.sqrt(max(covariance[i, i], 0.0)) / q.tolerance + 1e-9
-        z = departure[i] / q.tolerance
-        tail = log_ndtr((INSIDE - z) / sigma) if z > 0.0 else log_ndtr((INSIDE + z) / sigma)
-        total += float(tail) - LOG_INSIDE
-    return total
-
-
-def _numerics_part(residual: Floats, numerics: Floats) -> Floats:
-    return numerics @ np.linalg.solve(
-        np.eye(numerics.shape[1]) + numerics.T @ numerics, numerics.T @ residual
     )

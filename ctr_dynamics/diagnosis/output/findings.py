@@ -1,4 +1,4 @@
-"""findings.json: the outcome of a diagnosis for programs (schema ctr_dynamics/findings/1)."""
+"""findings.json: the outcome of a diagnosis for programs (schema ctr_dynamics/findings/1), and the robot files beside it."""
 
 from __future__ import annotations
 
@@ -11,10 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctr_dynamics import __version__
+from ctr_dynamics.diagnosis.diagnosis_result import Diagnosis
+from ctr_dynamics.diagnosis.inference.candidates import Candidate
 from ctr_dynamics.diagnosis.inference.map_fit import Fit
-from ctr_dynamics.diagnosis.output.robot_export import robot_of
-from ctr_dynamics.diagnosis.pipeline import Diagnosis, Member
+from ctr_dynamics.diagnosis.output.robot_export import robot_with
 from ctr_dynamics.diagnosis.verdict.residual_tests import rms
+from ctr_dynamics.diagnosis.verdict.separability import Cause
 from ctr_dynamics.diagnosis.whitening import noise_floor
 from ctr_dynamics.effects import EFFECTS, Quantity
 from ctr_dynamics.io.atomic_files import atomic_file
@@ -24,7 +26,6 @@ from ctr_dynamics.runtime.replay import plain
 Floats = NDArray[np.float64]
 SCHEMA = "ctr_dynamics/findings/1"
 RECALIBRATED, EXTENDED = "recalibrated_robot.yaml", "extended_robot.yaml"
-NUMERICS_LIMIT = 0.2  # of the noise floor
 
 
 def interval(q: Quantity, value: float, sigma: float, width: float) -> list[float | None]:
@@ -34,12 +35,11 @@ def interval(q: Quantity, value: float, sigma: float, width: float) -> list[floa
     return [x if math.isfinite(x) else None for x in ends]
 
 
-def parameters(fit: Fit, member: Member, inflation: float) -> dict[str, Any]:
-    """Values of one cause's parameters."""
+def parameters(fit: Fit, candidate: Candidate, inflation: float) -> dict[str, Any]:
+    """Values of one cause's parameters; ``inflation`` multiplies the posterior deviations of ``fit``."""
     out: dict[str, Any] = {}
-    assert member.candidate is not None
     for q, value, sigma in zip(fit.active, fit.values, fit.sigma * inflation, strict=True):
-        if q.key not in member.candidate.keys:
+        if q.key not in candidate.keys:
             continue
         if q.parameter.period:
             value %= q.parameter.period
@@ -56,55 +56,30 @@ def parameters(fit: Fit, member: Member, inflation: float) -> dict[str, Any]:
 
 
 def findings(diagnosis: Diagnosis, command: str, experiment: dict[str, Any] | None) -> dict[str, Any]:
-    """The contract's dictionary; numbers that are not known are None."""
+    """The contract's dictionary; numbers that are not known are None.
+
+    Args:
+        command: that reproduces the diagnosis.
+        experiment: the next one, as the contract has it.
+    """
     d = diagnosis
-    problem, best = d.problem, d.best
-    inflation = 1.0
-    if problem is not None and best is not None:
-        inflation = math.sqrt(max(1.0, best.chi2 / problem.size))
-    causes = []
-    for m in d.members:
-        if m.effect == "config_mistake" and d.mistake is not None:
-            values: dict[str, Any] = {
-                "which": {
-                    "value": d.mistake[0],
-                    "ci90": None,
-                    "ci99": None,
-                    "unit": "name",
-                    "nominal": "none",
-                }
-            }
-        elif m.candidate is None or best is None:
-            values = {}
-        else:
-            values = parameters(best, m, inflation)
-        causes.append(
-            {
-                "effect": m.effect,
-                "parameters": values,
-                "probability": m.probability,
-                "separation": m.separation,
-                "not_separable_from": m.rivals,
-            }
-        )
-    if d.verdict in ("clean", "not_excited"):
-        causes = []
+    problem, v = d.problem, d.validation
     residual = {
         "nominal_rms_m": d.nominal_rms,
-        "recalibrated_rms_m": _rms(d.left),
-        "extended_rms_m": _rms(d.rest),
+        "recalibrated_rms_m": _rms(d.residual_recalibrated),
+        "extended_rms_m": _rms(d.residual_extended),
         "noise_floor_m": noise_floor(d.robot),
-        "whiteness_p": d.white.p if d.white else None,
+        "whiteness_p": d.whiteness_extended.p if d.whiteness_extended else None,
     }
-    v = d.validation
-    within = bool(d.numerics) and max(d.numerics.values()) < NUMERICS_LIMIT * noise_floor(d.robot)
+    limit = d.options.report.numerics_limit * noise_floor(d.robot)
+    within = bool(d.numerics) and max(d.numerics.values()) < limit
     return plain(
         {
             "schema": SCHEMA,
             "verdict": d.verdict,
-            "causes": causes,
-            # clean is one explanation by contract; what small causes are possible stands in "probabilities"
-            "cause_set95": [[]] if d.verdict == "clean" else [list(effects) for effects, _ in d.sets],
+            "causes": [] if d.verdict in ("clean", "not_excited") else [_cause(d, c) for c in d.causes],
+            # clean is one hypothesis by contract; "probabilities" has the small causes that are possible
+            "cause_set95": [[]] if d.verdict == "clean" else [list(effects) for effects, _ in d.cause_sets],
             "tested": d.tested,
             "not_observable": d.not_observable,
             "numerics": {
@@ -124,11 +99,11 @@ def findings(diagnosis: Diagnosis, command: str, experiment: dict[str, Any] | No
                 "nis_after": v.nis_after,
             },
             "next_experiment": experiment,
-            "extended_robot": EXTENDED if best is not None else None,
-            "recalibrated_robot": RECALIBRATED if d.clean is not None else None,
+            "extended_robot": EXTENDED if d.extended is not None else None,
+            "recalibrated_robot": RECALIBRATED if d.recalibrated is not None else None,
             "reproduce": command,
             "seconds": d.seconds,
-            "probabilities": [{"effects": list(effects), "probability": p} for effects, p in d.sets],
+            "probabilities": [{"effects": list(effects), "probability": p} for effects, p in d.cause_sets],
             "notes": d.notes,
             "version": __version__,
             "robot": {"name": d.robot.name, "source": d.robot.source, "sha256": d.robot.sha256},
@@ -145,6 +120,24 @@ def findings(diagnosis: Diagnosis, command: str, experiment: dict[str, Any] | No
     )
 
 
+def _cause(d: Diagnosis, cause: Cause) -> dict[str, Any]:
+    """One cause as the contract has it."""
+    values: dict[str, Any] = {}
+    if cause.effect == "config_mistake" and d.mistake is not None:
+        which = {"value": d.mistake.name, "ci90": None, "ci99": None, "unit": "name", "nominal": "none"}
+        values = {"which": which}
+    elif cause.candidate is not None and d.extended is not None and d.problem is not None:
+        inflation = math.sqrt(max(1.0, d.extended.chi2 / d.problem.size))
+        values = parameters(d.extended, cause.candidate, inflation)
+    return {
+        "effect": cause.effect,
+        "parameters": values,
+        "probability": cause.probability,
+        "separation": cause.separation,
+        "not_separable_from": cause.rivals,
+    }
+
+
 def _rms(residuals: list[Floats]) -> float | None:
     return rms(np.concatenate(residuals)[:, :3]) if residuals else None
 
@@ -152,15 +145,14 @@ def _rms(residuals: list[Floats]) -> float | None:
 def write(directory: Path, diagnosis: Diagnosis, content: dict[str, Any]) -> None:
     """findings.json and the robot files into ``directory``."""
     directory.mkdir(parents=True, exist_ok=True)
-    name = diagnosis.robot.name
-    if diagnosis.clean is not None:
-        recalibrated = robot_of(
-            diagnosis.robot, diagnosis.clean, f"{name}_recalibrated", "re-calibrated inside its tolerances"
-        )
+    robot, name = diagnosis.robot, diagnosis.robot.name
+    if diagnosis.recalibrated is not None:
+        note = "re-calibrated inside its tolerances"
+        recalibrated = robot_with(robot, diagnosis.recalibrated, f"{name}_recalibrated", note)
         _text(directory / RECALIBRATED, robot_to_yaml(recalibrated))
-    if diagnosis.best is not None:
-        effects = ", ".join(m.effect for m in diagnosis.members if m.effect in EFFECTS) or "no cause"
-        extended = robot_of(diagnosis.robot, diagnosis.best, f"{name}_extended", f"extended by {effects}")
+    if diagnosis.extended is not None:
+        effects = ", ".join(c.effect for c in diagnosis.causes if c.effect in EFFECTS) or "no cause"
+        extended = robot_with(robot, diagnosis.extended, f"{name}_extended", f"extended by {effects}")
         _text(directory / EXTENDED, robot_to_yaml(extended))
     _text(
         directory / "findings.json", json.dumps(content, indent=1, allow_nan=False, ensure_ascii=False) + "\n"

@@ -1,4 +1,4 @@
-"""report.html of a diagnosis: one page that opens offline. First the verdict in sentences, then what they rest on."""
+"""Findings report: report.html of a diagnosis, one page that opens offline. First the verdict in sentences, then what they rest on."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from scipy.signal import periodogram
 
+from ctr_dynamics.diagnosis.diagnosis_result import Diagnosis
 from ctr_dynamics.diagnosis.inference.map_fit import Fit
-from ctr_dynamics.diagnosis.inference.sensitivities import separation
+from ctr_dynamics.diagnosis.inference.separation import separation
 from ctr_dynamics.diagnosis.output.summary_text import summary
-from ctr_dynamics.diagnosis.pipeline import Diagnosis
 from ctr_dynamics.diagnosis.verdict.residual_tests import by_axis
 from ctr_dynamics.diagnosis.whitening import noise_floor
 from ctr_dynamics.effects import EFFECTS
@@ -23,7 +23,6 @@ from ctr_dynamics.reporting.page import Page
 
 Floats = NDArray[np.float64]
 AXES = "xyz"
-SHOWN_CAUSES = 12
 
 
 def write_report(path: Path, diagnosis: Diagnosis, content: dict[str, Any]) -> None:
@@ -35,21 +34,25 @@ def write_report(path: Path, diagnosis: Diagnosis, content: dict[str, Any]) -> N
         page.paragraph(text)
     for text in content["notes"]:
         page.paragraph(text, "warning")
-    if diagnosis.problem is not None and diagnosis.clean is not None and diagnosis.best is not None:
+    if (
+        diagnosis.problem is not None
+        and diagnosis.recalibrated is not None
+        and diagnosis.extended is not None
+    ):
         _traces(page, diagnosis)
         _unexplained(page, diagnosis)
         _evidence(page, diagnosis)
         _rivals(page, diagnosis)
         _validation(page, diagnosis)
-        _whiteness(page, diagnosis, diagnosis.clean, diagnosis.best)
-        _values(page, diagnosis.best)
+        _whiteness(page, diagnosis, diagnosis.recalibrated, diagnosis.extended)
+        _values(page, diagnosis.extended)
     _scope(page, content)
     with atomic_file(path) as part:
         part.write_text(page.text(), encoding="utf-8", errors="backslashreplace")
 
 
 def _traces(page: Page, d: Diagnosis) -> None:
-    for recording, left, rest in zip(d.recordings, d.left, d.rest, strict=True):
+    for recording, left, rest in zip(d.recordings, d.residual_recalibrated, d.residual_extended, strict=True):
         t = recording.stamps
         before, after = (recording.position - r[:, :3] for r in (left, rest))
         band = np.full(len(t), 2e3 * noise_floor(d.robot) / np.sqrt(3.0))
@@ -59,39 +62,39 @@ def _traces(page: Page, d: Diagnosis) -> None:
             panels.append(
                 Panel(f"{axis} (mm)")
                 .line(t, 1e3 * recording.position[:, i], "tracker", "tracker", dots=True)
-                .line(t, 1e3 * before[:, i], "re-calibrated", "alone")
+                .line(t, 1e3 * before[:, i], "re-calibrated", "open_loop")
                 .line(t, 1e3 * after[:, i], "extended", "fused", band=band)
             )
-            signature = 1e3 * (after - before)[:, i]
+            explained = 1e3 * (after - before)[:, i]
             errors.append(
                 Panel(f"{axis} (mm)")
                 .line(t, 1e3 * left[:, i], "residual, re-calibrated", "tracker", dots=True)
-                .line(t, signature, "what the causes explain", "fused")
+                .line(t, explained, "what the causes explain", "fused")
                 .line(t, 1e3 * rest[:, i], "residual, extended", "other", dots=True)
             )
         page.figure(
             figure_svg(panels),
             "Tip position in the tracker's axes; the band is two standard deviations of the tracker's noise.",
         )
-        page.figure(figure_svg(errors), "Residuals with the signature of the causes over them.")
+        page.figure(figure_svg(errors), "Residuals, with what the causes explain of them.")
         page.figure(
             _loops(recording.joints, t, left, rest),
-            "Residual length over each tube's angle: loops point to friction and play.",
+            "Residual length over each tube's angle: loops point to friction and backlash.",
         )
         page.figure(_envelope(t, left, rest), "Residual length, averaged over half a second.")
 
 
 def _unexplained(page: Page, d: Diagnosis) -> None:
-    if d.unexplained is None:
+    if d.unexplained_force is None:
         return
     page.heading("The unexplained force")
     panels = [
         Panel(f"force {axis} (mN)").line(
-            d.unexplained.stamps, 1e3 * d.unexplained.force[:, i], "at the tip", "fused"
+            d.unexplained_force.stamps, 1e3 * d.unexplained_force.force[:, i], "at the tip", "fused"
         )
         for i, axis in enumerate(AXES)
     ]
-    page.figure(figure_svg(panels), f"In the first bag, {d.unexplained.text}.")
+    page.figure(figure_svg(panels), f"In the first bag, {d.unexplained_force.text}.")
 
 
 def _loops(joints: Floats, t: Floats, left: Floats, rest: Floats):  # type: ignore[no-untyped-def]
@@ -124,7 +127,7 @@ def _envelope(t: Floats, left: Floats, rest: Floats):  # type: ignore[no-untyped
     panel = Panel("residual (mm)", log=True)
     count = np.bincount(groups)
     centre = np.bincount(groups, t) / count
-    for values, label, colour in ((left, "re-calibrated", "alone"), (rest, "extended", "fused")):
+    for values, label, colour in ((left, "re-calibrated", "open_loop"), (rest, "extended", "fused")):
         squares = np.bincount(groups, np.sum(values[:, :3] ** 2, axis=1)) / count
         panel.line(centre, 1e3 * np.sqrt(squares), label, colour)
     return figure_svg([panel])
@@ -134,10 +137,11 @@ def _evidence(page: Page, d: Diagnosis) -> None:
     if d.search is None:
         return
     page.heading("Evidence")
-    shown = d.search.explanations[:SHOWN_CAUSES]
-    clean = next(e for e in d.search.explanations if not e.members)
+    most = d.options.report.shown
+    shown = d.search.hypotheses[:most]
+    no_cause = next(e for e in d.search.hypotheses if not e.members)
     labels = [" + ".join(c.label for c in e.members) or "no cause" for e in shown]
-    values = [max(e.score - clean.score, -5.0) for e in shown]
+    values = [max(e.score - no_cause.score, -5.0) for e in shown]
     figure = Figure(figsize=(10, 0.6 + 0.3 * len(shown)), layout="constrained")
     ax = figure.subplots()
     ax.barh(range(len(shown)), values, color="#0969da")
@@ -146,13 +150,13 @@ def _evidence(page: Page, d: Diagnosis) -> None:
     ax.set_xscale("symlog", linthresh=5)
     ax.set_xlabel("log posterior over that of no cause")
     ax.grid(axis="x", alpha=0.25)
-    page.figure(to_svg(figure), "Explanations that were fitted in full.")
+    page.figure(to_svg(figure), "Hypotheses that were fitted in full.")
     rows = [
         (label, f"{p:.3f}", f"{e.fit.chi2 / max(d.problem.size, 1):.3f}" if d.problem else "-")
         for label, p, e in zip(labels, d.search.probabilities, shown, strict=False)
     ]
-    page.table(rows, ("explanation", "probability", "squares over noise"))
-    linear = [(s.candidate.label, s.gain) for s in d.search.screened[:SHOWN_CAUSES] if np.isfinite(s.gain)]
+    page.table(rows, ("hypothesis", "probability", "squares over noise"))
+    linear = [(s.candidate.label, s.gain) for s in d.search.screened[:most] if np.isfinite(s.gain)]
     page.paragraph(
         "Log evidence that each single cause gains by the linear estimate at the re-calibrated model:"
     )
@@ -160,19 +164,19 @@ def _evidence(page: Page, d: Diagnosis) -> None:
 
 
 def _rivals(page: Page, d: Diagnosis) -> None:
-    if d.at_best is None or d.problem is None or d.search is None:
+    if d.sensitivities is None or d.problem is None or d.search is None:
         return
-    members = [c for e in d.search.explanations[:1] for c in e.members]
+    members = [c for e in d.search.hypotheses[:1] for c in e.members]
     if not members:
         return
-    best = d.search.explanations[0]
-    names = sorted({c.effect for c in d.at_best.signatures})
+    best = d.search.hypotheses[0]
+    names = sorted({c.effect for c in d.sensitivities.by_candidate})
     table = np.full((len(members), len(names)), np.nan)
     for i, member in enumerate(members):
-        for rival in d.at_best.signatures:
+        for rival in d.sensitivities.by_candidate:
             if rival.effect != member.effect:
                 k = names.index(rival.effect)
-                value = separation(d.problem, best.fit, (member,), rival, d.at_best)
+                value = separation(d.problem, best.fit, (member,), rival, d.sensitivities)
                 table[i, k] = np.nanmin([table[i, k], value])
     figure = Figure(figsize=(10, 1.8 + 0.3 * len(members)), layout="constrained")
     ax = figure.subplots()
@@ -207,12 +211,12 @@ def _validation(page: Page, d: Diagnosis) -> None:
     page.table([("NIS per degree of freedom", v.nis_before, v.nis_after)], ("", "re-calibrated", "extended"))
 
 
-def _whiteness(page: Page, d: Diagnosis, clean: Fit, best: Fit) -> None:
+def _whiteness(page: Page, d: Diagnosis, recalibrated: Fit, extended: Fit) -> None:
     assert d.problem is not None
     page.heading("Is what is left noise?")
     figure = Figure(figsize=(10, 3.0), layout="constrained")
     left, right = figure.subplots(1, 2)
-    for fit, label, colour in ((clean, "re-calibrated", "#0969da"), (best, "extended", "#cf222e")):
+    for fit, label, colour in ((recalibrated, "re-calibrated", "#0969da"), (extended, "extended", "#cf222e")):
         sequences = by_axis(d.problem, fit.whitened)
         lags = np.arange(1, 21)
         values = [[float(x[k:] @ x[:-k]) / max(float(x @ x), 1e-30) for k in lags] for x in sequences]
@@ -220,7 +224,7 @@ def _whiteness(page: Page, d: Diagnosis, clean: Fit, best: Fit) -> None:
         rate = 1.0 / np.median(np.diff(d.recordings[0].stamps))
         frequency, power = periodogram(sequences[1], rate)
         right.plot(frequency, np.cumsum(power) / max(power.sum(), 1e-30), color=colour, label=label)
-    bound = 2.0 / np.sqrt(len(by_axis(d.problem, best.whitened)[0]) * 3)
+    bound = 2.0 / np.sqrt(len(by_axis(d.problem, extended.whitened)[0]) * 3)
     left.axhspan(-bound, bound, color="#8c959f", alpha=0.3)
     left.set_xlabel("lag (samples)")
     left.set_ylabel("autocorrelation")
@@ -234,7 +238,7 @@ def _whiteness(page: Page, d: Diagnosis, clean: Fit, best: Fit) -> None:
     )
     rows = [
         (label, w.power, w.p_correlation, w.p_power)
-        for label, w in (("re-calibrated", d.white_before), ("extended", d.white))
+        for label, w in (("re-calibrated", d.whiteness_recalibrated), ("extended", d.whiteness_extended))
         if w
     ]
     page.table(rows, ("model", "mean square", "p of Ljung-Box", "p of mean square"))

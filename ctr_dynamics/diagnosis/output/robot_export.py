@@ -1,4 +1,8 @@
-"""Robot files from fits: what the data say goes into the file's own fields where it has them, and under `extensions` else."""
+"""Robot export: the robot file with what a fit has found.
+
+In: a robot and a fit. Out: a robot with the fit's values and posterior deviations, in the file's own fields where it has them, and under
+`extensions` else.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from ctr_dynamics.diagnosis.inference.map_fit import Fit, Key
+from ctr_dynamics.diagnosis.inference.fit_problem import Key
+from ctr_dynamics.diagnosis.inference.map_fit import Fit
 from ctr_dynamics.effects import EFFECTS
 from ctr_dynamics.kernels.rotations import from_vector, matrix, multiply, to_vector
 from ctr_dynamics.robot import Robot
@@ -27,8 +32,8 @@ _VECTORS = {
 }
 
 
-def robot_of(robot: Robot, fit: Fit, name: str, note: str) -> Robot:
-    """``robot`` with the values and posterior deviations of ``fit``; effects without a field of their own go under `extensions`."""
+def robot_with(robot: Robot, fit: Fit, name: str, note: str) -> Robot:
+    """``robot`` with the values and posterior deviations of ``fit``; ``note`` goes into its description."""
     data = robot_to_dict(robot)
     values = {q.key: float(v) for q, v in zip(fit.active, fit.values, strict=True)}
     sigma = {q.key: float(s) for q, s in zip(fit.active, fit.sigma, strict=True)}

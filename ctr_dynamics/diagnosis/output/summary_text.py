@@ -1,4 +1,4 @@
-"""Findings in sentences that a roboticist can act on."""
+"""Summary text: findings in sentences that a roboticist can act on."""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""The next experiment: which motion of the library would tell two explanations apart, by how much."""
+"""Next experiment: which motion of the library would tell two hypotheses apart, by how much.
+
+In: a diagnosis. Out: a scenario of the library with the separation that it would give, or none where nothing is left to tell apart.
+"""
 
 from __future__ import annotations
 
@@ -8,11 +11,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ctr_dynamics.diagnosis.diagnosis_result import Diagnosis
 from ctr_dynamics.diagnosis.forward_model import ForwardModel
 from ctr_dynamics.diagnosis.inference.candidates import Candidate
-from ctr_dynamics.diagnosis.inference.map_fit import prior_variance
-from ctr_dynamics.diagnosis.inference.sensitivities import left_over, separation
-from ctr_dynamics.diagnosis.pipeline import Diagnosis
+from ctr_dynamics.diagnosis.inference.fit_problem import Problem
+from ctr_dynamics.diagnosis.inference.gaussian_posterior import prior_variance
+from ctr_dynamics.diagnosis.inference.map_fit import Fit
+from ctr_dynamics.diagnosis.inference.sensitivities import Sensitivities
+from ctr_dynamics.diagnosis.inference.separation import left_over, separation
 from ctr_dynamics.diagnosis.recording import Recording
 from ctr_dynamics.diagnosis.whitening import Whitener
 from ctr_dynamics.errors import InputError
@@ -23,11 +29,11 @@ from ctr_dynamics.simulation.scenario_run import drives
 
 Floats = NDArray[np.float64]
 LIBRARY = ("release", "light_release", "reversals", "turns")
-START = "release"  # what excites most, for bags that excite nothing
+MOST_EXCITING = "release"
 
 
 @dataclass(frozen=True)
-class Plan:
+class NextExperiment:
     """A scenario of the library and what it is worth; separations in whitened units, None where unknown."""
 
     description: str
@@ -36,9 +42,40 @@ class Plan:
     after: float | None
 
 
-def planned(scenario: Scenario, robot: Robot) -> Recording:
-    """What a bag of ``scenario`` would hold, without readings."""
-    _, known = drives(scenario, robot, Model(robot, nodes=16))
+def next_experiment(diagnosis: Diagnosis) -> NextExperiment | None:
+    """The most informative experiment; None where nothing is left to tell apart."""
+    d = diagnosis
+    if d.verdict == "not_excited":
+        scenario = load_scenario(MOST_EXCITING)
+        text = f"{scenario.description}: excites bending and torsion, which these bags do not"
+        return NextExperiment(text, scenario, None, None)
+    if d.problem is None or d.extended is None or d.sensitivities is None:
+        return None
+    cause = next((c for c in d.causes if c.candidate is not None and c.rivals), None)
+    if cause is None or cause.candidate is None or cause.separation is None:
+        return None
+    rival = next((c for c in d.sensitivities.by_candidate if c.effect == cause.rivals[0]), None)
+    if rival is None:
+        return None
+    before = separation(d.problem, d.extended, (cause.candidate,), rival, d.sensitivities)
+    best: NextExperiment | None = None
+    for name in LIBRARY:
+        scenario = load_scenario(name)
+        try:
+            after = _separation_with(
+                scenario, d.problem, d.extended, d.sensitivities, (cause.candidate, rival)
+            )
+        except InputError:
+            continue
+        if after is not None and (best is None or best.after is None or after > best.after):
+            text = f"{scenario.description}; tells {cause.effect} from {rival.effect}"
+            best = NextExperiment(text, scenario, before, after)
+    return best
+
+
+def recording_of(scenario: Scenario, robot: Robot, nodes: int) -> Recording:
+    """What a bag of ``scenario`` would hold, without measurements."""
+    _, known = drives(scenario, robot, Model(robot, nodes=nodes))
     t = np.arange(math.floor(scenario.duration_s * scenario.rates.joints_hz) + 1) / scenario.rates.joints_hz
     inputs = [known(x) for x in t]
     joints = np.array([[x, *i.alpha, *i.beta] for x, i in zip(t, inputs, strict=True)])
@@ -56,59 +93,28 @@ def planned(scenario: Scenario, robot: Robot) -> Recording:
     )
 
 
-def plan(diagnosis: Diagnosis) -> Plan | None:
-    """The most informative experiment; None where nothing is left to tell apart."""
-    d = diagnosis
-    if d.verdict == "not_excited":
-        scenario = load_scenario(START)
-        return Plan(
-            f"{scenario.description}: excites bending and torsion, which these bags do not",
-            scenario,
-            None,
-            None,
-        )
-    if d.problem is None or d.best is None or d.at_best is None:
-        return None
-    member = next((m for m in d.members if m.candidate is not None and m.rivals), None)
-    if member is None or member.candidate is None or member.separation is None:
-        return None
-    rivals = [c for c in d.at_best.signatures if c.effect == member.rivals[0]]
-    if not rivals:
-        return None
-    rival = rivals[0]
-    before = separation(d.problem, d.best, (member.candidate,), rival, d.at_best)
-    best: Plan | None = None
-    for name in LIBRARY:
-        scenario = load_scenario(name)
-        try:
-            after = _separation(d, scenario, member.candidate, rival)
-        except InputError:
-            continue
-        if after is not None and (best is None or best.after is None or after > best.after):
-            text = f"{scenario.description}; tells {member.effect} from {rival.effect}"
-            best = Plan(text, scenario, before, after)
-    return best
-
-
-def _separation(d: Diagnosis, scenario: Scenario, own: Candidate, rival: Candidate) -> float | None:
-    """Separation of the two with these bags and one of ``scenario`` together."""
-    assert d.problem is not None
-    assert d.best is not None
-    assert d.at_best is not None
-    fit = d.best
-    recording = planned(scenario, d.robot)
-    forward_model = ForwardModel(recording, d.robot, d.problem.forward_models[0].nodes)
+def _separation_with(
+    scenario: Scenario,
+    problem: Problem,
+    fit: Fit,
+    sensitivities: Sensitivities,
+    pair: tuple[Candidate, Candidate],
+) -> float | None:
+    """Separation of a cause from its rival (``pair``) with the bags of ``problem`` and one of ``scenario`` together."""
+    own, rival = pair
+    recording = recording_of(scenario, problem.robot, problem.options.forward_model.fine_nodes)
+    forward_model = ForwardModel(recording, problem.robot, problem.forward_models[0].nodes)
     rivals = [q for q in rival.quantities if q.key not in {x.key for x in fit.active}]
     point = {**fit.point, **dict(rival.start)}
     prediction, jacobian = forward_model.jacobian(point, (*fit.active, *rivals))
     if prediction.failure:
         return None
-    mask = d.problem.whiteners[0].mask
-    whiten = Whitener(d.robot, recording.stamps, mask, np.ones(len(recording.stamps), bool))
+    mask = problem.whiteners[0].mask
+    whiten = Whitener(problem.robot, recording.stamps, mask, np.ones(len(recording.stamps), bool))
     columns = whiten(jacobian)
     a = len(fit.active)
     old = fit.columns * [q.scale for q in fit.active]
-    old_rival = d.at_best.signatures[rival]
+    old_rival = sensitivities.by_candidate[rival]
     chosen = [i for i, q in enumerate(rival.quantities) if q.key in {x.key for x in rivals}]
     old_rival = old_rival[:, chosen] * [rival.quantities[i].scale for i in chosen]
     everything = np.vstack([old, columns[:, :a]])
@@ -117,7 +123,7 @@ def _separation(d: Diagnosis, scenario: Scenario, own: Candidate, rival: Candida
     departure = np.array(
         [(v - q.off) / q.scale if q.key in keys else 0.0 for q, v in zip(fit.active, fit.values, strict=True)]
     )
-    signature = everything @ departure
     wide = {q.key for q in fit.causes} - keys
     widths = np.array([math.sqrt(prior_variance(q, q.key in wide)) / q.scale for q in fit.active])
-    return float(left_over(np.hstack([everything * widths, against]), signature[:, None])[0])
+    J = np.hstack([everything * widths, against])
+    return float(left_over(J, (everything @ departure)[:, None])[0])

@@ -1,4 +1,7 @@
-"""Checks of what a model leaves: is the residual noise, and is the noise of the stated size."""
+"""Residual tests: is what a model leaves noise, and is the noise of the stated size.
+
+In: a problem and whitened residuals. Out: the probabilities of two tests.
+"""
 
 from __future__ import annotations
 
@@ -9,10 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from ctr_dynamics.diagnosis.inference.map_fit import Problem
+from ctr_dynamics.diagnosis.inference.fit_problem import Problem
+from ctr_dynamics.diagnosis.inference.map_fit import Fit
 
 Floats = NDArray[np.float64]
-LAGS = 20  # of the Ljung-Box test: half a second at 40 Hz
 
 
 @dataclass(frozen=True)
@@ -20,7 +23,9 @@ class Whiteness:
     """Tests of whitened residuals against independent unit noise.
 
     Attributes:
-        p: of the more extreme of the two tests, corrected for there being two; power: mean square; p_power, p_correlation: of each test.
+        p: of the more extreme of the two tests, corrected for there being two.
+        power: mean square.
+        p_power, p_correlation: of each test.
     """
 
     p: float
@@ -40,12 +45,13 @@ def by_axis(problem: Problem, whitened: Floats) -> list[Floats]:
     return out
 
 
-def whiteness(problem: Problem, whitened: Floats, free: int) -> Whiteness:
-    """Ljung-Box test over all axes together, and whether the mean square exceeds one; ``free`` parameters have been fitted."""
+def whiteness(problem: Problem, fit: Fit) -> Whiteness:
+    """Ljung-Box test over all axes together, and whether the mean square of what ``fit`` leaves exceeds one."""
+    free = len(fit.active)
     q, dof = 0.0, 0
-    for x in by_axis(problem, whitened):
+    for x in by_axis(problem, fit.whitened):
         n = len(x)
-        lags = min(LAGS, n // 4)
+        lags = min(problem.options.residual_tests.lags, n // 4)
         if lags < 1 or not np.any(x):
             continue
         power = float(x @ x)
@@ -53,25 +59,11 @@ def whiteness(problem: Problem, whitened: Floats, free: int) -> Whiteness:
         q += n * (n + 2) * float(np.sum(r**2 / (n - np.arange(1, lags + 1))))
         dof += lags
     p_correlation = float(chi2.sf(q, max(dof - free // 3, 1))) if dof else 1.0
-    m = max(len(whitened) - free, 1)
-    power = float(whitened @ whitened)
+    m = max(len(fit.whitened) - free, 1)
+    power = float(fit.whitened @ fit.whitened)
     p_power = float(chi2.sf(power, m))
     p = min(1.0, 2.0 * min(p_correlation, p_power))
     return Whiteness(p, power / m, p_power, p_correlation)
-
-
-def block_bootstrap(
-    a: Floats, b: Floats, stamps: Floats, seed: int = 0, length: float = 0.5, draws: int = 2000
-) -> tuple[float, float]:
-    """95 % interval of 1 - sum(b)/sum(a) over blocks of ``length`` s; a, b: squared errors (s,) before and after."""
-    block = np.floor(stamps / length).astype(int)
-    groups = np.unique(block, return_inverse=True)[1]
-    before, after = np.bincount(groups, a), np.bincount(groups, b)
-    rng = np.random.default_rng(seed)
-    picks = rng.integers(0, len(before), (draws, len(before)))
-    ratio = 1.0 - after[picks].sum(axis=1) / np.maximum(before[picks].sum(axis=1), 1e-30)
-    low, high = np.percentile(ratio, [2.5, 97.5])
-    return float(low), float(high)
 
 
 def rms(values: Floats) -> float:

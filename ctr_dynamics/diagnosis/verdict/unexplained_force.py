@@ -1,4 +1,7 @@
-"""What no cause explains, described as a force at the tip: when it acts, along what, how large, how often."""
+"""Unexplained force: what no cause explains, described as a force at the tip.
+
+In: a forward model and the re-calibrated point. Out: when the force acts, along what, how large and how often.
+"""
 
 from __future__ import annotations
 
@@ -9,17 +12,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import lombscargle
 
+from ctr_dynamics.diagnosis.diagnosis_options import UnexplainedForceOptions
 from ctr_dynamics.diagnosis.forward_model import ForwardModel, Point
 from ctr_dynamics.effects import quantities
 
 Floats = NDArray[np.float64]
-FREQUENCIES = np.linspace(0.1, 18.0, 1800)  # Hz: below half of a 40 Hz tracker's rate
-PERIODIC = 0.5  # share of the power in one frequency from which it is named
-STIFF = 0.1  # of the largest compliance: directions below say nothing about a force
 
 
 @dataclass(frozen=True)
-class Unexplained:
+class UnexplainedForce:
     """A force at the tip that would explain what is left, were the robot in equilibrium with it at any time.
 
     Attributes:
@@ -46,7 +47,9 @@ class Unexplained:
         )
 
 
-def unexplained(forward_model: ForwardModel, point: Point) -> Unexplained | None:
+def unexplained_force(
+    forward_model: ForwardModel, point: Point, options: UnexplainedForceOptions
+) -> UnexplainedForce | None:
     """Describe what the model at ``point`` leaves of a recording; None where it cannot be simulated or hardly anything is left.
 
     The tip's compliance is that of a constant force: right below the first resonance, and a description above it.
@@ -55,33 +58,35 @@ def unexplained(forward_model: ForwardModel, point: Point) -> Unexplained | None
     prediction, jacobian = forward_model.jacobian(point, pushes)
     residual = forward_model.residual(prediction)[:, :3]
     stamps = forward_model.recording.stamps
-    good = np.isfinite(residual).all(axis=1) & (stamps >= stamps[0] + 0.5)
-    if prediction.failure or good.sum() < 20:
+    good = np.isfinite(residual).all(axis=1) & (stamps >= stamps[0] + options.start_s)
+    if prediction.failure or good.sum() < options.fewest:
         return None
     compliance = jacobian[good, :3] / np.array([q.scale for q in pushes])
     typical = float(np.median(np.linalg.norm(compliance, axis=(1, 2))))
     if typical == 0.0:
         return None
     # ridge: a robot that is stiff in one direction shows no force there
-    square = np.einsum("kji,kjl->kil", compliance, compliance) + (STIFF * typical) ** 2 * np.eye(3)
+    square = np.einsum("kji,kjl->kil", compliance, compliance) + (options.stiff * typical) ** 2 * np.eye(3)
     force = np.linalg.solve(square, np.einsum("kji,kj->ki", compliance, residual[good])[..., None])[..., 0]
     t = stamps[good]
     power = np.sum(force**2, axis=1)
     total = np.cumsum(power) / power.sum()
     vectors = np.linalg.eigh(force.T @ force)[1]
     direction = vectors[:, -1] * np.sign(vectors[np.argmax(np.abs(vectors[:, -1])), -1])
-    return Unexplained(
+    return UnexplainedForce(
         t,
         force,
         direction,
         math.sqrt(float(power.mean())),
         float(t[np.searchsorted(total, 0.05)]),
         float(t[min(np.searchsorted(total, 0.95), len(t) - 1)]),
-        _frequency(t, force @ direction),
+        _frequency(t, force @ direction, options),
     )
 
 
-def _frequency(t: Floats, x: Floats) -> float | None:
-    spectrum = lombscargle(t, x - x.mean(), 2.0 * np.pi * FREQUENCIES, normalize=True)
+def _frequency(t: Floats, x: Floats, options: UnexplainedForceOptions) -> float | None:
+    """Hz of the frequency that dominates ``x`` (k,) at ``t`` (k,) s; None where none does."""
+    frequencies = np.linspace(options.lowest_hz, options.highest_hz, options.frequencies)
+    spectrum = lombscargle(t, x - x.mean(), 2.0 * np.pi * frequencies, normalize=True)
     best = int(np.argmax(spectrum))
-    return float(FREQUENCIES[best]) if spectrum[best] >= PERIODIC else None
+    return float(frequencies[best]) if spectrum[best] >= options.periodic else None

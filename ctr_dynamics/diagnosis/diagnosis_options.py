@@ -1,0 +1,305 @@
+"""Every number that a diagnosis works with, its unit and the reason for its value; the table of docs/diagnosis_options.md.
+
+One group for each stage, in the order of the stages. The values were chosen on cases of the truth generator with seeds that
+no published figure uses.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field, fields, is_dataclass
+from typing import Any, TypeVar
+
+T = TypeVar("T")
+NOISE = "deviations"  # of the sum of squares that noise alone gives
+LOG = "log evidence"
+FRACTION = "fraction"
+COUNT = "count"
+
+
+def option(value: T, unit: str, reason: str) -> T:
+    """A field with its unit and the reason for its value."""
+    made: T = field(default=value, metadata={"unit": unit, "reason": reason})
+    return made
+
+
+@dataclass(frozen=True)
+class RecordingOptions:
+    """Data: what is used of a bag."""
+
+    shortest_s: float = option(2.0, "s", "joints and tracker together; less shows too little of a vibration")
+    longest_s: float = option(1000.0, "s", "joints that fit into memory with all that is kept of them")
+    gap_s: float = option(0.1, "s", "without joint states; the motion in a longer gap is unknown")
+    settling_s: float = option(0.5, "s", "after a gap; vibration from the unseen motion persists")
+    pause_s: float = option(
+        10.0, "s", "without joint states, or by which the clock was set: another recording"
+    )
+    start_s: float = option(0.1, "s", "of joint states that show whether the robot stands at the start")
+    start_rad: float = option(
+        0.01, "rad", "rotation within the start, beside the encoders' noise, that is rest"
+    )
+    start_m: float = option(2e-4, "m", "translation within the start that is rest")
+    start_noise: float = option(6.0, "deviations", "of the encoders' noise in a peak-to-peak value of rest")
+    unsettled_s: float = option(2.0, "s", "until an unknown initial motion has died away; 1 s leaves 0.3 mm")
+    first_load_s: float = option(0.1, "s", "a first load that comes this early acts from the start")
+
+
+@dataclass(frozen=True)
+class ForwardModelOptions:
+    """Forward model: resolution and differences."""
+
+    nodes: int = option(10, COUNT, "from plate to tip; the error in space is then far below that in time")
+    fine_nodes: int = option(
+        16, COUNT, "for mistaken geometries and for scenarios, whose error is not measured"
+    )
+    dt_s: float = option(0.003, "s", "the estimator's step")
+    difference: float = option(1e-3, "of the scale", "for derivatives of the inputs and of the tracker chain")
+    joint_gap_s: float = option(0.05, "s", "between joint states; straight lines across longer gaps")
+
+
+@dataclass(frozen=True)
+class ConfigurationOptions:
+    """Configuration mistakes: units, signs and orders."""
+
+    gross: float = option(8.0, "noise rms", "misfit below which no mistake is looked for")
+    improvement: float = option(0.25, "of the misfit", "what a mistake may leave when it is undone")
+
+
+@dataclass(frozen=True)
+class CalibrationOptions:
+    """Calibration: maximum a posteriori fits."""
+
+    tolerance_limit: float = option(2.9, "tolerances", "a value farther off is a finding and needs a cause")
+    reach: float = option(
+        4.0, "tolerances", "a large misfit would carry all nuisances away and hide its cause"
+    )
+    inflation: float = option(1.5, "of posterior deviations", "errors of tuning cases were that much larger")
+    iterations: int = option(10, COUNT, "steps of a fit")
+    renewals: int = option(2, COUNT, "exact Jacobians of a fit; Broyden's updates serve between them")
+    settled: float = option(0.05, "cost", "what gains less is not worth a simulation")
+    surprise: tuple[float, ...] = option(
+        (12.0, 6.0, 4.0),
+        "promised gains",
+        "first, second, later steps; a fit that cannot reach its limit so is ended",
+    )
+    damping: tuple[float, ...] = option(
+        (1e2, 1e3, 1e4, 1e5), "prior precisions", "tried in turn where no part of a full step lowers the cost"
+    )
+    backtracking: float = option(0.35, "of the step", "each time it does not lower the cost")
+    parts: int = option(2, COUNT, "lengths of a step that are tried before damping")
+    stale: float = option(0.3, "of the step", "error of a prediction from which the Jacobian may be renewed")
+    travelled: float = option(3.0, "whitened", "sum of these errors from which it is renewed")
+    difference: float = option(
+        0.02, "of the scale", "for columns of shape parameters of an effect that was off"
+    )
+
+
+@dataclass(frozen=True)
+class DiscretisationOptions:
+    """Discretisation error: the solver's own error against finer solutions."""
+
+    deviation: float = option(0.6, "of the difference", "what stays free to vary after the correction")
+    space_limit: float = option(3.0, "whitened", "difference to twice the nodes from which these are used")
+    most_nodes: int = option(40, COUNT, "cost grows with them")
+    renewed: float = option(
+        3.0, "whitened", "change of the correction from which that of another point counts"
+    )
+    shorter: tuple[tuple[float, float], ...] = option(
+        ((0.5, 1.0), (2.0 / 3.0, 1.4), (0.8, 2.2)),
+        "of the step",
+        "shorter steps in the order of trial, each with the factor from its difference to that of half a step",
+    )
+
+
+@dataclass(frozen=True)
+class PriorOptions:
+    """Candidates: probabilities before the data, and where places start."""
+
+    clean: float = option(0.5, "probability", "of no cause")
+    single: float = option(0.38, "probability", "of one cause, shared among the effects")
+    pair: float = option(0.1, "probability", "of two causes")
+    triple: float = option(0.02, "probability", "of three causes")
+    behind_plane: float = option(0.1, FRACTION, "of the positions behind a contact plane to begin with")
+
+
+@dataclass(frozen=True)
+class ScreeningOptions:
+    """Screening: linear evidence of every candidate."""
+
+    finite_size_dt_s: float = option(
+        0.005, "s", "step for finite sizes; their change exceeds its error in time"
+    )
+    least_gain: float = option(1.0, LOG, "below, a candidate is not worth a fit")
+    candidates: int = option(8, COUNT, "that are fitted; the true cause was among them in 87 of 87 cases")
+    spare: int = option(3, COUNT, "more that are looked at, since presets of one effect count once")
+
+
+@dataclass(frozen=True)
+class ContactPlaneOptions:
+    """Contact plane: looked for from the time of divergence on."""
+
+    diverged: float = option(0.3, "of the large residuals", "from there measurement and model have diverged")
+    diverged_noise: float = option(5.0, "noise rms", "the least residual that counts as diverged")
+    first: float = option(2.0, "noise rms", "from there the residual shows the direction of the normal")
+    sudden_s: float = option(0.1, "s", "from there to the divergence; what grows slower is no impact")
+    lead_s: float = option(0.06, "s", "before the divergence that counts in a fit")
+    first_spans_s: tuple[float, ...] = option((0.05, 0.13), "s", "after the divergence, for every start")
+    spans_s: tuple[float, ...] = option((0.25, 0.5, 1.0), "s", "after the divergence, for the best one")
+    stiffnesses: tuple[float, ...] = option((120.0, 400.0), "N/m", "to begin with")
+    factors: tuple[float, ...] = option(
+        (1.0, 0.5, 2.0), "of the stiffness", "starts of fits with all nuisances"
+    )
+    sure: float = option(2e-3, "of the squares", "what leaves no more needs no other start")
+    no_plane: float = option(0.5, "of the squares", "what leaves more in a first span is no plane")
+    explained: float = option(0.9, "of the squares", "that a plane must explain in a span")
+    depth_m: float = option(2e-3, "m", "of the tip behind the plane where it is noticed first")
+    evaluations: int = option(12, COUNT, "derivatives of the residual for a span")
+
+
+@dataclass(frozen=True)
+class SearchOptions:
+    """Hypothesis search: which sets of causes are fitted."""
+
+    batch: int = option(
+        2, COUNT, "first fits, which others must be able to beat; fixed, whatever the workers"
+    )
+    give_up: float = option(8.0, "deviations", "of the cost above the best one's at which a fit is given up")
+    enough: float = option(2.0, "times the noise", "what leaves no more ends the trial of other sizes")
+    nearby_sizes: tuple[float, float] = option(
+        (0.5, 1.7), "of a finite size", "where the best one is looked for"
+    )
+    nearby_evaluations: int = option(12, COUNT, "simulations of that search")
+    nearby_accuracy: float = option(0.01, "of a finite size", "of that search")
+    large_misfit: float = option(80.0, NOISE, "from which large sizes and a contact plane are tried")
+    little_left: float = option(2.0, NOISE, "what leaves no more makes these trials needless")
+    much_left: float = option(4.0, NOISE, "from which more hypotheses are tried")
+    poor_fit: float = option(0.3, "of the misfit", "two causes that leave more are not made right by a third")
+    acceptable: float = option(1.5, "times the noise", "squares; a hypothesis that leaves more is not right")
+    further_gain: float = option(5.0, LOG, "that a further cause must add")
+    further_slack: float = option(2.0, LOG, "by which the linear estimate of that may be wrong")
+    further: int = option(4, COUNT, "further causes that are fitted beside a leader")
+    leaders: int = option(2, COUNT, "single causes beside which others are looked for")
+    leader_margin: float = option(3.0, LOG, "to the best single cause")
+    leader_margin_poor: float = option(20.0, LOG, "the same where the best one leaves much")
+    pair_effects: int = option(5, COUNT, "that leave least by themselves, whose pairs are all fitted")
+    contenders: int = option(3, COUNT, "hypotheses that are fitted again with exact Jacobians")
+    contender_margin: float = option(6.0, LOG, "to the best one within which they may be")
+    alternative_distance: float = option(12.0, "whitened", "separation within which an alternative is fitted")
+    alternative_likeness: float = option(
+        0.12, "of the size", "separation within which shapes are alike: large effects are not linear enough"
+    )
+    alternatives: int = option(3, COUNT, "for each cause, and for each two")
+    pair_rankings: int = option(6, COUNT, "best pairs by linear evidence that are fitted in a round")
+    pair_margin: float = option(6.0, LOG, "by which such a pair may look worse than the best hypothesis")
+    pair_nonlinear: float = option(
+        0.01, "of the explained misfit", "more of it, since columns hold nearby only"
+    )
+    rounds: int = option(3, COUNT, "of alternatives and pairs, each from a new best hypothesis")
+    time_error: float = option(
+        5.0, "times the squares", "of the error in time within which a rest may be that"
+    )
+    left: float = option(0.03, "of the misfit", "that a hypothesis may leave")
+    left_impacts: float = option(0.15, "of the misfit", "the same where the error in time is as large")
+    early_s: float = option(1.0, "s", "after divergence, to which causes with impacts are fitted first")
+    early_spans_s: tuple[float, ...] = option((2.0, 4.0), "s", "after it, before the whole recording")
+    early_leaders: int = option(2, COUNT, "early hypotheses that are fitted to longer spans")
+
+
+@dataclass(frozen=True)
+class EvidenceOptions:
+    """Evidence: from fits to probabilities."""
+
+    temperature: float = option(1.6, "1", "divides log evidence; a judgement against overconfidence")
+    predictions: int = option(8, COUNT, "likeliest hypotheses that predict the validation bags")
+    outvoted: float = option(100.0, LOG, "of fitted bags that no prediction as good as the noise makes good")
+    set_probability: float = option(0.95, "probability", "that the listed sets of causes hold together")
+
+
+@dataclass(frozen=True)
+class ResidualTestOptions:
+    """Residual tests: whether what is left is noise."""
+
+    lags: int = option(20, COUNT, "of the Ljung-Box test: half a second at 40 Hz")
+    noise_p: float = option(1e-4, "probability", "below which what is left is not noise")
+
+
+@dataclass(frozen=True)
+class ValidationOptions:
+    """Validation: bags that were not fitted."""
+
+    block_s: float = option(0.5, "s", "of the bootstrap; longer than a period of the first mode")
+    draws: int = option(2000, COUNT, "of the bootstrap")
+    predicted: float = option(1.15, "NIS / dof", "up to which a bag is predicted down to the noise")
+    left: float = option(0.2, "of the misfit", "there that may be left of it")
+
+
+@dataclass(frozen=True)
+class VerdictOptions:
+    """Verdict: what is named."""
+
+    named: float = option(0.9, "probability", "from which causes are named")
+    needed_gain: float = option(4.0, LOG, "priors included, that causes must gain over fewer or none")
+    separation: float = option(5.0, "whitened", "sensitivities that are nearer cannot be told apart")
+    separation_fitted: float = option(
+        3.0, "deviations", "the same between fits: root of the difference of costs"
+    )
+    observable: float = option(3.0, "whitened", "size of a sensitivity at prior scale that a bag can see")
+    strong: float = option(24.0, "whitened", "size that can be told from most others")
+    excited: float = option(0.2, "of the effects", "that a bag must show strongly")
+    mistake: float = option(0.97, "probability", "of a configuration mistake that explains nearly all")
+    unknown: float = option(0.95, "probability", "of a cause outside the catalogue when nothing fits")
+    beside_unknown: float = option(0.05, "probability", "that the likeliest sets of causes share with that")
+    unknown_beside: float = option(0.6, "probability", "of one beside causes that are named")
+
+
+@dataclass(frozen=True)
+class UnexplainedForceOptions:
+    """Unexplained force: description of what no cause explains."""
+
+    start_s: float = option(0.5, "s", "at the beginning that is left out")
+    fewest: int = option(20, COUNT, "poses below which nothing is described")
+    stiff: float = option(0.1, "of the compliance", "directions below say nothing about a force")
+    lowest_hz: float = option(0.1, "Hz", "of the periodogram")
+    highest_hz: float = option(18.0, "Hz", "below half of a 40 Hz tracker's rate")
+    frequencies: int = option(1800, COUNT, "of the periodogram, 0.01 Hz apart")
+    periodic: float = option(0.5, "of the power", "in one frequency from which it is stated")
+
+
+@dataclass(frozen=True)
+class ReportOptions:
+    """Output: what is said and shown."""
+
+    numerics_limit: float = option(0.2, "noise rms", "discretisation error that is within the noise")
+    shown: int = option(12, COUNT, "hypotheses in figures and tables of the report")
+
+
+@dataclass(frozen=True)
+class DiagnosisOptions:
+    """All groups, in the order of the stages."""
+
+    recording: RecordingOptions = RecordingOptions()
+    forward_model: ForwardModelOptions = ForwardModelOptions()
+    configuration: ConfigurationOptions = ConfigurationOptions()
+    calibration: CalibrationOptions = CalibrationOptions()
+    discretisation: DiscretisationOptions = DiscretisationOptions()
+    prior: PriorOptions = PriorOptions()
+    screening: ScreeningOptions = ScreeningOptions()
+    contact_plane: ContactPlaneOptions = ContactPlaneOptions()
+    search: SearchOptions = SearchOptions()
+    evidence: EvidenceOptions = EvidenceOptions()
+    residual_tests: ResidualTestOptions = ResidualTestOptions()
+    validation: ValidationOptions = ValidationOptions()
+    verdict: VerdictOptions = VerdictOptions()
+    unexplained_force: UnexplainedForceOptions = UnexplainedForceOptions()
+    report: ReportOptions = ReportOptions()
+
+
+def rows(options: Any = None, prefix: str = "") -> Iterator[tuple[str, Any, str, str]]:
+    """(name, value, unit, reason) of every option, ``group.name``."""
+    options = DiagnosisOptions() if options is None else options
+    for f in fields(options):
+        value = getattr(options, f.name)
+        if is_dataclass(value):
+            yield from rows(value, f"{prefix}{f.name}.")
+        else:
+            yield f"{prefix}{f.name}", value, f.metadata["unit"], f.metadata["reason"]

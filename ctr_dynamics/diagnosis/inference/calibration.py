@@ -1,0 +1,39 @@
+"""Calibration: nuisances fitted inside their tolerances, with no cause, and the discretisation error there.
+
+In: a problem. Out: the re-calibrated fit, against which every gain counts, and the size of the discretisation error.
+"""
+
+from __future__ import annotations
+
+from ctr_dynamics.diagnosis.inference.discretisation_error import correct_discretisation
+from ctr_dynamics.diagnosis.inference.fit_problem import Local, Problem
+from ctr_dynamics.diagnosis.inference.map_fit import Fit, fit
+from ctr_dynamics.diagnosis.run_context import RunContext
+from ctr_dynamics.effects import EFFECTS, Quantity, quantities
+from ctr_dynamics.errors import InputError
+from ctr_dynamics.robot import Robot
+
+
+def nuisances_of(robot: Robot) -> list[Quantity]:
+    """Quantities of ``robot`` with a tolerance, without those that are free beside one effect only."""
+    forms = {name for effect in EFFECTS.values() for name in effect.form}
+    return [q for q in quantities(robot) if q.tolerance > 0.0 and q.effect not in forms]
+
+
+def calibrate(problem: Problem, context: RunContext) -> tuple[Fit, dict[str, float]]:
+    """Fit the nuisances, correct ``problem`` for its discretisation error at the fit, and fit again.
+
+    Raises:
+        InputError: no simulation succeeds.
+    """
+    context.report("re-calibration inside tolerance")
+    first = fit(problem, (), {}, polish=False)
+    if first is None:
+        raise InputError(
+            "the model cannot be simulated near the nominal robot", do="check the robot file and the bag"
+        )
+    context.report("discretisation error")
+    numerics = correct_discretisation(problem, first.point, context)
+    here = problem.residual(first.point)
+    known = None if here is None else Local(here, first.by_key)
+    return fit(problem, (), first.point, known) or first, numerics

@@ -1,0 +1,150 @@
+"""Evidence: from fitted hypotheses to probabilities.
+
+In: hypotheses, and bags that were not fitted, if any. Out: the hypotheses in order of their posterior, with probabilities. Laplace evidence
+with priors on causes and sizes, tempered against overconfidence, plus the log likelihood of what a hypothesis predicts of the bags that were
+not fitted.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from joblib import delayed
+from numpy.typing import NDArray
+
+from ctr_dynamics.diagnosis.diagnosis_options import DiagnosisOptions
+from ctr_dynamics.diagnosis.inference.candidates import Candidate, log_prior
+from ctr_dynamics.diagnosis.inference.fit_problem import Key, Problem
+from ctr_dynamics.diagnosis.inference.gaussian_posterior import posterior
+from ctr_dynamics.diagnosis.inference.hypotheses import Hypothesis, fit_exactly
+from ctr_dynamics.diagnosis.inference.map_fit import Fit
+from ctr_dynamics.diagnosis.inference.screening import Screened
+from ctr_dynamics.diagnosis.inference.sensitivities import Sensitivities
+from ctr_dynamics.diagnosis.run_context import RunContext
+
+Floats = NDArray[np.float64]
+IMPOSSIBLE = -1e9  # log likelihood of bags that a hypothesis cannot simulate
+
+
+@dataclass
+class WeighedHypotheses:
+    """Outcome of a hypothesis search.
+
+    Attributes:
+        hypotheses: all that were fitted, likeliest first; the one without causes is among them.
+        probabilities: of each.
+        no_cause: the hypothesis without causes.
+        sensitivities: at the re-calibrated point. screened: what candidates gain there by the linear estimate.
+        pool: all candidates, with the contact plane that was found.
+        at_best: sensitivities at the likeliest hypothesis; None where there was no need of them.
+    """
+
+    hypotheses: list[Hypothesis]
+    probabilities: Floats
+    no_cause: Hypothesis
+    sensitivities: Sensitivities
+    screened: list[Screened]
+    pool: list[Candidate]
+    at_best: Sensitivities | None = None
+
+    @property
+    def best(self) -> Hypothesis:
+        """The likeliest."""
+        return self.hypotheses[0]
+
+    def cause_sets(self, options: DiagnosisOptions) -> list[tuple[tuple[str, ...], float]]:
+        """Sets of effects with their probabilities, likeliest first, as few as hold the probability of the options."""
+        total: dict[tuple[str, ...], float] = {}
+        for e, p in zip(self.hypotheses, self.probabilities, strict=True):
+            total[e.effects] = total.get(e.effects, 0.0) + float(p)
+        out, held = [], 0.0
+        for effects, p in sorted(total.items(), key=lambda item: -item[1]):
+            out.append((effects, p))
+            held += p
+            if held >= options.evidence.set_probability:
+                break
+        return out
+
+    def probability_of(self, effect: str) -> float:
+        """Sum of the probabilities of all hypotheses that hold ``effect``."""
+        return float(
+            sum(p for e, p in zip(self.hypotheses, self.probabilities, strict=True) if effect in e.effects)
+        )
+
+
+def weigh(found: list[Hypothesis], pool: Sequence[Candidate], options: DiagnosisOptions) -> None:
+    """Sort by log posterior; the better of two fits of the same set stays."""
+    best: dict[frozenset[Key], Hypothesis] = {}
+    for e, evidence in zip(found, _evidence(found), strict=True):
+        prior = log_prior(e.members, pool, options.prior)
+        e.score, e.fitted_score = evidence + prior, e.fit.log_evidence + prior
+        if e.keys not in best or best[e.keys].score < e.score:
+            best[e.keys] = e
+    found[:] = sorted(best.values(), key=lambda e: -e.score)
+
+
+def probabilities(found: Sequence[Hypothesis], problem: Problem) -> Floats:
+    """Of each hypothesis, likeliest first: softmax of the tempered score, with the noise that the best one leaves."""
+    inflation = max(1.0, found[0].fit.chi2 / problem.size)
+    evidence = np.array(_evidence(found))
+    prior = np.array([e.score for e in found]) - evidence
+    scores = evidence / (problem.options.evidence.temperature * inflation) + prior
+    weights = np.exp(scores - scores.max())
+    return weights / weights.sum()
+
+
+def _evidence(found: Sequence[Hypothesis]) -> list[float]:
+    """Log evidence of each with that of its prediction; a hypothesis that was not asked predicts no better than the worst."""
+    worst = min((e.predicted for e in found if e.predicted is not None), default=0.0)
+    return [e.fit.log_evidence + (worst if e.predicted is None else e.predicted) for e in found]
+
+
+def weigh_by_prediction(
+    found: WeighedHypotheses, problem: Problem, held_out: Problem, context: RunContext
+) -> None:
+    """Let the likeliest hypotheses predict ``held_out``, recordings that were not fitted, and weigh them by both.
+
+    What imitates a cause in one motion does not in another. Hypotheses that are farther behind than a prediction down to the noise would
+    make good are not asked.
+    """
+    o, contenders = problem.options.evidence, problem.options.search.contenders
+    every, first = found.hypotheses, found.best
+
+    def ask(those: Sequence[Hypothesis]) -> None:
+        new = [e for e in those if e.predicted is None]
+        answers = context.run(delayed(log_prediction)(held_out, e.fit) for e in new)
+        for e, answer in zip(new, answers, strict=True):
+            e.predicted = answer
+
+    for turn in range(contenders + 1):  # an exact fit of one may put another first
+        best = every[0]
+        ask([best, found.no_cause])
+        assert best.predicted is not None
+        room = o.outvoted + max(0.0, -0.5 * held_out.size - best.predicted)
+        ask([e for e in every[: o.predictions] if e.members and e.fitted_score > best.fitted_score - room])
+        weigh(every, found.pool, problem.options)
+        if not every[0].members or every[0].exact or turn == contenders:
+            break
+        fit_exactly(problem, every[0])
+        every[0].predicted = None
+    if every[0] is not first:
+        found.at_best = None
+    found.probabilities = probabilities(every, problem)
+
+
+def log_prediction(held_out: Problem, result: Fit) -> float:
+    """Log likelihood of ``held_out``, up to a constant, with the posterior of ``result``: what fitted bags leave open is no wrong prediction.
+
+    By half the step where that can be simulated: fits are corrected for their error in time as well.
+    """
+    found = held_out.finer.linearise(result.point, result.active)
+    found = found or held_out.linearise(result.point, result.active)
+    if found is None:
+        return IMPOSSIBLE
+    residual, columns = found
+    size, axes = np.linalg.eigh(result.covariance)
+    free = columns @ (axes * np.sqrt(np.maximum(size, 0.0)))  # by coefficients of unit deviation
+    _, _, evidence = posterior(residual, free, np.zeros(len(size)), np.ones(len(size)), held_out.numerics)
+    return evidence

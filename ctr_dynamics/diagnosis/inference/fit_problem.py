@@ -1,0 +1,131 @@
+"""Recordings of one robot, prepared for fits: in, recordings and a robot; out, whitened residuals and their derivatives."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ctr_dynamics.diagnosis.diagnosis_options import DiagnosisOptions
+from ctr_dynamics.diagnosis.forward_model import ForwardModel
+from ctr_dynamics.diagnosis.recording import Recording
+from ctr_dynamics.diagnosis.whitening import Whitener
+from ctr_dynamics.effects import Quantity
+from ctr_dynamics.errors import InputError
+from ctr_dynamics.robot import Robot
+
+Floats = NDArray[np.float64]
+Key = tuple[str, str]
+"""Effect and name of a quantity."""
+
+
+@dataclass(frozen=True)
+class Local:
+    """The model around one point: whitened residual (m,), and derivatives (m,) of the prediction by coordinates."""
+
+    residual: Floats
+    columns: Mapping[Key, Floats]
+
+
+@dataclass
+class Problem:
+    """Recordings of one robot, prepared for fits; m is the number of whitened values.
+
+    Attributes:
+        forward_models, whiteners: one for each recording.
+        nuisances: quantities with a tolerance.
+        numerics: (m, d) whitened directions of the discretisation error.
+        offset: (m,) whitened correction of the residual towards the finer solution.
+        reach: tolerances by which fits move a nuisance at most.
+        options: numbers of all stages.
+    """
+
+    robot: Robot
+    forward_models: list[ForwardModel]
+    whiteners: list[Whitener]
+    nuisances: tuple[Quantity, ...]
+    numerics: Floats
+    offset: Floats
+    reach: float
+    options: DiagnosisOptions
+
+    @property
+    def size(self) -> int:
+        """Number of whitened values."""
+        return sum(w.size for w in self.whiteners)
+
+    def with_step(self, dt: float) -> Problem:
+        """The same with another time step (s)."""
+        return replace(self, forward_models=[e.resolved(e.nodes, dt) for e in self.forward_models])
+
+    @property
+    def finer(self) -> Problem:
+        """The same with half the time step."""
+        return self.with_step(0.5 * self.forward_models[0].scheme.dt)
+
+    def residual(self, point: Mapping[Key, float]) -> Floats | None:
+        """(m,) whitened residual at ``point``; None where a simulation fails."""
+        parts = []
+        for forward_model, whiten in zip(self.forward_models, self.whiteners, strict=True):
+            left = forward_model.residual_at(point)
+            if left is None:
+                return None
+            parts.append(whiten(left))
+        return np.concatenate(parts) - self.offset
+
+    def linearise(
+        self, point: Mapping[Key, float], wanted: Sequence[Quantity]
+    ) -> tuple[Floats, Floats] | None:
+        """Whitened residual (m,) at ``point`` and derivatives (m, len(wanted)) of the prediction, each by its coordinate."""
+        residuals, columns = [], []
+        for forward_model, whiten in zip(self.forward_models, self.whiteners, strict=True):
+            try:
+                prediction, jacobian = forward_model.jacobian(point, wanted)
+            except InputError:
+                return None
+            if prediction.failure:
+                return None
+            residuals.append(whiten(forward_model.residual(prediction)))
+            columns.append(whiten(jacobian))
+        scale = np.array([q.scale for q in wanted])
+        return np.concatenate(residuals) - self.offset, np.concatenate(columns) / scale
+
+    def residuals(self, point: Mapping[Key, float]) -> list[Floats]:
+        """Residuals (s, 6) in m and rad of every recording at ``point``, NaN after the end of a simulation that fails."""
+        return [e.residual(e.predict(point)) for e in self.forward_models]
+
+
+def make_problem(
+    robot: Robot,
+    recordings: Sequence[Recording],
+    nuisances: Sequence[Quantity],
+    mask: NDArray[np.bool_],
+    nodes: int | None = None,
+    options: DiagnosisOptions | None = None,
+) -> Problem:
+    """Problem of ``recordings``.
+
+    Args:
+        nuisances: quantities that may move inside their tolerances.
+        mask: (6,) axes that count: position, then rotation. Poses that are not finite are left out.
+        nodes: of the mesh, where not those of ``options``.
+    """
+    options = options or DiagnosisOptions()
+    forward_models = [ForwardModel(r, robot, nodes or options.forward_model.nodes) for r in recordings]
+    whiteners = []
+    for r in recordings:
+        used = np.isfinite(r.position).all(axis=1) & (r.stamps >= 0.0)
+        whiteners.append(Whitener(robot, r.stamps, mask, used))
+    size = sum(w.size for w in whiteners)
+    return Problem(
+        robot,
+        forward_models,
+        whiteners,
+        tuple(nuisances),
+        np.zeros((size, 0)),
+        np.zeros(size),
+        options.calibration.reach,
+        options,
+    )

@@ -1,0 +1,94 @@
+"""Bayes' rule for linear models with Gaussian noise and priors; numerics directions are free beside the parameters.
+
+The model is y = J d + N e + noise of unit variance. d are departures from the values of the robot file, with variances as priors; e are
+sizes of the discretisation error with unit prior variance.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import log_ndtr
+
+from ctr_dynamics.effects import Quantity
+
+Floats = NDArray[np.float64]
+Key = tuple[str, str]
+
+
+def prior_variance(quantity: Quantity, cause: bool) -> float:
+    """Of a coordinate: tolerance^2, plus scale^2 where it may be a cause."""
+    return quantity.tolerance**2 + (quantity.scale**2 if cause else 0.0)
+
+
+def variances(
+    nuisances: Sequence[Quantity], causes: Sequence[Quantity]
+) -> tuple[tuple[Quantity, ...], Floats]:
+    """Free quantities and their prior variances: nuisances, then causes that are none."""
+    active = list(nuisances)
+    names = {q.key for q in nuisances}
+    active += [q for q in causes if q.key not in names]
+    wide = {q.key for q in causes}
+    return tuple(active), np.array([prior_variance(q, q.key in wide) for q in active])
+
+
+def posterior(
+    residual: Floats, columns: Floats, departure: Floats, variance: Floats, numerics: Floats
+) -> tuple[Floats, Floats, float]:
+    """One linear step: new departures (a,), their covariance (a, a), and the log evidence.
+
+    Args:
+        residual: (m,) whitened, at the present ``departure`` (a,).
+        columns: (m, a) derivatives of the prediction.
+        variance: (a,) of the priors.
+        numerics: (m, d).
+    """
+    count = len(variance)
+    J = np.hstack([columns, numerics])
+    prior = np.concatenate([variance, np.ones(J.shape[1] - count)])
+    target = residual + columns @ departure
+    root = np.sqrt(prior)
+    A = J * root
+    information = np.eye(J.shape[1]) + A.T @ A
+    factor = np.linalg.cholesky(information)
+    rhs = A.T @ target
+    z = np.linalg.solve(factor.T, np.linalg.solve(factor, rhs))
+    log_evidence = -0.5 * float(target @ target - rhs @ z) - float(np.log(np.diag(factor)).sum())
+    inverse = np.linalg.inv(information)
+    covariance = (root[:, None] * inverse * root)[:count, :count]
+    return (root * z)[:count], covariance, log_evidence
+
+
+def cost(residual: Floats, departure: Floats, variance: Floats, numerics: Floats) -> float:
+    """Twice the negative log posterior, with the numerics directions at their best."""
+    rhs = numerics.T @ residual
+    free = float(rhs @ np.linalg.solve(np.eye(numerics.shape[1]) + numerics.T @ numerics, rhs))
+    return float(residual @ residual) - free + float(np.sum(departure**2 / variance))
+
+
+def numerics_part(residual: Floats, numerics: Floats) -> Floats:
+    """(m,) part of a residual that the numerics directions explain at their best."""
+    return numerics @ np.linalg.solve(
+        np.eye(numerics.shape[1]) + numerics.T @ numerics, numerics.T @ residual
+    )
+
+
+def within_tolerance(
+    active: Sequence[Quantity], causes: set[Key], departure: Floats, covariance: Floats, limit: float
+) -> float:
+    """Log probability that the nuisances lie within ``limit`` tolerances, over that before the data.
+
+    A tolerance is the deviation of normal errors; what lies far outside is no error of tolerance, however little it adds to the evidence.
+    """
+    total, before = 0.0, float(log_ndtr(limit))
+    for i, q in enumerate(active):
+        if q.key in causes or q.tolerance <= 0.0:
+            continue
+        sigma = math.sqrt(max(covariance[i, i], 0.0)) / q.tolerance + 1e-9
+        z = departure[i] / q.tolerance
+        tail = log_ndtr((limit - z) / sigma) if z > 0.0 else log_ndtr((limit + z) / sigma)
+        total += float(tail) - before
+    return total

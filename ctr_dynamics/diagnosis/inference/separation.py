@@ -1,0 +1,67 @@
+"""Separation: how much of a sensitivity is left after everything that could do the same has been projected out.
+
+In: a fit and sensitivities there. Out: sizes in whitened units, in which noise has a deviation of one.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ctr_dynamics.diagnosis.inference.candidates import Candidate, keys_of
+from ctr_dynamics.diagnosis.inference.fit_problem import Problem
+from ctr_dynamics.diagnosis.inference.gaussian_posterior import prior_variance
+from ctr_dynamics.diagnosis.inference.map_fit import Fit
+from ctr_dynamics.diagnosis.inference.sensitivities import Sensitivities
+
+Floats = NDArray[np.float64]
+
+
+def separation(
+    problem: Problem,
+    fit: Fit,
+    members: Sequence[Candidate],
+    rival: Candidate | None,
+    sensitivities: Sensitivities,
+) -> float:
+    """d_sep of a cause, or of several together: the whitened size of what they do beside nuisances, other causes and the rival."""
+    own = {q.key for c in members for q in c.quantities}
+    gone = keys_of(members)
+    departure = np.array(
+        [v - q.off if q.key in own else 0.0 for q, v in zip(fit.active, fit.values, strict=True)]
+    )
+    wide = {q.key for q in fit.causes}
+    parts = [
+        fit.columns[:, i] * math.sqrt(prior_variance(q, q.key in wide))
+        for i, q in enumerate(fit.active)
+        if q.key not in gone
+    ]
+    if rival is not None and rival in sensitivities.by_candidate:
+        parts += [sensitivities.by_candidate[rival][:, k] * q.scale for k, q in enumerate(rival.quantities)]
+    J = np.hstack([np.stack(parts, axis=1), problem.numerics])
+    return float(left_over(J, (fit.columns @ departure)[:, None])[0])
+
+
+def observable_sizes(problem: Problem, sensitivities: Sensitivities) -> dict[str, float]:
+    """Whitened size of every effect's strongest sensitivity at its prior scale, nuisances projected out."""
+    J = np.hstack(
+        [
+            np.stack([sensitivities.columns[q.key] * q.tolerance for q in problem.nuisances], axis=1),
+            problem.numerics,
+        ]
+    )
+    sizes: dict[str, float] = {}
+    for c, sensitivity in sensitivities.by_candidate.items():
+        size = left_over(J, sensitivity * [q.scale for q in c.quantities])[0]
+        sizes[c.effect] = max(float(size), sizes.get(c.effect, 0.0))
+    return sizes
+
+
+def left_over(J: Floats, sensitivity: Floats) -> Floats:
+    """Sizes, largest first, of what columns ``J`` (m, a) with coefficients of unit prior deviation leave of ``sensitivity`` (m, k)."""
+    half = np.linalg.solve(np.linalg.cholesky(np.eye(J.shape[1]) + J.T @ J), J.T @ sensitivity)
+    squares = np.linalg.eigvalsh(sensitivity.T @ sensitivity - half.T @ half)[::-1]
+    return np.sqrt(np.maximum(squares, 0.0))
