@@ -8,6 +8,7 @@ import os
 import sys
 import warnings
 from collections.abc import Callable, Sequence
+from dataclasses import is_dataclass
 from importlib import import_module
 from importlib.util import find_spec
 from keyword import iskeyword
@@ -57,10 +58,12 @@ def fail(message: str) -> None:
 
 
 def _with_exit_code(command: Callable[..., Any]) -> Callable[..., None]:
+    options = _options(command)
+
     @functools.wraps(command)
     def run(*args: Any, **kwargs: Any) -> None:
         try:
-            code = command(*args, **kwargs)
+            code = command(options(*args, **kwargs)) if options is not None else command(*args, **kwargs)
         except InputError as error:
             fail(str(error))
             raise typer.Exit(BAD_INPUT) from None
@@ -77,9 +80,21 @@ def _with_exit_code(command: Callable[..., Any]) -> Callable[..., None]:
             raise typer.Exit(int(code))
 
     # typer reads annotations through the signature, and strings in them need the command's own module.
-    run.__signature__ = inspect.signature(command, eval_str=True)  # type: ignore[attr-defined]
-    run.__annotations__ = inspect.get_annotations(command, eval_str=True)
+    signature = _signature(command)
+    run.__signature__ = signature  # type: ignore[attr-defined]
+    run.__annotations__ = {name: p.annotation for name, p in signature.parameters.items()}
     return run
+
+
+def _options(command: Callable[..., Any]) -> type | None:
+    """The data class whose fields are a command's options; None where the options are its arguments."""
+    kinds = [p.annotation for p in inspect.signature(command, eval_str=True).parameters.values()]
+    return kinds[0] if len(kinds) == 1 and isinstance(kinds[0], type) and is_dataclass(kinds[0]) else None
+
+
+def _signature(command: Callable[..., Any]) -> inspect.Signature:
+    """What typer is to read: the command's arguments, or the fields of its data class of options."""
+    return inspect.signature(_options(command) or command, eval_str=True)
 
 
 def _not_imported() -> None:

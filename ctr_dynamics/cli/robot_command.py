@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import sys
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -34,8 +35,11 @@ _ASKED: dict[str, tuple[str, bool, str, str]] = {
 }
 
 
-def new(
-    file: Annotated[Path, typer.Argument(metavar="FILE.yaml", help="Robot file to write.")],
+@dataclass(frozen=True)
+class NewOptions:
+    """Options of `robot new`."""
+
+    file: Annotated[Path, typer.Argument(metavar="FILE.yaml", help="Robot file to write.")]
     tube: Annotated[
         list[str] | None,
         typer.Option(
@@ -44,55 +48,55 @@ def new(
             help="One tube, innermost first: 'name=inner, od=1.244mm, id=1.028mm, straight=301mm, curved=97.1mm, "
             "radius=109mm+-2%, E=52GPa+-5%, density=6.45g/cm^3'.",
         ),
-    ] = None,
+    ] = None
     name: Annotated[
         str, typer.Option("--name", metavar="NAME", help="Name of the robot; default: the file's.")
-    ] = "",
+    ] = ""
     gravity: Annotated[
         str, typer.Option("--gravity", metavar="AXIS", help="Where weight points: -y, +x, ..")
-    ] = "-y",
+    ] = "-y"
     tip_mass: Annotated[
         str, typer.Option("--tip-mass", metavar="MASS", help="Body at the tip: '8 g +- 0.1 g'.")
-    ] = "",
+    ] = ""
     tip_diameter: Annotated[
         str, typer.Option("--tip-diameter", metavar="LENGTH", help="Of that body, a sphere.")
-    ] = "",
-    beta: Annotated[
-        str, typer.Option("--beta", metavar="LIST", help="Rest positions: '-252mm, -198mm'.")
-    ] = "",
-    alpha: Annotated[str, typer.Option("--alpha", metavar="LIST", help="Rest angles: '90deg, 90deg'.")] = "",
+    ] = ""
+    beta: Annotated[str, typer.Option("--beta", metavar="LIST", help="Rest positions: '-252mm, -198mm'.")] = (
+        ""
+    )
+    alpha: Annotated[str, typer.Option("--alpha", metavar="LIST", help="Rest angles: '90deg, 90deg'.")] = ""
     position_noise: Annotated[
         str, typer.Option("--position-noise", metavar="LENGTH", help="Tracker noise, one sigma per axis.")
-    ] = "",
+    ] = ""
     rotation_noise: Annotated[
         str, typer.Option("--rotation-noise", metavar="ANGLE", help="Its rotation noise, one sigma per axis.")
-    ] = "",
+    ] = ""
     delay: Annotated[
         str,
         typer.Option(
             "--delay", metavar="TIME", help="How much older than its stamp a pose is: '18 ms +- 2 ms'."
         ),
-    ] = "",
+    ] = ""
     lever_arm: Annotated[
         str,
         typer.Option("--lever-arm", metavar="LIST", help="Sensor in the tip frame: '0mm, 2mm+-0.5mm, -5mm'."),
-    ] = "",
-    force: Annotated[bool, typer.Option("--force", help="Write over an existing file.")] = False,
-) -> int:
+    ] = ""
+    force: Annotated[bool, typer.Option("--force", help="Write over an existing file.")] = False
+
+
+def new(options: NewOptions) -> int:
     """Write a robot file from tube data sheets.
 
     Without --tube every value is asked for. Units stand behind the numbers; '+- 2 %' or '+- 0.01 mm' is one
     standard deviation.
     """
-    if file.exists() and not force:
+    file = options.file
+    if file.exists() and not options.force:
         raise InputError("the file exists", do="give another name, or --force", where=str(file))
-    given = {
-        "tip_mass": tip_mass, "tip_diameter": tip_diameter, "beta": beta, "alpha": alpha, "position_noise": position_noise,
-        "rotation_noise": rotation_noise, "delay": delay, "lever_arm": lever_arm,
-    }  # fmt: skip
+    given: dict[str, str] = {key: getattr(options, key) for key in _ASKED}
     tubes: list[tuple[str, dict[str, sheets.Measured]]]
-    if tube:
-        tubes = [sheets.tube_from_text(text, number) for number, text in enumerate(tube, 1)]
+    if options.tube:
+        tubes = [sheets.tube_from_text(text, number) for number, text in enumerate(options.tube, 1)]
     else:
         try:
             tubes = _ask_tubes()
@@ -105,7 +109,9 @@ def new(
             unit, several, _, _ = _ASKED[key]
             read = sheets.measures if several else sheets.measured
             values[key] = read(text, unit, f"--{key.replace('_', '-')}")
-    sheet = dataclasses.replace(sheets.Sheet(name or file.stem, tuple(tubes), gravity), **values)
+    sheet = dataclasses.replace(
+        sheets.Sheet(options.name or file.stem, tuple(tubes), options.gravity), **values
+    )
     robot = sheets.robot_from_sheet(sheet)
     with atomic_file(file) as temporary:
         temporary.write_text(sheets.robot_file_text(robot, sheets.ASSUMED), encoding="utf-8")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -111,18 +112,21 @@ def _figures(
     }
 
 
-def snap(
+@dataclass(frozen=True)
+class SnapOptions:
+    """Options of the command."""
+
     robot: Annotated[
         str, typer.Option("--robot", metavar="NAME_OR_FILE", help="A shipped robot or a robot file.")
-    ],
+    ]
     output: Annotated[
         Path, typer.Option("--output", metavar="DIR", help="Folder for tables, plots and the bag.")
-    ],
-    dt: Annotated[float, typer.Option("--dt", metavar="S", help="Time step.")] = 1e-5,
-    duration: Annotated[float, typer.Option("--duration", metavar="S", help="Length of the motion.")] = 12e-3,
+    ]
+    dt: Annotated[float, typer.Option("--dt", metavar="S", help="Time step.")] = 1e-5
+    duration: Annotated[float, typer.Option("--duration", metavar="S", help="Length of the motion.")] = 12e-3
     refine: Annotated[
         int, typer.Option("--refine", metavar="N", help="Multiply the cells of every section.")
-    ] = 1,
+    ] = 1
     values: Annotated[
         list[str] | None,
         typer.Option(
@@ -130,7 +134,7 @@ def snap(
             metavar="NAME=VALUE",
             help="tube_coulomb, tube_viscous, epsilon, beta1, or a number of the robot file such as tubes[0].youngs_modulus; may be repeated.",
         ),
-    ] = None,
+    ] = None
     start: Annotated[
         float | None,
         typer.Option(
@@ -138,18 +142,18 @@ def snap(
             metavar="RAD",
             help="theta_b at t = 0; default: the robot's rest, or just before the snap.",
         ),
-    ] = None,
-    rate: Annotated[float, typer.Option("--rate", metavar="RAD/S", help="Rate of theta_b.")] = 10.0,
-    scheme: Annotated[
-        str, typer.Option("--scheme", help="bdf2, bdf_alpha, trapezoid or backward_euler.")
-    ] = "bdf2",
-    alpha: Annotated[float, typer.Option("--alpha", help="Alpha of bdf_alpha.")] = -0.45,
+    ] = None
+    rate: Annotated[float, typer.Option("--rate", metavar="RAD/S", help="Rate of theta_b.")] = 10.0
+    scheme: Annotated[str, typer.Option("--scheme", help="bdf2, bdf_alpha, trapezoid or backward_euler.")] = (
+        "bdf2"
+    )
+    alpha: Annotated[float, typer.Option("--alpha", help="Alpha of bdf_alpha.")] = -0.45
     cells: Annotated[
         str,
         typer.Option(
             "--cells", metavar="N,N,..", help="Cells behind the plate and of each section, base to tip."
         ),
-    ] = "",
+    ] = ""
     adaptive: Annotated[
         float | None,
         typer.Option(
@@ -157,18 +161,20 @@ def snap(
             metavar="S",
             help="Longest step: steps grow to it from --dt where the motion is slow.",
         ),
-    ] = None,
+    ] = None
     equations: Annotated[
         str,
         typer.Option(
             "--equations", help="derived, or printed: (12) and (20) as in the paper, without a term in gamma."
         ),
-    ] = "derived",
-    points: Annotated[int, typer.Option("--points", metavar="N", help="Points of the S-curve.")] = 1000,
-    slower: Annotated[
-        float, typer.Option("--slower", metavar="FACTOR", help="Slow motion of the bag.")
-    ] = 1000.0,
-) -> int:
+    ] = "derived"
+    points: Annotated[int, typer.Option("--points", metavar="N", help="Points of the S-curve.")] = 1000
+    slower: Annotated[float, typer.Option("--slower", metavar="FACTOR", help="Slow motion of the bag.")] = (
+        1000.0
+    )
+
+
+def snap(options: SnapOptions) -> int:
     """Snap-through by the finite-difference solver.
 
     Tube 1 turns against the others, which are held, through the fold of the S-curve. Writes trajectory.csv,
@@ -181,26 +187,29 @@ def snap(
     from ctr_dynamics.snap.features import after_snap, crossing, extrema
     from ctr_dynamics.snap.scurve import s_curve
 
-    given = assignments(values or [])
-    of = robot_for_snap(load_robot(robot), given)
-    if not 50 <= points <= 100_000:
-        raise InputError(f"--points {points} is outside 50 to 100000", do="1000 resolve the fold to 1e-7 rad")
+    given = assignments(options.values or [])
+    of = robot_for_snap(load_robot(options.robot), given)
+    if not 50 <= options.points <= 100_000:
+        raise InputError(
+            f"--points {options.points} is outside 50 to 100000", do="1000 resolve the fold to 1e-7 rad"
+        )
+    slower, output, adaptive = options.slower, options.output, options.adaptive
     if not 1.0 <= slower <= 1e6:
         raise InputError(f"--slower {slower:g} is outside 1 to 1e6")
-    chosen = refined_cells(of, refine, _cells(cells))
-    options = {
-        "dt": dt,
-        "duration": duration,
-        "rate": rate,
-        "cells": chosen,
-        "scheme": scheme,
-        "alpha": alpha,
-        "equations": equations,
+    numerics = {
+        "dt": options.dt,
+        "duration": options.duration,
+        "rate": options.rate,
+        "cells": refined_cells(of, options.refine, _cells(options.cells)),
+        "scheme": options.scheme,
+        "alpha": options.alpha,
+        "equations": options.equations,
     }
-    Plan(start or 0.0, adaptive=adaptive, **options).check()  # type: ignore[arg-type]
+    Plan(options.start or 0.0, adaptive=adaptive, **numerics).check()  # type: ignore[arg-type]
     output_folder(output)
-    curve = s_curve(of, np.array(of.rest.beta.value), of.rest.alpha.value[1], points)
-    plan = Plan(_start(of, start, "beta1" in given, curve), adaptive=adaptive, **options)  # type: ignore[arg-type]
+    curve = s_curve(of, np.array(of.rest.beta.value), of.rest.alpha.value[1], options.points)
+    start = _start(of, options.start, "beta1" in given, curve)
+    plan = Plan(start, adaptive=adaptive, **numerics)  # type: ignore[arg-type]
     trajectory = run(of, plan, _progress())
     crossed = crossing(trajectory.t, trajectory.theta_f)
     found = after_snap(extrema(trajectory.t, trajectory.theta_f), crossed)
@@ -208,7 +217,7 @@ def snap(
         "version": __version__,
         "robot": of.source or of.name,
         "robot_sha256": of.sha256,
-        "parameters": str({**options, "start": plan.start, "adaptive": adaptive, "set": given}),
+        "parameters": str({**numerics, "start": plan.start, "adaptive": adaptive, "set": given}),
     }
     summary = _figures(plan, trajectory, curve, found, crossed)
     files.write_trajectory(output / "trajectory.csv", trajectory)

@@ -43,7 +43,7 @@ from ctr_dynamics.runtime.memory import keep_memory
 from ctr_dynamics.runtime.recorder import Recorder
 from ctr_dynamics.runtime.ring_buffer_recording import RingBufferRecording
 from ctr_dynamics.runtime.step_encoder import StepEncoder
-from ctr_dynamics.runtime.step_loop import StepLoop
+from ctr_dynamics.runtime.step_loop import Clock, StepLoop
 from ctr_dynamics.runtime.timing import StepTiming
 from ctr_dynamics.runtime.warm_up import warm_up
 
@@ -100,10 +100,9 @@ class EstimatorNode(Node):
             self._estimator,
             self.outputs.step,
             self._housekeeping,
-            self._now_ns,
+            Clock(self._now_ns, wall=not self._use_sim_time),
             self.timing,
             self.get_logger().error,
-            wall=not self._use_sim_time,
             prefetch=self._prefetch,
         )
         self._offered = [

@@ -14,7 +14,7 @@ import time
 import traceback
 from collections import deque
 from collections.abc import Callable, Sequence
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 from ctr_dynamics.runtime.clock_offset import StampClock
 from ctr_dynamics.runtime.timing import StepTiming
@@ -56,6 +56,14 @@ class Steps(Protocol):
     def reset(self) -> None: ...
 
 
+class Clock(NamedTuple):
+    """A node's clock: its current time in ns, 0 while it has none, and whether it runs at the rate of the wall clock, so that one may sleep
+    until a stamp."""
+
+    now_ns: Callable[[], int]
+    wall: bool = True
+
+
 class Call:
     """A function to be run by the stepping thread, for its caller to wait for."""
 
@@ -80,10 +88,9 @@ class StepLoop(threading.Thread):
         estimator: see `Steps`; touched by this thread alone once started.
         publish: called with every step in order of its stamp; returns False when the stamp was withheld.
         housekeeping: called after each round with the current time and whether there is time to spare; publishes diagnostics when they are due.
-        clock_ns: the node's current time, 0 while it has none.
+        clock: the node's.
         timing: the account of punctuality.
         log_error: takes one line for the log.
-        wall: whether that clock runs at the rate of the wall clock, so that one may sleep until a stamp.
         gather_ns: how long the first inputs are gathered.
         prefetch: computes a step without effect; called a moment before joints that several steps wait for.
     """
@@ -93,10 +100,9 @@ class StepLoop(threading.Thread):
         estimator: Steps,
         publish: Callable[[Any], bool],
         housekeeping: Callable[[int, bool], None],
-        clock_ns: Callable[[], int],
+        clock: Clock,
         timing: StepTiming,
         log_error: Callable[[str], Any],
-        wall: bool = True,
         gather_ns: int = GATHER_NS,
         prefetch: Callable[[], object] = lambda: None,
     ) -> None:
@@ -110,9 +116,9 @@ class StepLoop(threading.Thread):
         self.last_fault = ""
         self._publish = publish
         self._housekeeping = housekeeping
-        self._clock_ns = clock_ns
+        self._clock_ns = clock.now_ns
         self._log_error = log_error
-        self._wall = wall
+        self._wall = clock.wall
         self._gather_ns = gather_ns
         self._prefetch_step = prefetch
         self._took_steps = False

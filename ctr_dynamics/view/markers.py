@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,9 +25,8 @@ COLOURS = (
 )
 LINE_STRIP, SPHERE = 4, 2
 ADD = 0
-CHI_95 = math.sqrt(
-    7.814727903251179
-)  # radius of the ellipsoid that holds 95 % of a 3-D normal distribution, in deviations
+CHI_95 = math.sqrt(7.814727903251179)
+"""Radius of the ellipsoid that holds 95 % of a 3-D normal distribution, in deviations."""
 
 Floats = NDArray[np.float64]
 
@@ -77,6 +77,19 @@ def _quaternion(R: Floats) -> Floats:
     return np.asarray(q / np.linalg.norm(q))
 
 
+class Marker(NamedTuple):
+    """What a marker shows: position (3,) m, orientation (4,) xyzw, scale (3,) m, colour (4,) rgba, points (n, 3) m of a line."""
+
+    namespace: str
+    number: int
+    kind: int
+    position: Sequence[float]
+    orientation: Sequence[float]
+    scale: Sequence[float]
+    colour: Sequence[float]
+    points: Floats
+
+
 def encode_tubes(
     robot: Robot,
     stamp_ns: int,
@@ -103,62 +116,32 @@ def encode_tubes(
     for i, line in enumerate(tube_lines(robot, beta, s, points)):
         diameter = 2.0 * robot.tubes[i].outer_radius.value * diameter_scale
         colour = (*COLOURS[i % len(COLOURS)], 1.0)
-        _marker(
-            writer,
-            stamp_ns,
-            frame_id,
-            "tubes",
-            i,
-            LINE_STRIP,
-            (0.0, 0.0, 0.0),
-            identity,
-            (diameter, 0.0, 0.0),
-            colour,
-            line,
-        )
+        tube = Marker("tubes", i, LINE_STRIP, (0.0, 0.0, 0.0), identity, (diameter, 0.0, 0.0), colour, line)
+        _write(writer, stamp_ns, frame_id, tube)
     if tip is not None:
         size, turn = ellipsoid(tip[1], ellipsoid_scale)
-        _marker(
-            writer,
-            stamp_ns,
-            frame_id,
-            "tip covariance",
-            0,
-            SPHERE,
-            tip[0].tolist(),
-            turn.tolist(),
-            size.tolist(),
-            (0.6, 0.6, 0.6, 0.5),
-            np.zeros((0, 3)),
+        grey = (0.6, 0.6, 0.6, 0.5)
+        place = tip[0].tolist()
+        cloud = Marker(
+            "tip covariance", 0, SPHERE, place, turn.tolist(), size.tolist(), grey, np.zeros((0, 3))
         )
+        _write(writer, stamp_ns, frame_id, cloud)
     return writer.done()
 
 
-def _marker(
-    writer: CdrWriter,
-    stamp_ns: int,
-    frame_id: str,
-    namespace: str,
-    number: int,
-    kind: int,
-    position: Sequence[float],
-    orientation: Sequence[float],
-    scale: Sequence[float],
-    colour: Sequence[float],
-    points: Floats,
-) -> None:
+def _write(writer: CdrWriter, stamp_ns: int, frame_id: str, marker: Marker) -> None:
     """One visualization_msgs/Marker, field by field in the order of its definition."""
     writer.header(stamp_ns, frame_id)
-    writer.string(namespace)
-    for value in (number, kind, ADD):
+    writer.string(marker.namespace)
+    for value in (marker.number, marker.kind, ADD):
         writer.int32(value)
-    writer.float64s([*position, *orientation, *scale])
-    writer.float32s(colour)
+    writer.float64s([*marker.position, *marker.orientation, *marker.scale])
+    writer.float32s(marker.colour)
     writer.int32(0)  # lifetime: until replaced
     writer.uint32(0)
     writer.boolean(False)  # frame_locked
-    writer.uint32(len(points))
-    writer.float64s(points.reshape(-1).tolist())
+    writer.uint32(len(marker.points))
+    writer.float64s(marker.points.reshape(-1).tolist())
     writer.uint32(0)  # colors
     writer.string("")  # texture_resource
     writer.header(0, "")  # texture

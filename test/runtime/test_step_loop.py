@@ -17,6 +17,7 @@ from ctr_dynamics.runtime.step_loop import (
     PREFETCH_NS,
     PREFETCH_STEPS,
     STEP_NS,
+    Clock,
     StepLoop,
 )
 from ctr_dynamics.runtime.timing import Histogram, StepTiming
@@ -72,7 +73,7 @@ def make_loop(estimator, clock, policy="predict", publish=None, gather_ns=0, pre
         estimator,
         publish or note,
         lambda now, pause: None,
-        lambda: clock.now,
+        Clock(lambda: clock.now),
         StepTiming(policy, 100 * MS),
         errors.append,
         gather_ns=gather_ns,
