@@ -1,6 +1,6 @@
 # make demo   the estimator live on a shipped bag, over DDS
-# make test   format, lint, types and tests; PYTEST_ARGS="-k robot" passes options on, WORKERS=4 uses more cores
-# make lint   format, lint and types alone
+# make test   format, lint, layers, types and tests; PYTEST_ARGS="-k robot" passes options on, WORKERS=4 uses more cores
+# make lint   format, lint, layers and types alone
 # make format writes the format
 # make clean  removes the environment and what was built
 # Needs Python 3.10 to 3.12 with venv; PYTHON=/path/to/python chooses one.
@@ -32,6 +32,7 @@ test: lint
 lint: install
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
+	$(BIN)/lint-imports
 	$(BIN)/mypy
 
 format: install
@@ -65,4 +66,4 @@ $(VENV)/.requirements: requirements.txt
 	@touch $@
 
 clean:
-	rm -rf $(VENV) build dist install log ctr_dynamics.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) build dist install log ctr_dynamics.egg-info .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis

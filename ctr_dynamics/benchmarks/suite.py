@@ -10,7 +10,8 @@ from typing import Any
 from ctr_dynamics.benchmarks.ensemble import ensemble, sensitivity_cost
 from ctr_dynamics.benchmarks.fused import fused_replay
 from ctr_dynamics.benchmarks.machine_info import machine
-from ctr_dynamics.benchmarks.release import Release, grid, space_error, time_error, work
+from ctr_dynamics.benchmarks.release import Release
+from ctr_dynamics.benchmarks.release_figures import grid, space_error, time_error, work
 from ctr_dynamics.benchmarks.snap_steps import snap_cost
 from ctr_dynamics.benchmarks.sweeps import sweeps
 from ctr_dynamics.parameters import Settings
