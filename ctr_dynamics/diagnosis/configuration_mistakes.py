@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from ctr_dynamics.diagnosis.diagnosis_options import DiagnosisOptions
+from ctr_dynamics.diagnosis.diagnosis_options import DiagnosisOptions, ForwardModelOptions
 from ctr_dynamics.diagnosis.forward_model import ForwardModel
 from ctr_dynamics.diagnosis.recording import Recording
 from ctr_dynamics.diagnosis.run_context import RunContext
@@ -115,13 +115,13 @@ MISTAKES: dict[str, Callable[[Recording, Robot], Pair]] = {
 }
 
 
-def misfit(recording: Recording, robot: Robot, nodes: int) -> float:
+def misfit(recording: Recording, robot: Robot, resolution: ForwardModelOptions) -> float:
     """3-D rms in m of the measurement against the nominal model, infinity where it fails.
 
     Rotations count by the ratio of the noise of positions to theirs.
     """
     try:
-        forward_model = ForwardModel(recording, robot, nodes=nodes)
+        forward_model = ForwardModel(recording, robot, resolution)
         prediction = forward_model.predict({})
     except InputError:
         return math.inf
@@ -138,15 +138,15 @@ def find_mistake(
     recording: Recording, robot: Robot, options: DiagnosisOptions, context: RunContext
 ) -> FoundMistake | None:
     """The mistake that leaves least when it is undone, where the misfit is gross and it explains nearly all."""
-    o, nodes = options.configuration, options.forward_model.fine_nodes
-    before = misfit(recording, robot, nodes)
+    o, fine = options.configuration, options.forward_model.fine
+    before = misfit(recording, robot, fine)
     if before < o.gross * noise_floor(robot) * math.sqrt(2.0):
         return None
     context.report("gross misfit: trying mistakes of units, signs and orders")
     after: dict[str, float] = {}
     for name, undo in MISTAKES.items():
         try:
-            after[name] = misfit(*undo(recording, robot), nodes)
+            after[name] = misfit(*undo(recording, robot), fine)
         except InputError:
             continue
     best = min(after, key=lambda name: after[name])

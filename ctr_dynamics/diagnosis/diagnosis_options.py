@@ -7,7 +7,7 @@ no published figure uses.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field, fields, is_dataclass
+from dataclasses import dataclass, field, fields, is_dataclass, replace
 from typing import Any, TypeVar
 
 T = TypeVar("T")
@@ -55,6 +55,11 @@ class ForwardModelOptions:
     dt_s: float = option(0.003, "s", "the estimator's step")
     difference: float = option(1e-3, "of the scale", "for derivatives of the inputs and of the tracker chain")
     joint_gap_s: float = option(0.05, "s", "between joint states; straight lines across longer gaps")
+
+    @property
+    def fine(self) -> ForwardModelOptions:
+        """The same with ``fine_nodes``."""
+        return replace(self, nodes=self.fine_nodes)
 
 
 @dataclass(frozen=True)

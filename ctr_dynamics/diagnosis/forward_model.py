@@ -1,17 +1,19 @@
-"""One bag seen through the model: what the tracker should have read for any values of the effects, and its derivatives.
+"""Forward model: one recording seen through the model.
 
-The way is the estimator's: readings to actuators (:class:`ctr_dynamics.effects.Plant`), the dynamic model, tip to tracker. Derivatives by
-quantities that move the model go through the tangent of every step; those of the tracker chain are differences of the last link alone.
+In: a recording, a robot, and coordinates of effects. Out: what the tracker should have measured, and its derivatives. The way is the
+estimator's: encoder readings to actuators (:class:`ctr_dynamics.effects.Plant`), the dynamic model, tip to tracker. Derivatives by
+quantities that move the model go through the tangent of every step; those of the tracker are differences of the tracker model only.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ctr_dynamics.diagnosis.diagnosis_options import ForwardModelOptions
 from ctr_dynamics.diagnosis.recording import Recording
 from ctr_dynamics.effects import EFFECTS, Plant, Quantity, apply_effects, make_plant
 from ctr_dynamics.errors import InputError
@@ -24,17 +26,15 @@ from ctr_dynamics.robot import Robot
 from ctr_dynamics.sensing.interpolation import Signal
 
 Floats = NDArray[np.float64]
-Point = Mapping[
-    tuple[str, str], float
-]  # coordinates of quantities that are not at their off-values, by (effect, name)
-NODES = 10  # from plate to tip: the error in space is then far below that in time (numerics.py measures both)
-FRACTION = 1e-3  # of a quantity's unit, for differences of what is cheap to evaluate
-GAP = 0.05  # s between joint states beyond which nothing is known of the motion between them
+Key = tuple[str, str]
+"""Effect and name of a quantity."""
+Point = Mapping[Key, float]
+"""Coordinates of quantities that are not at their off-values."""
 
 
 @dataclass(frozen=True)
 class Prediction:
-    """What the tracker should have read.
+    """What the tracker should have measured.
 
     Attributes:
         position: (s, 3) m; quaternion: (s, 4) wxyz, at the recording's stamps. trajectory: the tip behind it. failure: empty when whole.
@@ -50,26 +50,35 @@ class ForwardModel:
     """A recording and a robot.
 
     Args:
-        nodes, dt: the model's resolution.
+        options: resolution of the model.
     """
 
-    def __init__(self, recording: Recording, robot: Robot, nodes: int = NODES, dt: float = 0.003) -> None:
-        self.recording, self.robot, self.nodes = recording, robot, nodes
+    def __init__(
+        self, recording: Recording, robot: Robot, options: ForwardModelOptions | None = None
+    ) -> None:
+        self.recording, self.robot = recording, robot
+        self.options = options or ForwardModelOptions()
+        nodes, dt = self.options.nodes, self.options.dt_s
+        self.nodes = nodes
         self.scheme = make_scheme("sdirk3", dt)
         self._models = {False: Model(robot, nodes=nodes), True: Model(robot, nodes=nodes, extended=True)}
         self.nominal = make_plant(robot)
         load = Signal(6)
         for time, *wrench in recording.load.tolist():
             load.add(round(time * 1e9), np.array(wrench))
-        # a step across a sharp bend of the load would make the error of the prediction depend on where in the step it lies, and the misfit a
-        # rough function of every delay
-        bends = load.bends(-np.inf, np.inf, self._models[False].load_kink / dt)
-        self._load_events = 1e-9 * np.array(bends, dtype=float)
+        # a step across a slope discontinuity of the load would make the error of the prediction depend on where in the step it lies, and the
+        # misfit a rough function of every delay
+        discontinuities = load.bends(-np.inf, np.inf, self._models[False].load_kink / dt)
+        self._load_events = 1e-9 * np.array(discontinuities, dtype=float)
 
     def resolved(self, nodes: int, dt: float) -> ForwardModel:
         """The same at another resolution."""
-        same = nodes == self.nodes and dt == self.scheme.dt
-        return self if same else ForwardModel(self.recording, self.robot, nodes, dt)
+        options = replace(self.options, nodes=nodes, dt_s=dt)
+        return self if options == self.options else ForwardModel(self.recording, self.robot, options)
+
+    def until(self, end: float) -> ForwardModel:
+        """The same up to ``end`` (s)."""
+        return ForwardModel(self.recording.until(end), self.robot, self.options)
 
     # -- the chain --
 
@@ -89,7 +98,7 @@ class ForwardModel:
         position = actuators.behind_backlash(actuators.forward(joints[:, 1 : 1 + 2 * n]))
         alpha, beta = position[:, :n], position[:, n:]
         steps = np.diff(t)
-        turned = smooth(t, alpha)
+        turned = smooth(t, alpha, self.options.joint_gap_s)
         slides = np.diff(beta, axis=0) / steps[:, None]
         width = (4 if extended else 3) * n + 6
 
@@ -124,7 +133,7 @@ class ForwardModel:
     # -- predictions --
 
     def predict(self, point: Point) -> Prediction:
-        """The tracker's readings at ``point``; where the simulation ends early they are NaN."""
+        """What the tracker measures at ``point``; NaN after the end of a simulation that fails."""
         plant = self.plant(point)
         trajectory = self._run(plant, plant.extended)
         position, quaternion = self._observe(plant, trajectory)
@@ -145,7 +154,7 @@ class ForwardModel:
         )
 
     def residual(self, prediction: Prediction) -> Floats:
-        """(s, 6) reading minus prediction: position in m in the tracker's axes, rotation vector in rad in the sensor's axes."""
+        """(s, 6) measurement minus prediction: position in m in the tracker's axes, rotation vector in rad in the sensor's axes."""
         return np.hstack(
             [
                 self.recording.position - prediction.position,
@@ -166,7 +175,7 @@ class ForwardModel:
     def jacobian(self, point: Point, wanted: Sequence[Quantity]) -> tuple[Prediction, Floats]:
         """Prediction at ``point`` and its derivatives (s, 6, len(wanted)) by the coordinates of ``wanted``, each times its ``scale``."""
         plant = self.plant(point)
-        changed = [self.plant(moved(point, q, FRACTION)) for q in wanted]
+        changed = [self.plant(moved(point, q, self.options.difference)) for q in wanted]
         kinds: list[str] = []
         for other in changed:
             model = not np.array_equal(other.block, plant.block) or not other.has_inputs_of(plant)
@@ -174,7 +183,7 @@ class ForwardModel:
             kinds.append("tracker" if not model else "extended" if needs else "plain")
         numbers = {kind: [i for i, k in enumerate(kinds) if k == kind] for kind in ("plain", "extended")}
         if numbers["extended"] and len(numbers["plain"]) <= -len(numbers["extended"]) % PACK:
-            # the extended model has the same derivatives, and room left in its last pack of columns
+            # the extended model has the same derivatives, and room left in its last batch of columns
             numbers["extended"] += numbers["plain"]
             numbers["plain"] = []
         columns = np.zeros((len(self.recording.stamps), 6, len(wanted)))
@@ -195,17 +204,19 @@ class ForwardModel:
         for i, kind in enumerate(kinds):
             if kind == "tracker":
                 position, quaternion = self._observe(changed[i], prediction.trajectory)
-                columns[:, :3, i] = (position - prediction.position) / FRACTION
+                columns[:, :3, i] = (position - prediction.position) / self.options.difference
                 columns[:, 3:, i] = (
                     to_vector_rows(multiply_rows(conjugate_rows(prediction.quaternion), quaternion))
-                    / FRACTION
+                    / self.options.difference
                 )
         return prediction, np.nan_to_num(columns)
 
     def _columns(self, plant: Plant, changed: Sequence[Plant], extended: bool) -> Trajectory:
         if not changed:
             return self._run(plant, extended)
-        effect = np.stack([(other.block - plant.block) / FRACTION for other in changed], axis=1)
+        effect = np.stack(
+            [(other.block - plant.block) / self.options.difference for other in changed], axis=1
+        )
         base = self.inputs(plant, extended)
         moving = [
             (i, self.inputs(other, extended))
@@ -214,17 +225,19 @@ class ForwardModel:
         ]
         width = self._models[extended].input_count
 
+        difference = self.options.difference
+
         def input_effect(times: Floats) -> Floats:
             out = np.zeros((len(times), width, len(changed)))
             here = base(times)
             for i, rows in moving:
-                out[:, :, i] = (rows(times) - here) / FRACTION
+                out[:, :, i] = (rows(times) - here) / difference
             return out
 
         return self._run(plant, extended, effect=effect, input_effect=input_effect)
 
     def _through(self, plant: Plant, trajectory: Trajectory) -> Floats:
-        """Columns of the tip as columns of the readings, (s, 6, r)."""
+        """Columns of the tip as columns of the measurements, (s, 6, r)."""
         assert trajectory.columns is not None
         tip, flat = trajectory.tip[:, :7], trajectory.columns[:, :7].reshape(len(trajectory.t), -1)
         return plant.tracker.derivative(
@@ -234,10 +247,10 @@ class ForwardModel:
         )
 
 
-def moved(point: Point, quantity: Quantity, share: float) -> dict[tuple[str, str], float]:
-    """``point`` with one coordinate changed by ``share`` of its scale."""
+def moved(point: Point, quantity: Quantity, fraction: float) -> dict[Key, float]:
+    """``point`` with one coordinate changed by ``fraction`` of its scale."""
     other = dict(point)
-    other[quantity.key] = other.get(quantity.key, quantity.off) + share * quantity.scale
+    other[quantity.key] = other.get(quantity.key, quantity.off) + fraction * quantity.scale
     return other
 
 
@@ -262,19 +275,19 @@ def at_times(values: Floats, t: Floats, times: Floats) -> Floats:
     return out
 
 
-def smooth(t: Floats, values: Floats) -> Callable[[Floats], tuple[Floats, Floats]]:
-    """Values and rates at any times (k,) of samples (s, n) at ``t`` (s,): cubic between samples with the slope of the two neighbours at each (Catmull
-    and Rom), a straight line across gaps, held outside.
+def smooth(t: Floats, values: Floats, gap_s: float) -> Callable[[Floats], tuple[Floats, Floats]]:
+    """Values and rates at any times (k,) of samples (s, n) at ``t`` (s,).
 
-    Encoders scatter. A straight line from sample to sample has a bend at each, which steps in time of much the same length meet or miss; the
-    misfit would be a rough function of every delay.
+    Cubic between samples with the slope of the two neighbours at each (Catmull and Rom), a straight line across gaps of more than ``gap_s``,
+    held outside. Encoders are noisy. Straight lines have a slope discontinuity at each sample, which steps of about the same length meet or
+    miss; the misfit would be a rough function of every delay.
     """
     h = np.diff(t)[:, None]
     secants = np.diff(values, axis=0) / h
     slopes = np.vstack(
         [secants[:1], (h[:-1] * secants[1:] + h[1:] * secants[:-1]) / (h[:-1] + h[1:]), secants[-1:]]
     )
-    gap = h > GAP
+    gap = h > gap_s
     first, last = (np.where(gap, secants, s) for s in (slopes[:-1], slopes[1:]))
 
     def at(times: Floats) -> tuple[Floats, Floats]:

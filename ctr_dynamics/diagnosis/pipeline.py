@@ -66,8 +66,7 @@ def diagnose(
         return _mistaken(result, result.mistake.misfit, context.elapsed_s - begin)
 
     # forward model: the nominal robot on every recording
-    nuisances = nuisances_of(robot)
-    problem = result.problem = make_problem(robot, recordings, nuisances, mask, options=options)
+    problem = result.problem = make_problem(robot, recordings, nuisances_of(robot), mask, options)
     result.nominal_rms = rms(np.concatenate(problem.residuals({}))[:, :3])
     if not math.isfinite(result.nominal_rms):
         raise InputError(
@@ -99,8 +98,7 @@ def diagnose(
     # evidence: what the likeliest hypotheses predict of bags that were not fitted
     held_out = None
     if validation:
-        nodes = problem.forward_models[0].nodes
-        held_out = make_problem(robot, validation, nuisances, mask, nodes, options)
+        held_out = problem.on(validation)
         if any(not is_wrong(problem, e) for e in found.hypotheses):
             context.report("evidence of the validation bags")
             weigh_by_prediction(found, problem, held_out, context)

@@ -86,7 +86,7 @@ def test_interpolation_is_exact_for_cubics_and_held_outside():
 def test_joints_are_smooth_between_samples_straight_across_gaps_and_held_outside():
     t = np.concatenate([0.01 * np.arange(6), 0.2 + 0.01 * np.arange(4)])
     values = np.stack([3.0 * t**2 - t, np.cos(40.0 * t)], axis=1)
-    at = smooth(t, values)
+    at = smooth(t, values, OPTIONS.forward_model.joint_gap_s)
     np.testing.assert_allclose(at(t)[0], values, atol=1e-14)
     inner = np.linspace(0.0101, 0.0399, 50)
     np.testing.assert_allclose(at(inner)[0][:, 0], 3.0 * inner**2 - inner, atol=1e-14)  # parabolas exactly

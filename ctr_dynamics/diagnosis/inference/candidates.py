@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctr_dynamics.diagnosis.diagnosis_options import PriorOptions
-from ctr_dynamics.diagnosis.inference.fit_problem import Key
+from ctr_dynamics.diagnosis.forward_model import Key
 from ctr_dynamics.effects import EFFECTS, Quantity
 
 Floats = NDArray[np.float64]

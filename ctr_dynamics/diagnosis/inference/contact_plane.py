@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from ctr_dynamics.diagnosis.diagnosis_options import ContactPlaneOptions
-from ctr_dynamics.diagnosis.forward_model import ForwardModel
+from ctr_dynamics.diagnosis.forward_model import ForwardModel, Key
 from ctr_dynamics.diagnosis.inference.candidates import Candidate
-from ctr_dynamics.diagnosis.inference.fit_problem import Key, Problem
+from ctr_dynamics.diagnosis.inference.fit_problem import Problem
 from ctr_dynamics.diagnosis.recording import Recording
 from ctr_dynamics.diagnosis.run_context import RunContext
 from ctr_dynamics.diagnosis.whitening import noise_floor
@@ -145,8 +145,7 @@ class _Search:
 
     def _fitted(self, x: Floats, begin: float, span: float) -> tuple[Floats, float]:
         """The plane near ``x`` that leaves least from shortly before ``begin`` (s) to ``span`` behind it, and the fraction of the squares."""
-        full = self.forward_model
-        short = ForwardModel(full.recording.until(begin + span), full.robot, full.nodes, full.scheme.dt)
+        short = self.forward_model.until(begin + span)
         stamps = short.recording.stamps
         counted = (stamps > begin - self.options.lead_s) & np.isfinite(short.recording.position).all(axis=1)
 

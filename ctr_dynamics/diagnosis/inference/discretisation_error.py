@@ -12,8 +12,8 @@ from joblib import delayed
 from numpy.typing import NDArray
 
 from ctr_dynamics.diagnosis.diagnosis_options import DiscretisationOptions
-from ctr_dynamics.diagnosis.forward_model import ForwardModel
-from ctr_dynamics.diagnosis.inference.fit_problem import Key, Problem
+from ctr_dynamics.diagnosis.forward_model import ForwardModel, Key
+from ctr_dynamics.diagnosis.inference.fit_problem import Problem
 from ctr_dynamics.diagnosis.run_context import RunContext
 
 Floats = NDArray[np.float64]

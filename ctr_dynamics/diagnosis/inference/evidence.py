@@ -15,8 +15,9 @@ from joblib import delayed
 from numpy.typing import NDArray
 
 from ctr_dynamics.diagnosis.diagnosis_options import DiagnosisOptions
+from ctr_dynamics.diagnosis.forward_model import Key
 from ctr_dynamics.diagnosis.inference.candidates import Candidate, log_prior
-from ctr_dynamics.diagnosis.inference.fit_problem import Key, Problem
+from ctr_dynamics.diagnosis.inference.fit_problem import Problem
 from ctr_dynamics.diagnosis.inference.gaussian_posterior import posterior
 from ctr_dynamics.diagnosis.inference.hypotheses import Hypothesis, fit_exactly
 from ctr_dynamics.diagnosis.inference.map_fit import Fit

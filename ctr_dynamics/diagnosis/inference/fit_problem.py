@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctr_dynamics.diagnosis.diagnosis_options import DiagnosisOptions
-from ctr_dynamics.diagnosis.forward_model import ForwardModel
+from ctr_dynamics.diagnosis.forward_model import ForwardModel, Key
 from ctr_dynamics.diagnosis.recording import Recording
 from ctr_dynamics.diagnosis.whitening import Whitener
 from ctr_dynamics.effects import Quantity
@@ -17,8 +17,6 @@ from ctr_dynamics.errors import InputError
 from ctr_dynamics.robot import Robot
 
 Floats = NDArray[np.float64]
-Key = tuple[str, str]
-"""Effect and name of a quantity."""
 
 
 @dataclass(frozen=True)
@@ -65,6 +63,17 @@ class Problem:
         """The same with half the time step."""
         return self.with_step(0.5 * self.forward_models[0].scheme.dt)
 
+    def on(self, recordings: Sequence[Recording]) -> Problem:
+        """The same robot, nuisances, axes and resolution on other recordings, before any correction."""
+        resolution = self.forward_models[0].options
+        return make_problem(
+            self.robot,
+            recordings,
+            self.nuisances,
+            self.whiteners[0].mask,
+            replace(self.options, forward_model=resolution),
+        )
+
     def residual(self, point: Mapping[Key, float]) -> Floats | None:
         """(m,) whitened residual at ``point``; None where a simulation fails."""
         parts = []
@@ -102,7 +111,6 @@ def make_problem(
     recordings: Sequence[Recording],
     nuisances: Sequence[Quantity],
     mask: NDArray[np.bool_],
-    nodes: int | None = None,
     options: DiagnosisOptions | None = None,
 ) -> Problem:
     """Problem of ``recordings``.
@@ -110,10 +118,9 @@ def make_problem(
     Args:
         nuisances: quantities that may move inside their tolerances.
         mask: (6,) axes that count: position, then rotation. Poses that are not finite are left out.
-        nodes: of the mesh, where not those of ``options``.
     """
     options = options or DiagnosisOptions()
-    forward_models = [ForwardModel(r, robot, nodes or options.forward_model.nodes) for r in recordings]
+    forward_models = [ForwardModel(r, robot, options.forward_model) for r in recordings]
     whiteners = []
     for r in recordings:
         used = np.isfinite(r.position).all(axis=1) & (r.stamps >= 0.0)

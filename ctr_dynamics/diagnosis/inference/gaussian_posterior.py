@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import log_ndtr
 
+from ctr_dynamics.diagnosis.forward_model import Key
 from ctr_dynamics.effects import Quantity
 
 Floats = NDArray[np.float64]
-Key = tuple[str, str]
 
 
 def prior_variance(quantity: Quantity, cause: bool) -> float:

@@ -14,7 +14,7 @@ from ctr_dynamics.diagnosis.inference.candidates import Candidate
 from ctr_dynamics.diagnosis.inference.contact_plane import time_of_divergence
 from ctr_dynamics.diagnosis.inference.discretisation_error import correct_discretisation
 from ctr_dynamics.diagnosis.inference.evidence import WeighedHypotheses, probabilities, weigh
-from ctr_dynamics.diagnosis.inference.fit_problem import Problem, make_problem
+from ctr_dynamics.diagnosis.inference.fit_problem import Problem
 from ctr_dynamics.diagnosis.inference.fit_quality import excess, explains
 from ctr_dynamics.diagnosis.inference.hypotheses import Hypothesis, check_time_error, with_form
 from ctr_dynamics.diagnosis.inference.map_fit import Fit, corrected, fit
@@ -135,11 +135,9 @@ def search_early(problem: Problem, pool: list[Candidate], context: RunContext) -
 
 def _until(problem: Problem, begins: Sequence[float], span: float) -> Problem:
     """``problem`` up to ``span`` (s) after the time ``begins`` of each recording."""
-    recordings = [
-        e.recording.until(begin + span) for e, begin in zip(problem.forward_models, begins, strict=True)
-    ]
-    mask, nodes = problem.whiteners[0].mask, problem.forward_models[0].nodes
-    return make_problem(problem.robot, recordings, problem.nuisances, mask, nodes, problem.options)
+    return problem.on(
+        [e.recording.until(begin + span) for e, begin in zip(problem.forward_models, begins, strict=True)]
+    )
 
 
 def _with_hypotheses(

@@ -15,7 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import lsq_linear
 
-from ctr_dynamics.diagnosis.inference.fit_problem import Key, Local, Problem
+from ctr_dynamics.diagnosis.forward_model import Key
+from ctr_dynamics.diagnosis.inference.fit_problem import Local, Problem
 from ctr_dynamics.diagnosis.inference.gaussian_posterior import (
     cost,
     numerics_part,

@@ -13,8 +13,9 @@ import numpy as np
 from joblib import delayed
 from numpy.typing import NDArray
 
+from ctr_dynamics.diagnosis.forward_model import Key
 from ctr_dynamics.diagnosis.inference.candidates import Candidate
-from ctr_dynamics.diagnosis.inference.fit_problem import Key, Problem
+from ctr_dynamics.diagnosis.inference.fit_problem import Problem
 from ctr_dynamics.diagnosis.inference.map_fit import Fit
 from ctr_dynamics.diagnosis.run_context import RunContext
 from ctr_dynamics.effects import EFFECTS, Quantity

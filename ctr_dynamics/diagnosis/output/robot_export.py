@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from ctr_dynamics.diagnosis.inference.fit_problem import Key
+from ctr_dynamics.diagnosis.forward_model import Key
 from ctr_dynamics.diagnosis.inference.map_fit import Fit
 from ctr_dynamics.effects import EFFECTS
 from ctr_dynamics.kernels.rotations import from_vector, matrix, multiply, to_vector

@@ -103,7 +103,7 @@ def _separation_with(
     """Separation of a cause from its rival (``pair``) with the bags of ``problem`` and one of ``scenario`` together."""
     own, rival = pair
     recording = recording_of(scenario, problem.robot, problem.options.forward_model.fine_nodes)
-    forward_model = ForwardModel(recording, problem.robot, problem.forward_models[0].nodes)
+    forward_model = ForwardModel(recording, problem.robot, problem.forward_models[0].options)
     rivals = [q for q in rival.quantities if q.key not in {x.key for x in fit.active}]
     point = {**fit.point, **dict(rival.start)}
     prediction, jacobian = forward_model.jacobian(point, (*fit.active, *rivals))
