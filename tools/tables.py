@@ -12,6 +12,7 @@ from typing import Any
 
 import yaml
 
+from ctr_dynamics.diagnosis import diagnosis_options
 from ctr_dynamics.errors import InputError
 from ctr_dynamics.io.messages.topics import TOPICS
 from ctr_dynamics.parameters import PARAMETERS, Parameter
@@ -29,7 +30,7 @@ def _shown(value: Any) -> str:
     if isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, tuple):
-        return "[" + ", ".join(f"{v:g}" for v in value) + "]"
+        return "[" + ", ".join(_shown(v) for v in value) + "]"
     return f"{value:g}" if isinstance(value, float) else str(value)
 
 
@@ -78,10 +79,26 @@ def topic_table() -> str:
     return _markdown(["", "topic", "type", "rate", "meaning"], rows)
 
 
+def diagnosis_option_tables() -> str:
+    """A heading and a Markdown table for every group of the diagnosis' options."""
+    parts = []
+    for group, options in diagnosis_options.groups():
+        title = (options.__doc__ or "").splitlines()[0]
+        rows = [
+            [f"`{name}`", f"`{_shown(value)}`", unit, reason]
+            for name, value, unit, reason in diagnosis_options.rows(options)
+        ]
+        parts.append(
+            f"## {title.rstrip('.')}\n\nGroup `{group}`.\n\n{_markdown(['name', 'value', 'unit', 'reason'], rows)}"
+        )
+    return "\n\n".join(parts)
+
+
 # Page -> name of its markers, and what stands between them.
 SECTIONS = {
     Path("docs/topics.md"): ("topics", topic_table),
     Path("docs/parameters.md"): ("parameters", parameter_tables),
+    Path("docs/diagnosis_options.md"): ("options", diagnosis_option_tables),
     Path("docs/glossary.md"): ("vocabulary", words.table),
 }
 

@@ -1,13 +1,12 @@
 """Every number that a diagnosis works with, its unit and the reason for its value; the table of docs/diagnosis_options.md.
 
-One group for each stage, in the order of the stages. The values were chosen on cases of the truth generator with seeds that
-no published figure uses.
+One group for each stage, in the order of the stages. The values were chosen on cases of the truth generator (test/diagnosis/truth).
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field, fields, is_dataclass, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import Any, TypeVar
 
 T = TypeVar("T")
@@ -299,12 +298,14 @@ class DiagnosisOptions:
     report: ReportOptions = ReportOptions()
 
 
-def rows(options: Any = None, prefix: str = "") -> Iterator[tuple[str, Any, str, str]]:
-    """(name, value, unit, reason) of every option, ``group.name``."""
-    options = DiagnosisOptions() if options is None else options
+def groups() -> Iterator[tuple[str, Any]]:
+    """Name and default of every group."""
+    options = DiagnosisOptions()
     for f in fields(options):
-        value = getattr(options, f.name)
-        if is_dataclass(value):
-            yield from rows(value, f"{prefix}{f.name}.")
-        else:
-            yield f"{prefix}{f.name}", value, f.metadata["unit"], f.metadata["reason"]
+        yield f.name, getattr(options, f.name)
+
+
+def rows(group: Any) -> Iterator[tuple[str, Any, str, str]]:
+    """Name, value, unit and reason of every option of a group."""
+    for f in fields(group):
+        yield f.name, getattr(group, f.name), f.metadata["unit"], f.metadata["reason"]

@@ -16,6 +16,7 @@ from ctr_dynamics.diagnosis.inference.map_fit import corrected, fit
 from ctr_dynamics.diagnosis.inference.screening import screen
 from ctr_dynamics.diagnosis.inference.search_moves import SearchState, alternatives, fit_alternatives
 from ctr_dynamics.diagnosis.inference.sensitivities import sensitivities_at, with_large_sizes
+from ctr_dynamics.diagnosis.pipeline import diagnose
 from ctr_dynamics.diagnosis.recording import Recording
 from ctr_dynamics.diagnosis.run_context import RunContext
 from ctr_dynamics.effects import quantities
@@ -241,3 +242,13 @@ def test_what_looks_like_a_cause_is_fitted_in_its_place(recording, robot, known)
     assert right.fit.cost < wrong.cost - 1.0
     known_ones = [*state.found, *new]
     assert not [s for s in alternatives(problem, known_ones, here) if s[0].effect == "payload_mass"]
+
+
+def test_a_used_up_time_budget_ends_the_search_and_is_said(recording, robot):
+    stages = []
+    found = diagnose(robot, [recording], context=RunContext(stages.append, workers=1, time_budget_s=0.0))
+    assert "the time budget of 0 s is used up: the search was not completed" in found.notes
+    assert stages[:3] == ["nominal model", "re-calibration inside tolerance", "discretisation error"]
+    assert not [stage for stage in stages if "alternatives" in stage or "leaves" in stage]
+    assert found.search is not None
+    assert found.search.probabilities.sum() == pytest.approx(1.0)
