@@ -19,13 +19,13 @@ import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from ctr_dynamics.benchmarks.fused import DT_NS
 from ctr_dynamics.estimation.estimator import Estimator
 from ctr_dynamics.io.bag_reader import InputMessage, open_bag
 from ctr_dynamics.io.bag_writer import write_bag
 from ctr_dynamics.io.messages import topics
 from ctr_dynamics.io.messages.cdr import JointStateIn, PoseIn, WrenchIn
 from ctr_dynamics.io.messages.encode import encode_joint_state, encode_pose_stamped, encode_wrench_stamped
+from ctr_dynamics.io.messages.topics import STEP_NS
 from ctr_dynamics.io.shipped_bags import shipped_bag
 from ctr_dynamics.parameters import Settings
 from ctr_dynamics.robot_files import load_robot
@@ -116,7 +116,7 @@ def replayed(bag: Path, robot_name: str, minutes: int) -> list[float]:
             memory.append(resident_mb())
             now = time.perf_counter()
             print(
-                f"| {len(memory)} | {memory[-1]:.1f} | {steps} | {invalid} | {steps * DT_NS * 1e-9 / (now - begin):.1f} |",
+                f"| {len(memory)} | {memory[-1]:.1f} | {steps} | {invalid} | {steps * STEP_NS * 1e-9 / (now - begin):.1f} |",
                 flush=True,
             )
             begin, end_ns, steps, invalid = now, end_ns + MINUTE_NS, 0, 0

@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 
 from ctr_dynamics.benchmarks.sweeps import sweep_cost
-from ctr_dynamics.estimation.estimator import DT_NS, Estimator
+from ctr_dynamics.estimation.estimator import Estimator
 from ctr_dynamics.io.bag_reader import open_bag
+from ctr_dynamics.io.messages.topics import STEP_NS
 from ctr_dynamics.model.model import Model
 from ctr_dynamics.parameters import Settings
 from ctr_dynamics.robot_files import load_robot
@@ -46,7 +47,7 @@ def fused_replay(
     settings, robot = Settings(values), load_robot(robot_name)
     opened = open_bag(bag)
     warm_up(robot, settings)  # as the node does before its first message
-    most = None if seconds is None else round(seconds * 1e9) // DT_NS
+    most = None if seconds is None else round(seconds * 1e9) // STEP_NS
     wall = np.inf
     for _ in range(rounds):
         estimator = Estimator(robot, settings)
@@ -65,9 +66,9 @@ def fused_replay(
         "bag": bag.name,
         "nodes": model.nodes,
         "rank": int(settings["filter.rank"]),
-        "columns": estimator.fusion.factor.rank,  # what the rank becomes when its last pack of lanes is filled
+        "columns": estimator.runs.fused.ekf.factor.rank,  # what the rank becomes when its last SIMD batch is full
         "steps": steps,
-        "realtime_ratio": steps * DT_NS * 1e-9 / wall,
+        "realtime_ratio": steps * STEP_NS * 1e-9 / wall,
         "tick_ms": {"p50": p50, "p99": p99, "p99.9": p999, "max": worst, "mean": float(ticks.mean())},
         "tick_ratio_to_plain_sweep": {"p50": p50 / plain, "p99": p99 / plain},
         "sweeps_per_step": estimator.summary()["solver"]["sweeps_per_step"],

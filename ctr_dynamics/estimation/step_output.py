@@ -30,11 +30,12 @@ class Modes(NamedTuple):
         return cls(empty, empty, empty, empty)
 
 
-class Moment(NamedTuple):
-    """The model alone at a tracker sample's own time, ``ctr_base``, SI units.
+class MotionPoint(NamedTuple):
+    """The open-loop run at a measurement's own time, ``ctr_base``, SI units.
 
     Attributes:
-        residual: (3,) reading minus position. position (3,), quaternion (4,) wxyz, velocity (3,), acceleration (3,): of the tip.
+        residual: (3,) m, measured minus open-loop position.
+        position, velocity, acceleration: (3,) m, m/s, m/s^2; quaternion: (4,) wxyz, of the tip.
         alpha, alpha_rate, beta_rate: (n,) rad, rad/s, m/s.
     """
 
@@ -49,10 +50,18 @@ class Moment(NamedTuple):
 
 
 class Innovation(NamedTuple):
-    """A processed tracker sample: residual (6,) and its predicted variance (6,) (position m in the tracker's axes, rotation rad in the
-    sensor's), NIS, degrees of freedom, whether it was fused, how late it came (s), and why it was not fused; for the misfit monitor
-    ``white``, the whitened residual (6,), and the ``moment``, None where the model alone has no tip of that time; ``fused`` (3,) m, reading
-    minus the fused tip that was published for its time, None likewise."""
+    """A processed tracker measurement.
+
+    Attributes:
+        stamp_ns: of its header.
+        residual, variance: (6,) measured minus expected and its predicted variance: position m in the tracker's axes, rotation rad in the sensor's.
+        nis, dof: normalised innovation squared and its degrees of freedom; 0 where it could not be compared.
+        accepted: whether it was fused; reason: why not, or how.
+        delay_s: how late it came.
+        white: (6,) whitened residual.
+        motion: the open-loop run at its time; fused_residual: (3,) m, measured minus the fused tip that was published for its time. Both are None
+            where no tip of that time is stored.
+    """
 
     stamp_ns: int
     residual: Floats
@@ -63,8 +72,8 @@ class Innovation(NamedTuple):
     delay_s: float
     reason: str = ""
     white: Floats | None = None
-    moment: Moment | None = None
-    fused: Floats | None = None
+    motion: MotionPoint | None = None
+    fused_residual: Floats | None = None
 
 
 class SolverStats(NamedTuple):
@@ -84,7 +93,7 @@ class StepOutput(NamedTuple):
     Attributes:
         tip_position (3,), tip_quaternion_wxyz (4,), tip_covariance (6, 6): x, y, z, rx, ry, rz about the base axes.
         tip_velocity (6,): d/dt of the tip point (insertion included) and angular velocity, with its covariance (6, 6).
-        predicted_position, predicted_quaternion_wxyz: the model alone, never corrected.
+        predicted_position, predicted_quaternion_wxyz: the open-loop run, never corrected.
         backbone: float32 (P, 15): s, x, y, z, qx, qy, qz, qw, vx, vy, vz, ux, uy, uz, sd.
         disturbance_force, disturbance_sigma (3,): N, base axes.
     """

@@ -17,7 +17,7 @@ from ctr_dynamics.reporting.figures import Panel, figure_svg
 from ctr_dynamics.reporting.page import Page
 
 if TYPE_CHECKING:
-    from ctr_dynamics.estimation.estimator import Innovation, StepOutput
+    from ctr_dynamics.estimation.step_output import Innovation, StepOutput
     from ctr_dynamics.sensing.tracker import TrackerModel
 
 Floats = NDArray[np.float64]

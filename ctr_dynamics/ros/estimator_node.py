@@ -233,7 +233,7 @@ class EstimatorNode(Node):
         self._undecodable[topic] = (count + 1, str(error))
 
     def _prefetch(self) -> None:
-        self._estimator.rehearse()
+        self._estimator.prefetch()
         self.outputs.prefetch()
 
     def _housekeeping(self, now_ns: int, idle: bool) -> None:

@@ -153,7 +153,7 @@ class Player:
             spent = (time.perf_counter() - begin) / len(steps)
             self._call_times_s.extend([spent] * len(steps))
             yield from steps
-            self.estimator.use_pause()
+            self.estimator.do_idle_work()
 
 
 class _Invalid:

@@ -52,7 +52,7 @@ class Steps(Protocol):
     def advance(
         self, now_ns: int | None = None, spare_s: Callable[[], float] | None = None, most: int | None = None
     ) -> Sequence[Any]: ...
-    def use_pause(self) -> None: ...
+    def do_idle_work(self) -> None: ...
     def reset(self) -> None: ...
 
 
@@ -210,7 +210,7 @@ class StepLoop(threading.Thread):
             if not self.estimator.correcting:
                 if self._idle_work_due and not self.inbox and self._idle():
                     self._idle_work_due = False
-                    self.estimator.use_pause()
+                    self.estimator.do_idle_work()
             elif self._took_steps:
                 self._wake.set()  # now there is time for it
             self._prefetch()

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 
 from ctr_dynamics.estimation.estimator import Estimator
-from ctr_dynamics.io.messages.topics import STEP_NS
 from ctr_dynamics.parameters import Settings
 from ctr_dynamics.robot import Robot
 from ctr_dynamics.runtime.step_encoder import StepEncoder
@@ -49,7 +48,7 @@ def warm_up(robot: Robot, settings: Settings) -> int:
         for out in steps_now:
             encoder.encode(out, estimator.health.statuses)
         if tick not in BUSY:
-            estimator.use_pause()
+            estimator.do_idle_work()
         if steps_now and steps_now[-1].valid:
             out = steps_now[-1]
             w, *xyz = out.predicted_quaternion_wxyz.tolist()
@@ -57,6 +56,6 @@ def warm_up(robot: Robot, settings: Settings) -> int:
             x, y, z = out.predicted_position.tolist()
             beside = PUSH * math.sin(SWING * tick) if tick in PUSHED else 0.0
             estimator.add_tracker_pose(out.stamp_ns - age_ns, (x + beside, y, z), (*xyz, w))
-    if estimator.runs.fused is not None:
-        estimator.runs.apart(estimator.k * STEP_NS * 1e-9, [], record=True)
+    if estimator.runs.running:
+        estimator.runs.apart(estimator.k + 1, [], record=True)
     return steps

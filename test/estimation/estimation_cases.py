@@ -11,10 +11,11 @@ from typing import Any
 
 import numpy as np
 
-from ctr_dynamics.estimation.estimator import DT_NS, Estimator
+from ctr_dynamics.estimation.estimator import Estimator
 from ctr_dynamics.estimation.step_output import StepOutput
 from ctr_dynamics.io.bag_reader import open_bag
 from ctr_dynamics.io.messages.cdr import JointStateIn, PoseIn
+from ctr_dynamics.io.messages.topics import STEP_NS
 from ctr_dynamics.parameters import Settings
 from ctr_dynamics.robot_files import load_robot
 from ctr_dynamics.runtime.replay import Player
@@ -141,7 +142,7 @@ def check_outputs(run: Run) -> None:
     stamps = run.column("stamp_ns")
     assert np.all(np.diff(stamps) > 0)
     for out in run.outputs:
-        assert (out.stamp_ns - run.outputs[0].stamp_ns) % DT_NS == 0
+        assert (out.stamp_ns - run.outputs[0].stamp_ns) % STEP_NS == 0
         if out.valid:
             assert out.reason == ""
             for name, value in out._asdict().items():

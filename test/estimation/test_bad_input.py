@@ -17,7 +17,7 @@ from estimation_cases import (
     truth_error,
 )
 
-from ctr_dynamics.estimation.estimator import MAX_FAILURES
+from ctr_dynamics.estimation.runs import MAX_FAILURES
 from ctr_dynamics.io.messages.topics import DIAGNOSTICS
 from ctr_dynamics.robot_files import load_robot
 from ctr_dynamics.runtime.step_encoder import StepEncoder
@@ -387,7 +387,7 @@ def test_poses_without_joints_do_not_pile_up(sweep):
     for k in range(1000):
         made.add_tracker_pose(START_NS + 25_000_000 * k, *pose.content)
         assert made.advance(START_NS + 25_000_000 * k) == []
-    assert len(made.inputs.samples) <= 200
+    assert len(made.inputs.measurements.measurements) <= 200
     assert made.health.dropped >= 800
     for k in range(1000):
         made.add_tip_load(START_NS + 10_000_000 * k, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))

@@ -20,7 +20,8 @@ from estimation_cases import (
 from tracker_twin import expected
 
 from ctr_dynamics.effects import make_plant
-from ctr_dynamics.estimation.estimator import DT_NS, LOST
+from ctr_dynamics.estimation.estimator import EstimatorOptions
+from ctr_dynamics.io.messages.topics import STEP_NS
 from ctr_dynamics.kernels.rotations import conjugate, from_vector, matrix, multiply
 from ctr_dynamics.parameters import PARAMETERS
 from ctr_dynamics.robot_files import load_robot, robot_from_dict, robot_to_dict
@@ -83,11 +84,11 @@ def test_isolated_outlier_is_rejected(release, plain):
     run = play(reshaped(release, lambda p, q, m: (p + np.array([0.05 * (m.stamp == at), 0.0, 0.0]), q)))
     health = run.estimator.health
     assert health.rejected == plain.estimator.health.rejected + 1
-    refused = [i for out in run.outputs for i in out.innovations if not i.accepted]
-    assert len(refused) == 1
-    assert refused[0].nis > 1000
-    assert refused[0].reason == "outside the gate"
-    assert refused[0].residual[0] == pytest.approx(0.05, abs=3e-3)
+    rejected = [i for out in run.outputs for i in out.innovations if not i.accepted]
+    assert len(rejected) == 1
+    assert rejected[0].nis > 1000
+    assert rejected[0].reason == "outside the gate"
+    assert rejected[0].residual[0] == pytest.approx(0.05, abs=3e-3)
     assert all(out.valid for out in run.outputs)
     assert rms(run.column("tip_position") - plain.column("tip_position")) < 0.1e-3
 
@@ -97,8 +98,9 @@ def test_lasting_contradiction_is_said(release):
     rng = np.random.default_rng(0)
     run = play(reshaped(release, lambda p, q, m: (p + rng.uniform(-0.3, 0.3, 3), q)))
     check_outputs(run)
+    limit = EstimatorOptions().largest_deviation
     for out in run.outputs:
-        assert not out.valid or np.sqrt(np.trace(out.tip_covariance[:3, :3])) <= LOST
+        assert not out.valid or np.sqrt(np.trace(out.tip_covariance[:3, :3])) <= limit
     invalid = [out for out in run.outputs if not out.valid]
     assert any("tracker contradicts the model" in out.reason for out in invalid)
     status = next(s for s in run.estimator.health.statuses() if s.name == "tracker")
@@ -183,7 +185,7 @@ def test_without_an_equilibrium_nothing_piles_up(release):
     assert not any(out.valid for out in run.outputs)
     inputs = run.estimator.inputs
     assert len(inputs.joints.stamps) < 100
-    assert len(inputs.samples) < 100
+    assert len(inputs.measurements.measurements) < 100
     assert run.estimator.health.tracker["never compared"].count > 20
     assert run.estimator.health.dropped > 20
 
@@ -252,28 +254,28 @@ def test_two_runs_are_the_same_bytes(release, plain):
 
 
 @pytest.mark.parametrize(("policy", "tick"), [("wait", 0.0), ("predict", 0.003)])
-def test_rehearsed_steps_leave_no_trace(release, policy, tick):
-    """Whatever is gone through ahead of the joints, with a sample waiting or not, is as if it had not been."""
+def test_prefetched_steps_leave_no_trace(release, policy, tick):
+    """Whatever is gone through ahead of the joints, with a measurement waiting or not, is as if it had not been."""
     settings = {"output.policy": policy}
     messages = [m for m in release if m.stamp <= 1.3e9]
-    with_sample = []
+    with_measurement = []
 
     def busy(made):
         advance = made.advance
 
-        def rehearsed(*arguments):
+        def prefetched(*arguments):
             for _ in range(2):
-                made.rehearse()
-            with_sample.append(any(s.fused_k is None for s in made.inputs.samples))
+                made.prefetch()
+            with_measurement.append(any(s.fused_k is None for s in made.inputs.measurements.measurements))
             return advance(*arguments)
 
-        made.advance = rehearsed
+        made.advance = prefetched
 
     plain = play(messages, settings, tick=tick)
     run = play(messages, settings, tick=tick, prepare=busy)
     same_bytes(run, plain)
-    assert any(with_sample)
-    assert not all(with_sample)
+    assert any(with_measurement)
+    assert not all(with_measurement)
     assert run.estimator.summary() == plain.estimator.summary()
 
 
@@ -286,7 +288,7 @@ def test_a_reduction_in_idle_time_is_as_if_the_next_step_had_done_it(release):
 
         def then_idle(*arguments):
             steps = advance(*arguments)
-            reduced.append(made.fusion.add_noise_and_reduce())
+            reduced.append(made.runs.fused.ekf.add_noise_and_reduce())
             return steps
 
         made.advance = then_idle
@@ -309,16 +311,16 @@ def test_the_last_step_that_a_joint_state_covers_is_known_before_it_comes():
 def test_reductions_follow_the_last_step_that_a_joint_state_covers(release):
     made = estimator()
     found = []
-    reduce, inputs = made.fusion.add_noise_and_reduce, made.inputs
+    reduce, inputs = made.runs.fused.ekf.add_noise_and_reduce, made.inputs
 
     def noted():
         reduced = reduce()
         if reduced:
-            stamp = inputs.stamp(made.k - 1)
-            found.append((made.k - 1, any(stamp <= s < stamp + DT_NS for s in inputs.joints.stamps)))
+            stamp = made.timeline.stamp(made.k - 1)
+            found.append((made.k - 1, any(stamp <= s < stamp + STEP_NS for s in inputs.joints.stamps)))
         return reduced
 
-    made.fusion.add_noise_and_reduce = noted
+    made.runs.fused.ekf.add_noise_and_reduce = noted
     for message in sorted((m for m in release if m.stamp <= 1.3e9), key=lambda m: m.arrival):
         message.give(made)
         made.advance(START_NS + message.arrival)
@@ -440,7 +442,7 @@ def test_snapshot_is_plain_data_with_named_parameters(plain):
 
     snapshot = json.loads(json.dumps(plain.estimator.snapshot(), allow_nan=False))
     assert snapshot["k"] == plain.last.k
-    assert set(snapshot["parameters"]) == set(plain.estimator.fusion.uncertainty.names)
+    assert set(snapshot["parameters"]) == set(plain.estimator.runs.fused.ekf.uncertainty.names)
     young = snapshot["parameters"]["youngs_modulus.tube1"]
     assert abs(young["value"]) < 0.02
     assert 0 < young["sigma"] <= 0.0041

@@ -92,8 +92,8 @@ def corrected_apart(a, b):
     return tuple(
         float(np.linalg.norm(x.last.position - y.last.position))
         for x, y in (
-            (a.estimator.fusion.tips, b.estimator.fusion.tips),
-            (a.estimator.runs.alone_tips, b.estimator.runs.alone_tips),
+            (a.estimator.runs.fused.ekf.tips, b.estimator.runs.fused.ekf.tips),
+            (a.estimator.runs.open_loop.tips, b.estimator.runs.open_loop.tips),
         )
     )
 
@@ -101,7 +101,7 @@ def corrected_apart(a, b):
 def nis(run):
     """NIS per degree of freedom by the stamps of the poses. The last may be left for a next output."""
     reported = [i for out in run.outputs for i in out.innovations]
-    return {i.stamp_ns: i.nis / i.dof for i in reported + run.estimator.runs.innovations if i.dof}
+    return {i.stamp_ns: i.nis / i.dof for i in reported + run.estimator.innovations.take() if i.dof}
 
 
 @pytest.mark.parametrize("share", [0.3, 0.7])
@@ -165,12 +165,12 @@ def test_steps_before_their_correction_do_not_take_it_for_a_jump_of_the_joints(s
 def test_a_late_load_has_jumped_where_it_is_not_what_was_taken_for_its_time(release):
     """Between two loads that are known the model has taken the line; a third one there is compared with that."""
     run = play([m for m in release if m.kind == "joints" and m.stamp <= 0.1e9])
-    inputs, k = run.estimator.inputs, run.estimator.k
+    inputs = run.estimator.inputs
 
     def jumped(t, force):
-        change = inputs.add_load(START_NS + round(t * 1e9), [force, 0.0, 0.0], [0.0] * 3, "", k)
+        change = inputs.add_load(START_NS + round(t * 1e9), [force, 0.0, 0.0], [0.0] * 3, "")
         assert change is not None
-        return change[1]
+        return change.jumped
 
     assert jumped(0.05, 1.0)
     assert jumped(0.15, 0.0)
@@ -272,19 +272,19 @@ def test_a_way_back_begins_with_what_a_pause_has_settled(sweep):
     counts = []
 
     def with_pauses(made):
-        advance, energy = made.advance, made.fusion.factor.energy  # asked for once a reduction
+        advance, energy = made.advance, made.runs.fused.ekf.factor.energy  # asked for once a reduction
 
         def paused(*arguments):
             steps = advance(*arguments)
             if steps:
-                made.use_pause()
+                made.do_idle_work()
             return steps
 
         def counted():
             counts[-1] += 1
             return energy()
 
-        made.advance, made.fusion.factor.energy = paused, counted
+        made.advance, made.runs.fused.ekf.factor.energy = paused, counted
 
     late = [m.late(0.001) if m.kind == "joints" else m for m in sweep]
     for policy in ("wait", "predict"):

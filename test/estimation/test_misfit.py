@@ -8,14 +8,14 @@ import pytest
 from ctr_dynamics.effects import EFFECTS
 from ctr_dynamics.estimation.monitoring.consistency import FEWEST, MisfitLimits, MisfitMonitor, ljung_box
 from ctr_dynamics.estimation.monitoring.likely_causes import SIGNATURES, Regression
-from ctr_dynamics.estimation.step_output import OK, WARN, Innovation, Moment
+from ctr_dynamics.estimation.step_output import OK, WARN, Innovation, MotionPoint
 from ctr_dynamics.kernels.rotations import from_vector, matrix
 
 INTERVAL_NS = 25_000_000
 NOISE = 0.35e-3
 
 
-def innovation(i, white, moment=None):
+def innovation(i, white, motion_point=None):
     white = np.asarray(white, dtype=float)
     measured = white[np.isfinite(white)]
     return Innovation(
@@ -27,7 +27,7 @@ def innovation(i, white, moment=None):
         True,
         0.0,
         white=white,
-        moment=moment,
+        motion=motion_point,
     )
 
 
@@ -147,7 +147,7 @@ def motion(t):
     a, b, c = (
         place(angle + arate * d, s) for d, s in zip((-h, 0, h), sw, strict=True)
     )  # to first order in the turn
-    return Moment(
+    return MotionPoint(
         np.zeros(3),
         b,
         from_vector(np.array([0.3, 0.2, angle])),

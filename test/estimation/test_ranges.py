@@ -10,13 +10,13 @@ from ctr_dynamics.estimation.filter.parameter_priors import model_uncertainty
 
 
 @pytest.fixture
-def fusion():
+def ekf():
     """The filter of a clean bag after half a second, which knows of parameters and tracker states together."""
-    return play(bag_messages("clean_sweep", 0.5)).estimator.fusion
+    return play(bag_messages("clean_sweep", 0.5)).estimator.runs.fused.ekf
 
 
-def parameter(fusion, name):
-    return fusion.uncertainty.names.index(name)
+def parameter(ekf, name):
+    return ekf.uncertainty.names.index(name)
 
 
 def nearest(covariance, row, value):
@@ -28,33 +28,33 @@ def nearest(covariance, row, value):
     return np.linalg.solve(system, np.append(np.zeros(size), value))[:size]
 
 
-def test_a_parameter_at_the_end_of_its_range_takes_the_rest_along(fusion):
-    u, rows = fusion.uncertainty, fusion.factor.theta
+def test_a_parameter_at_the_end_of_its_range_takes_the_rest_along(ekf):
+    u, rows = ekf.uncertainty, ekf.factor.theta
     r = rows.shape[1]
-    i = parameter(fusion, "base_viscous")
-    gain = fusion.pi[:, :r] @ rows[i]
+    i = parameter(ekf, "base_viscous")
+    gain = ekf.pi[:, :r] @ rows[i]
     x = gain * (-3.0 / (rows[i] @ gain[:r]))  # three times less than nothing
-    assert (fusion.theta + rows @ x[:r])[i] < u.lowest[i] - 1.0
-    moved = u.confined(x, fusion.theta, rows, fusion.pi)
-    theta = fusion.theta + rows @ moved[:r]
+    assert (ekf.theta + rows @ x[:r])[i] < u.lowest[i] - 1.0
+    moved = u.confined(x, ekf.theta, rows, ekf.pi)
+    theta = ekf.theta + rows @ moved[:r]
     assert theta[i] == pytest.approx(u.lowest[i], abs=1e-9)
     row = np.append(rows[i], np.zeros(len(x) - r))
-    wanted = x + nearest(fusion.pi, row, u.lowest[i] - fusion.theta[i] - rows[i] @ x[:r])
+    wanted = x + nearest(ekf.pi, row, u.lowest[i] - ekf.theta[i] - rows[i] @ x[:r])
     np.testing.assert_allclose(moved, wanted, atol=1e-6 * np.abs(wanted).max())
     assert np.all(theta >= u.lowest - 1e-9)
     assert np.all(theta <= u.highest + 1e-9)
 
 
-def test_corrections_inside_the_ranges_are_left_alone(fusion):
-    x = 0.1 * np.ones(len(fusion.pi))
-    confined = fusion.uncertainty.confined(x, fusion.theta, fusion.factor.theta, fusion.pi)
+def test_corrections_inside_the_ranges_are_left_alone(ekf):
+    x = 0.1 * np.ones(len(ekf.pi))
+    confined = ekf.uncertainty.confined(x, ekf.theta, ekf.factor.theta, ekf.pi)
     np.testing.assert_array_equal(confined, x)
 
 
-def test_ranges_are_those_of_a_robot(fusion):
-    u = model_uncertainty(fusion.model)
+def test_ranges_are_those_of_a_robot(ekf):
+    u = model_uncertainty(ekf.model)
     at = dict(zip(u.names, zip(u.lowest, u.highest, strict=True), strict=True))
-    mass = fusion.model.robot.tubes[0].end_body.mass.value
+    mass = ekf.model.robot.tubes[0].end_body.mass.value
     assert at["youngs_modulus.tube1"] == (-0.9, 9.0)
     assert at["payload_mass.tube1"] == pytest.approx((-0.9 * mass, 9.0 * mass))
     assert at["encoder_offset.tube2"] == (-0.5, 0.5)
@@ -68,8 +68,8 @@ def test_ranges_are_those_of_a_robot(fusion):
             "base_viscous",
             "mass_per_length",
         ):
-            rows = fusion.model.layout[name]
-            assert np.all((fusion.nominal + u.effect @ finite)[rows] >= 0.0), name
+            rows = ekf.model.layout[name]
+            assert np.all((ekf.nominal + u.effect @ finite)[rows] >= 0.0), name
 
 
 def test_an_encoder_that_is_twenty_deviations_off_is_found():
@@ -82,13 +82,13 @@ def test_an_encoder_that_is_twenty_deviations_off_is_found():
             m = replace(m, content=(names, shown))
         messages.append(m)
     run = play(messages)
-    fusion = run.estimator.fusion
-    i = parameter(fusion, "encoder_offset.tube2")
-    assert off > 19 * fusion.uncertainty.sigma[i]
-    assert fusion.theta[i] == pytest.approx(off, abs=0.2 * off)
+    ekf = run.estimator.runs.fused.ekf
+    i = parameter(ekf, "encoder_offset.tube2")
+    assert off > 19 * ekf.uncertainty.sigma[i]
+    assert ekf.theta[i] == pytest.approx(off, abs=0.2 * off)
     error, _ = truth_error(run, "clean_sweep", "p_trk")
     late = rms(error[len(error) // 2 :])
     assert 1e3 * late < 0.4
     wrong, _ = truth_error(play(messages, {"filter.enabled": "false"}), "clean_sweep", "p_trk")
     assert rms(wrong[len(wrong) // 2 :]) > 5 * late
-    assert estimator().fusion.theta[i] == 0.0
+    assert estimator().runs.fused.ekf.theta[i] == 0.0

@@ -1,10 +1,11 @@
-"""Starting anew, and what may be left of what was before."""
+"""Restarts, and what may be left of what was before."""
 
 import numpy as np
 import pytest
-from estimation_cases import START_NS, bag_messages, joints, play
+from estimation_cases import START_NS, bag_messages, estimator, joints, play
 
-from ctr_dynamics.estimation.estimator import DT_NS, MAX_FAILURES
+from ctr_dynamics.estimation.runs import MAX_FAILURES
+from ctr_dynamics.io.messages.topics import STEP_NS
 from ctr_dynamics.model.model import Model
 from ctr_dynamics.model.simulator import StepResult
 from ctr_dynamics.model.statics import Statics
@@ -19,46 +20,54 @@ def running():
     return play(bag_messages("clean_sweep", 1.0), {"output.policy": "predict"}).estimator
 
 
-def test_late_inputs_do_not_lead_back_to_before_a_new_start(running):
-    runs, k = running.runs, running.k
-    assert len(runs.kept) > 1
-    assert not runs.start(k)
-    assert [kept.k for kept in runs.kept] == [k]
-    last = running.inputs.joints.stamps[-1]
-    running.add_joint_state(last + 10_000_000, *joints(0.0, running.inputs.joints.values[-1]).content)
-    running.advance(START_NS + (k + 3) * DT_NS)
-    assert running.k >= k + 3
-    assert running.health.restarts == 0
-    assert runs.fused is not None
-
-
-def test_readings_that_were_fused_before_a_new_start_are_not_fused_again(running):
+def test_late_inputs_do_not_lead_back_to_before_a_restart(running):
     k = running.k
-    before = {s.stamp_ns: s.fused_k for s in running.inputs.samples if s.fused_k is not None}
+    running.runs.stop()
+    outputs = running.advance(START_NS + (k + 3) * STEP_NS)
+    assert outputs[0].solver.outcome == "at rest"
+    late = running.inputs.joints.stamps[-1] - 1_000_000
+    running.add_joint_state(late, *joints(0.0, running.inputs.joints.values[-1]).content)
+    outputs += running.advance(START_NS + (k + 6) * STEP_NS)
+    assert [out.k for out in outputs] == list(range(k + 1, k + 7))
+    assert all(out.valid for out in outputs)
+    assert running.late.history.checkpoints[0].k == k + 1
+
+
+def test_measurements_that_were_fused_before_a_restart_are_not_fused_again(running):
+    k, queue = running.k, running.inputs.measurements
+    before = queue.fused()
     assert before
     running.runs.start(k)
-    after = {s.stamp_ns: s.fused_k for s in running.inputs.samples if s.fused_k is not None}
-    assert after == {stamp: at for stamp, at in before.items() if at < k}
+    assert queue.fused() == {stamp: at for stamp, at in before.items() if at < k}
 
 
-def test_a_new_filter_begins_with_the_parameters_of_the_file(running):
-    """Its columns belong to the robot that it goes on with, not to the one that the estimate had strayed to."""
-    fusion, state, t = running.fusion, running.runs.alone, running.k * DT_NS * 1e-9
-    columns = []
-    for strayed in (False, True):
-        fusion.forget_parameters()
-        if strayed:
-            fusion.theta[0] = fusion.uncertainty.highest[0]
-            fusion._apply_theta()
-        fusion.start(state.copy(), t)
-        columns.append(fusion.factor.stored.copy())
-    np.testing.assert_array_equal(*columns)
+def test_a_reinitialised_filter_begins_with_the_parameters_of_the_file(running):
+    """Its factor belongs to the robot that it goes on with, not to the one that the estimate had come to."""
+    ekf, state, t = running.runs.fused.ekf, running.runs.open_loop.state, running.k * STEP_NS * 1e-9
+    factors = []
+    for off_nominal in (False, True):
+        ekf.forget_parameters()
+        if off_nominal:
+            ekf.theta[0] = ekf.uncertainty.highest[0]
+            ekf.simulator.parameters += ekf.uncertainty.effect[:, 0] * ekf.theta[0]
+        ekf.start(state.copy(), t)
+        factors.append(ekf.factor.stored.copy())
+    np.testing.assert_array_equal(*factors)
 
 
-def test_a_reset_forgets_which_readings_were_counted(running):
-    assert running._reported
-    running.reset()
-    assert not running._reported
+def test_measurements_of_the_same_stamps_count_again_after_a_reset():
+    messages = bag_messages("clean_sweep", 0.5)
+    made = estimator({"output.policy": "predict"})
+    counted = []
+    for _ in range(2):
+        for message in sorted(messages, key=lambda m: m.arrival):
+            message.give(made)
+            made.advance(START_NS + message.arrival)
+        made.finish()
+        counted.append(made.health.nis_count)
+        made.reset()
+    assert counted[0] > 10
+    assert counted[1] == 2 * counted[0]
 
 
 def test_after_a_gap_actuators_go_on_from_where_the_steps_had_them():
@@ -91,10 +100,10 @@ def test_a_way_back_bears_as_many_failed_steps_as_the_way_on(running, monkeypatc
     stamps = running.inputs.joints.stamps
     between = (stamps[-4] + stamps[-5]) // 2  # a joint state that came late
     running.add_joint_state(between, *joints(0.0, running.inputs.joints.values[-4]).content)
-    running._go_back()
+    running.late.correct()
     assert running.k == k
     assert failed[0] < k
-    assert (runs.fused is None) == given_up
+    assert runs.running != given_up
     assert running.health.restarts == int(given_up)
     assert running.health.reasons["made to fail"] == len(failed)
 

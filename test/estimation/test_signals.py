@@ -66,7 +66,7 @@ def test_stages_together_are_the_stages_alone(sampled, first, extrapolate, load)
     for k in range({"none": 0, "held": 1, "moving": 9}[load]):
         wrench.add((10 * k - 12) * MS, RNG.normal(size=6))
     inputs = SimpleNamespace(
-        t0_ns=t0_ns, joints=sampled, load=wrench, timeout_ns=extrapolate * MS, predicting=extrapolate > 0
+        t0_ns=t0_ns, joints=sampled, load=wrench, timeout_ns=extrapolate * MS, extrapolating=extrapolate > 0
     )
     signals = Signals(SimpleNamespace(n=2, input_count=14), inputs)
     stamps = [round((first + part) * MS) for part in (0.4359, 0.718, 1.0)]

@@ -94,7 +94,7 @@ class StandIn:
             self.k += 1
         return found
 
-    def use_pause(self) -> None:
+    def do_idle_work(self) -> None:
         pass
 
     def advance(self, now_ns=None) -> list:

@@ -38,7 +38,7 @@ class Scripted:
         self.lead_ns = 0
         self.spare_s = None
 
-    def use_pause(self):
+    def do_idle_work(self):
         self.pauses += 1
 
     def advance(self, now_ns=None, spare_s=None, most=None):
@@ -249,7 +249,7 @@ def test_faults_beside_the_steps_do_not_end_them(clock):
     def fails(*_):
         raise OSError("no room")
 
-    loop._housekeeping = estimator.use_pause = fails
+    loop._housekeeping = estimator.do_idle_work = fails
     for _ in range(2):
         loop._round()
         clock.now += STEP_NS

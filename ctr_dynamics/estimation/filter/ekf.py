@@ -376,6 +376,19 @@ class RodEkf:
         )  # fmt: skip
         return TipEstimate(pose[:3], pose[3:], tip.mean[7:13].copy(), covariance, sigma, finite)
 
+    def parameters(self, known: bool = True) -> dict[str, dict[str, float | None]]:
+        """Value and deviation of every uncertain parameter by its name; no deviations unless they are ``known``."""
+        rows = self.factor.theta if known else None
+        sigma: list[float | None] = [None] * len(self.theta)
+        if rows is not None:
+            r = rows.shape[1]
+            variance = np.einsum("ij,jk,ik->i", rows, self.pi[:r, :r], rows)
+            sigma = np.sqrt(np.maximum(variance, 0.0)).tolist()
+        return {
+            name: {"value": float(value), "sigma": deviation}
+            for name, value, deviation in zip(self.uncertainty.names, self.theta, sigma, strict=True)
+        }
+
     # -- checkpoints --
 
     def checkpoint(self) -> FilterState:

@@ -17,7 +17,7 @@ REJOIN_S = 0.01
 
 
 class Signals:
-    """Actuators and known load at the stages of a step; those of one step are kept, as both runs ask for them."""
+    """Actuators and known load at the stages of a step; those of one step are remembered, as both runs ask for them."""
 
     def __init__(self, model: Model, inputs: InputBuffer) -> None:
         self.n, self.count, self.inputs = model.n, model.input_count, inputs
@@ -32,8 +32,8 @@ class Signals:
     def go_on_from(self, t: float, inputs: Inputs) -> None:
         """Have the actuators go on, after ``t`` (s), from where ``inputs`` had them then, and join what is known of them now little by little.
 
-        Joints that come in change what was extrapolated. A course that goes on without having been corrected for that would take the change as
-        a jump of the actuators within one step.
+        Joints that come in change what was extrapolated. Steps that go on without having been corrected for that would take the change as a jump
+        of the actuators within one step.
         """
         known, _ = self.rows(np.array([t]))
         self.clear()
@@ -69,7 +69,7 @@ class Signals:
     def _at(self, times: Floats) -> tuple[Floats, Floats]:
         n, t0_ns, joints, load = self.n, self.inputs.t0_ns, self.inputs.joints, self.inputs.load
         assert t0_ns is not None
-        ahead_ns = self.inputs.timeout_ns if self.inputs.predicting else 0
+        ahead_ns = self.inputs.timeout_ns if self.inputs.extrapolating else 0
         first_ns, last_ns = t0_ns + round(float(times[0]) * 1e9), t0_ns + round(float(times[-1]) * 1e9)
         drives = joints.around(first_ns, last_ns, ahead_ns)
         wrench = load.around(first_ns, last_ns) if load.stamps else self._no_load

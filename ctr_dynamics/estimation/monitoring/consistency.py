@@ -95,8 +95,8 @@ class MisfitMonitor:
             self._nis -= old
             self._dof -= dof
         self._count += 1
-        if innovation.moment is not None:
-            self._regression.add(time, innovation.moment)
+        if innovation.motion is not None:
+            self._regression.add(time, innovation.motion)
         self._judge(time, nis, innovation.dof)
 
     def _judge(self, time: float, nis: float, dof: int) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,8 +19,20 @@ Floats = NDArray[np.float64]
 SNAP_WARNING_S = 1.0  # a snap that is nearer than this is warned of
 TRACKER_LIMIT_S = 1.0  # without a usable sample for longer than this the status says so
 WAITING = "waiting for the first complete joint state"
-# what is counted once a sample, though samples are fused again when a step is taken again
-OF_SAMPLES = ("nis_count", "nis_sum", "nis_dof", "accepted", "rejected", "dropped", "_squares", "_compared")
+
+
+class MeasurementCounts(NamedTuple):
+    """What is counted once a measurement, though it is fused again where its step is corrected; see :class:`Health`."""
+
+    nis_count: int
+    nis_sum: float
+    nis_dof: int
+    accepted: int
+    rejected: int
+    dropped: int
+    squares: tuple[float, float]
+    compared: int
+    recent: list[tuple[float, bool]]
 
 
 @dataclass
@@ -91,8 +103,8 @@ class Health:
 
     def measured(self, sample: Innovation) -> None:
         """Count a tracker sample: how far it lies from the outputs of its time, whether it reached the gate, lay within and was fused."""
-        if sample.moment is not None and sample.fused is not None:
-            alone, fused = sample.moment.residual, sample.fused
+        if sample.motion is not None and sample.fused_residual is not None:
+            alone, fused = sample.motion.residual, sample.fused_residual
             self._squares = self._squares[0] + float(alone @ alone), self._squares[1] + float(fused @ fused)
             self._compared += 1
         if not sample.dof:
@@ -113,17 +125,20 @@ class Health:
         alone, fused = (math.sqrt(s / self._compared) if self._compared else None for s in self._squares)
         return {"predicted": alone, "fused": fused if self.fusing else None}
 
-    def of_samples(self) -> tuple:
-        """What is counted of samples, for :meth:`return_to`."""
-        return (*(getattr(self, name) for name in OF_SAMPLES), list(self.recent))
+    def measurement_counts(self) -> MeasurementCounts:
+        """What has been counted of measurements, for :meth:`restore_counts`."""
+        return MeasurementCounts(
+            self.nis_count, self.nis_sum, self.nis_dof, self.accepted, self.rejected, self.dropped,
+            self._squares, self._compared, list(self.recent),
+        )  # fmt: skip
 
-    def return_to(self, counted: tuple) -> None:
-        """Have counted of samples what :meth:`of_samples` gave."""
-        *values, recent = counted
-        for name, value in zip(OF_SAMPLES, values, strict=True):
-            setattr(self, name, value)
+    def restore_counts(self, counts: MeasurementCounts) -> None:
+        """Have counted of measurements what :meth:`measurement_counts` gave."""
+        self.nis_count, self.nis_sum, self.nis_dof = counts.nis_count, counts.nis_sum, counts.nis_dof
+        self.accepted, self.rejected, self.dropped = counts.accepted, counts.rejected, counts.dropped
+        self._squares, self._compared = counts.squares, counts.compared
         self.recent.clear()
-        self.recent.extend(recent)
+        self.recent.extend(counts.recent)
 
     def begin_anew(self) -> None:
         """Wait for joints and watch afresh; counters of what was odd stay."""
@@ -161,6 +176,26 @@ class Health:
             "lower95": lower,
             "upper95": upper,
             "within": lower <= mean <= upper,
+        }
+
+    def summary(self) -> dict[str, Any]:
+        """The counters as a replay's summary has them."""
+        return {
+            "steps": self.steps,
+            "residual_rms_m": self.residual_rms(),
+            "nis": self.nis_summary(),
+            "rejected": self.rejected,
+            "late": self.late,
+            "dropped": self.dropped,
+            "input_problems": self.input_problems(),
+            "solver": {
+                "failures": self.failures,
+                "reasons": dict(self.reasons),
+                "restarts": self.restarts,
+                "substeps": self.substeps,
+                "sweeps_per_step": self.sweeps / self.steps if self.steps else 0.0,
+                "steps_taken_again": self.rolled_back,
+            },
         }
 
     def statuses(self) -> list[Status]:

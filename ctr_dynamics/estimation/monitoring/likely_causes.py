@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ctr_dynamics.estimation.step_output import Moment
+from ctr_dynamics.estimation.step_output import MotionPoint
 from ctr_dynamics.kernels.filter_steps import matrix
 
 Floats = NDArray[np.float64]
@@ -33,7 +33,7 @@ TOGETHER = 32  # moments taken in at once
 
 
 class Course(NamedTuple):
-    """Moments one after another, arrays of them (k, ...) as in :class:`ctr_dynamics.estimation.step_output.Moment`, and what the signatures share:
+    """Points one after another, arrays of them (k, ...) as in :class:`~ctr_dynamics.estimation.step_output.MotionPoint`, and what signatures share:
     ``frame`` (k, 3, 3) of the tip, ``moving`` (k,) from 0 at rest to 1, and the sign of each tube's last motion ``held`` (k, n)."""
 
     residual: Floats
@@ -48,7 +48,7 @@ class Course(NamedTuple):
     held: Floats
 
 
-def course(moments: Sequence[Moment], held: Floats) -> Course:
+def course(moments: Sequence[MotionPoint], held: Floats) -> Course:
     """The ``moments`` as a course; ``held`` (n,): sign of each tube's motion before them."""
     every = [np.array(values) for values in zip(*moments, strict=True)]
     residual, position, quaternion, velocity, acceleration, alpha, alpha_rate, beta_rate = every
@@ -180,14 +180,14 @@ class Regression:
 
     def clear(self) -> None:
         """Forget everything."""
-        self._waiting: list[tuple[float, Moment]] = []
+        self._waiting: list[tuple[float, MotionPoint]] = []
         self._time: float | None = None  # of the newest moment
         self._last: float | None = None  # of the newest that has been taken in
         self._held: Floats | None = None
         self.seconds = 0.0
         self.samples = 0.0
 
-    def add(self, time: float, moment: Moment) -> None:
+    def add(self, time: float, moment: MotionPoint) -> None:
         """Take in the moment of a sample of ``time`` (s), unless it follows the last one too closely to say anything new."""
         if self._time is not None and abs(time - self._time) < CLOSE:
             return

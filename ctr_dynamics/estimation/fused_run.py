@@ -1,0 +1,136 @@
+"""The fused run: the model whose fields and parameters the filter corrects by tracker measurements."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ctr_dynamics.estimation.filter.ekf import FilterState, RodEkf
+from ctr_dynamics.estimation.inputs.actuation import Actuation, Signals
+from ctr_dynamics.estimation.inputs.input_buffer import InputBuffer
+from ctr_dynamics.estimation.inputs.measurement_queue import DueMeasurement
+from ctr_dynamics.estimation.monitoring.health import Health
+from ctr_dynamics.estimation.monitoring.innovation_log import InnovationLog
+from ctr_dynamics.estimation.open_loop import OpenLoopRun
+from ctr_dynamics.estimation.step_output import Innovation, MotionPoint
+from ctr_dynamics.estimation.timeline import DT, seconds
+from ctr_dynamics.kernels.workspace import input_row
+from ctr_dynamics.model.simulator import State
+
+Floats = NDArray[np.float64]
+
+
+class FusedState(NamedTuple):
+    """What a checkpoint stores of the :class:`FusedRun`."""
+
+    state: State
+    filter: FilterState
+
+
+class FusedRun:
+    """One simulation and its filter.
+
+    Args:
+        ekf: the filter, with the simulator that it corrects.
+        signals: actuators and known load.
+        load: (inputs,) load of the robot file.
+        inputs: for the actuators at a measurement's time.
+        health, innovations: where outcomes are counted and collected.
+
+    Attributes:
+        state: after the last step; None before the start and after what cannot be gone on from.
+        measured_ns: stamp of the newest measurement that reached the gate.
+    """
+
+    def __init__(
+        self, ekf: RodEkf, signals: Signals, load: Floats, inputs: InputBuffer, health: Health, innovations: InnovationLog
+    ) -> None:  # fmt: skip
+        self.ekf, self.simulator = ekf, ekf.simulator
+        self._signals, self._load, self._inputs = signals, load, inputs
+        self._health, self._innovations = health, innovations
+        model = ekf.model
+        rows = [input_row(model.tubes, i) for i in range(model.input_count)]
+        self._by_theta = ekf.uncertainty.effect[rows]  # encoder offsets and tip force
+        self.state: State | None = None
+        self.measured_ns: int | None = None
+
+    def clear(self) -> None:
+        """Have no state, and the parameters of the robot file."""
+        self.ekf.forget_parameters()
+        self.state, self.measured_ns = None, None
+
+    def start(self, state: State, t: float) -> None:
+        """Begin at the static equilibrium ``state`` at the time ``t`` (s)."""
+        self.state = state
+        self.ekf.start(state, t)
+
+    @property
+    def inputs_at(self) -> Actuation:
+        """Actuators and load with the estimated offsets and force."""
+        return Actuation(self._signals, self._load, self._by_theta, self.ekf.theta)
+
+    def update(self, k: int, due: Sequence[DueMeasurement], open_loop: OpenLoopRun) -> None:
+        """Compare the measurements that have come ``due`` after step ``k`` with the tips of their times, and fuse them."""
+        assert self.state is not None
+        for measurement, time_s, position, quaternion in due:
+            measurement.fused_k = k
+            motion, residual = self.residuals(time_s, position, quaternion, open_loop)
+            if self._health.fusing:
+                update = self.ekf.update(self.state, time_s, position, quaternion)
+            else:
+                update = self.ekf.compare(time_s, position, quaternion)
+            if update.dof:
+                self.measured_ns = max(self.measured_ns or 0, measurement.stamp_ns)
+            else:
+                self._health.note(
+                    "tracker",
+                    "outside the window",
+                    f"pose of t = {time_s:.3f} s at step {k}: {update.reason}",
+                )
+            self._innovations.add(
+                Innovation(
+                    measurement.stamp_ns, update.residual, update.variance, update.nis, update.dof, update.accepted,
+                    measurement.late_s, update.reason, update.white, motion, residual,
+                )
+            )  # fmt: skip
+        self._health.force_sigma = self.ekf.force_variance.sigma
+
+    def residuals(
+        self, time_s: float, position: Floats, quaternion: Floats, open_loop: OpenLoopRun
+    ) -> tuple[MotionPoint | None, Floats | None]:
+        """How far a measurement lies from both runs, before its update: the open-loop run there, and the residual (3,) m of the fused tip."""
+        tracker, inputs, n = self.ekf.tracker, self._inputs, self.ekf.model.n
+        own_s = time_s - tracker.delay
+        fused = tracker.observed_tip(lambda s: self.ekf.tips.at(s, DT, columns=False), own_s)
+        found = open_loop.observed(tracker, own_s)
+        if fused is None or found is None:
+            return None, None
+        tip, acceleration = found
+        position, _ = tracker.to_base(position, quaternion, fused.quaternion)
+        estimate = tracker.registered(self.ekf.bias, fused)[:3]
+        assert inputs.t0_ns is not None
+        joints, rates = inputs.joints.at(inputs.t0_ns + (time_s - tracker.age) * 1e9)
+        motion = MotionPoint(
+            position - tip.position, tip.position, tip.quaternion, tip.velocity, acceleration,
+            joints[:n], rates[:n], rates[n:],
+        )  # fmt: skip
+        return motion, position - estimate
+
+    def reinitialise(self, open_loop: OpenLoopRun, k: int) -> None:
+        """Go on from the open-loop run at step ``k``: a correction has led this run astray."""
+        assert open_loop.state is not None
+        self.start(open_loop.state.copy(), seconds(k))
+        self._health.restarts += 1
+
+    def checkpoint(self) -> FusedState:
+        """What :meth:`restore` returns to."""
+        assert self.state is not None
+        return FusedState(self.state.copy(), self.ekf.checkpoint())
+
+    def restore(self, stored: FusedState) -> None:
+        """Return to a checkpoint."""
+        self.state = stored.state.copy()
+        self.ekf.restore(stored.filter)

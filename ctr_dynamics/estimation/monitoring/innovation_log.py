@@ -1,0 +1,80 @@
+"""Innovations of processed measurements: each is counted and published once, however often its measurement is fused again."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from ctr_dynamics.estimation.monitoring.health import Health, MeasurementCounts
+from ctr_dynamics.estimation.step_output import Innovation
+
+REMEMBERED = 200  # reported innovations: corrections reach back less than 2 s, 80 measurements at 40 Hz
+
+
+class Mark(NamedTuple):
+    """A place in the log: how many innovations waited there, and what had been counted."""
+
+    waiting: int
+    counts: MeasurementCounts
+
+
+class InnovationLog:
+    """Innovations from the update to the next output.
+
+    Args:
+        health: counts them, and watches their consistency.
+    """
+
+    def __init__(self, health: Health) -> None:
+        self._health = health
+        self._waiting: list[Innovation] = []  # for the next output
+        self._reported: deque[Innovation] = deque(maxlen=REMEMBERED)
+        self._unjudged: deque[Innovation] = deque()  # by the consistency monitor
+
+    def clear(self) -> None:
+        """Forget everything; what has been counted stays."""
+        self._waiting.clear()
+        self._reported.clear()
+        self._unjudged.clear()
+
+    def add(self, innovation: Innovation) -> None:
+        """Take in the innovation of a measurement, fused or not."""
+        self._health.measured(innovation)
+        self._waiting.append(innovation)
+
+    def take(self) -> list[Innovation]:
+        """The innovations for the next output."""
+        waiting, self._waiting = self._waiting, []
+        self._reported.extend(waiting)
+        self._unjudged.extend(waiting)
+        return waiting
+
+    def judge(self) -> None:
+        """Hand what has been published to the consistency monitor."""
+        while self._unjudged:
+            self._health.misfit.add(self._unjudged.popleft())
+
+    # -- corrections --
+
+    def mark(self) -> Mark:
+        """The present place, for :meth:`discard` or :meth:`keep_new`."""
+        return Mark(len(self._waiting), self._health.measurement_counts())
+
+    def discard(self, mark: Mark) -> None:
+        """Take back what has come since ``mark``: those measurements will be fused again."""
+        self._recount(mark, [])
+
+    def keep_new(self, mark: Mark) -> None:
+        """Of what has come since ``mark``, take back the innovations of measurements that have been counted before."""
+        again = self._waiting[mark.waiting :]
+        if again:
+            counted = {i.stamp_ns for i in (*self._reported, *self._waiting[: mark.waiting])}
+            self._recount(mark, [i for i in again if i.stamp_ns not in counted])
+
+    def _recount(self, mark: Mark, new: Sequence[Innovation]) -> None:
+        del self._waiting[mark.waiting :]
+        self._health.restore_counts(mark.counts)
+        for innovation in new:
+            self._health.measured(innovation)
+        self._waiting.extend(new)
