@@ -16,7 +16,7 @@ from ctr_dynamics.diagnosis import diagnosis_options
 from ctr_dynamics.errors import InputError
 from ctr_dynamics.io.messages.topics import TOPICS
 from ctr_dynamics.parameters import PARAMETERS, Parameter
-from tools import message_pages, reference, words
+from tools import effects_page, message_pages, reference, words
 
 ESTIMATOR_YAML = Path("ctr_dynamics/config/estimator.yaml")
 
@@ -158,6 +158,7 @@ def outdated(root: Path) -> dict[Path, str]:
         **{root / "msg_docs" / name: text for name, text in message_pages.pages().items()},
         root / ESTIMATOR_YAML: estimator_yaml(),
         root / reference.PAGE: reference.render(),
+        root / effects_page.PAGE: effects_page.render(),
     }
     return {
         path: text

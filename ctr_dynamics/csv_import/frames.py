@@ -11,7 +11,7 @@ from ctr_dynamics.csv_import.column_layout import FORCE, POSITION, QUATERNION, T
 from ctr_dynamics.csv_import.convert import Log
 from ctr_dynamics.io.bag_checks import Finding
 from ctr_dynamics.io.messages import topics
-from ctr_dynamics.kernels.rotations import conjugate, from_vector, matrix, multiply, to_vector
+from ctr_dynamics.kernels.rotations import conjugate, multiply, to_vector
 from ctr_dynamics.model.model import Model
 from ctr_dynamics.model.statics import Statics
 from ctr_dynamics.robot import Robot
@@ -40,30 +40,29 @@ def compare(joints: Log, tracker: Log, robot: Robot, load: Log | None = None) ->
     statics = Statics(Model(robot, nodes=24))
     stamps, at = np.array(tracker.stamp_ns), np.array(joints.stamp_ns)
     positions, quaternions = tracker.columns(POSITION), tracker.columns(QUATERNION)[:, [3, 0, 1, 2]]
-    registration = from_vector(np.array(robot.tracker.registration_rotation.value))
-    shift = np.array(robot.tracker.registration_translation.value)
-    lever = np.array(robot.tracker.lever_arm.value)
+    plant, now = statics.model.plant, np.zeros(1)
     expected_p, expected_h, measured_p, measured_h = [], [], [], []
     for index in _slow(stamps, positions):
         alpha = np.array([np.interp(stamps[index], at, column) for column in alphas.T])
         beta = np.array([np.interp(stamps[index], at, column) for column in betas.T])
         wrench = _wrench_at(load, stamps[index])
-        found = statics.solve(beta, alpha, wrench[:3], wrench[3:])
+        drive = plant.actuators.forward(np.concatenate([alpha, beta]))
+        found = statics.solve(drive[n:], drive[:n], wrench[:3], wrench[3:])
         if found.converged:
-            R = matrix(found.tip_quaternion)
-            expected_p.append(matrix(registration) @ (found.tip_position + R @ lever) + shift)
-            expected_h.append(multiply(registration, found.tip_quaternion))
+            p, h = plant.tracker.reported(now, found.tip_position[None], found.tip_quaternion[None])
+            expected_p.append(p[0])
+            expected_h.append(h[0])
             measured_p.append(positions[index])
             measured_h.append(quaternions[index])
     if not expected_p:
         return None
-    p, q = np.array(measured_p), np.array(expected_p)
-    distance = _median(p, q)
+    measured, expected = np.array(measured_p), np.array(expected_p)
+    distance = _median(measured, expected)
     angle = _angles(measured_h, expected_h)
     hints = []
-    for name, turned in _position_readings(p).items():
-        if _median(turned, q) < 0.3 * distance and distance > DISTANCE_M:
-            hints.append(f"positions read as {name} are {1e3 * _median(turned, q):.1f} mm away")
+    for name, turned in _position_readings(measured).items():
+        if _median(turned, expected) < 0.3 * distance and distance > DISTANCE_M:
+            hints.append(f"positions read as {name} are {1e3 * _median(turned, expected):.1f} mm away")
     for name, other in (("w, x, y, z", [1, 2, 3, 0]), ("x, y, z, w", [3, 0, 1, 2])):
         swapped = _angles([h[other] for h in measured_h], expected_h)
         if swapped < 0.3 * angle and angle > ANGLE_RAD:
@@ -71,7 +70,7 @@ def compare(joints: Log, tracker: Log, robot: Robot, load: Log | None = None) ->
     inverse = _angles([conjugate(h) for h in measured_h], expected_h)
     if inverse < 0.3 * angle and angle > ANGLE_RAD:
         hints.append(f"inverse rotations are {np.degrees(inverse):.1f} deg away")
-    return Agreement(len(p), distance, angle, "; ".join(hints))
+    return Agreement(len(measured), distance, angle, "; ".join(hints))
 
 
 def findings(agreement: Agreement | None, has_orientation: bool) -> list[Finding]:

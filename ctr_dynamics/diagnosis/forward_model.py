@@ -68,7 +68,7 @@ class ForwardModel:
             load.add(round(time * 1e9), np.array(wrench))
         # a step across a slope discontinuity of the load would make the error of the prediction depend on where in the step it lies, and the
         # misfit a rough function of every delay
-        discontinuities = load.bends(-np.inf, np.inf, self._models[False].load_kink / dt)
+        discontinuities = load.slope_changes(-np.inf, np.inf, self._models[False].load_slope_limit / dt)
         self._load_events = 1e-9 * np.array(discontinuities, dtype=float)
 
     def resolved(self, nodes: int, dt: float) -> ForwardModel:

@@ -13,7 +13,7 @@ CATALOGUE = (
     drivetrain.actuator_latency,
     kinematics.insertion_velocity,
     kinematics.clearance,
-    kinematics.play_kinematics,
+    kinematics.clearance_kinematics,
     environment.load_time,
     friction.base_coulomb,
     friction.base_viscous,

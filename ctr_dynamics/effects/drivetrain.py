@@ -13,7 +13,7 @@ from ctr_dynamics.effects.registry import EffectParameter, Values, effect, per_t
     EffectParameter("tubeN.beta_offset_m", "m", 0.0, 2.5e-3, text="true beta minus reading"),
     text="A tube stands further out or in than its translation reads.",
     source="Till et al. (2020), fig. 2: beta",
-    far=(-1.5, -0.7, 0.7, 1.5),
+    large_sizes=(-1.5, -0.7, 0.7, 1.5),
 )
 def exposed_length(plant: Plant, values: Values) -> None:
     before = plant.actuators.beta_offset
@@ -54,7 +54,7 @@ def encoder_gain(plant: Plant, values: Values) -> None:
     ),
     text="A tube follows its drive only after the dead zone of a reversal.",
     source="Nordin and Gutman (2002): the play operator",
-    probes=(0.7, 2.0),
+    finite_sizes=(0.7, 2.0),
 )
 def backlash(plant: Plant, values: Values) -> None:
     plant.change_actuators(backlash=plant.actuators.backlash + per_tube(plant, values, "width_rad"))

@@ -61,7 +61,7 @@ def tip_force(plant: Plant, values: Values) -> None:
     text="The tip hangs on something elastic, such as tissue.",
     source="Kelvin-Voigt element: F = k (anchor - p) - c v",
     extended=True,
-    far=(0.2, 0.5, 1.0, 2.0),
+    large_sizes=(0.2, 0.5, 1.0, 2.0),
     joint=True,
 )
 def tip_spring(plant: Plant, values: Values) -> None:
@@ -80,10 +80,10 @@ def tip_spring(plant: Plant, values: Values) -> None:
     EffectParameter("ny", "1", 1.0, 0.5, shape=True, text="normal of the plane"),
     EffectParameter("nz", "1", 0.0, 0.5, shape=True, text="normal of the plane"),
     EffectParameter("offset_m", "m", -math.inf, 0.01, shape=True, text="the plane is normal . p = offset"),
-    text="The tip touches a wall and is pushed back in proportion to the depth.",
+    text="The tip touches a flat obstacle and is pushed back in proportion to the depth.",
     source="penalty contact: Johnson, Contact Mechanics (1985)",
     extended=True,
-    probes=(0.7,),
+    finite_sizes=(0.7,),
     joint=True,
     impacts=True,
 )

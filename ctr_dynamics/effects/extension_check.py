@@ -15,7 +15,7 @@ from ctr_dynamics.robot.quantity import number
 
 
 def check_extensions(given: Mapping[str, Mapping[str, Any]], n_tubes: int) -> None:
-    """Refuse what is no effect or parameter of the catalogue, tubes that the robot lacks, and values that are not finite or out of bounds.
+    """Reject what is no effect or parameter of the catalogue, tubes that the robot lacks, and values that are not finite or out of bounds.
 
     Args:
         given: values by effect and parameter, as a robot file holds them.

@@ -1,7 +1,7 @@
 """Effects of friction: at the base plate, between the tubes, along their overlap, against the air.
 
 Prior scales are sizes at which an effect would be noticed on a robot of this size, such as a viscous torque that damps the first torsional
-mode by some per cent; a robot file's own value widens them where it is larger.
+mode by some per cent; the scale grows with the value of a robot file where that is larger.
 """
 
 from __future__ import annotations
@@ -82,7 +82,7 @@ tube_viscous = _coefficient(
     source="Armstrong-Helouvry, Dupont, Canudas de Wit (1994): Gaussian Stribeck curve",
     extended=True,
     presets=({"speed_rad_s": 0.5}, {"speed_rad_s": 1.6}, {"speed_rad_s": 5.0}),
-    far=(2.0,),
+    large_sizes=(2.0,),
 )
 def stribeck(plant: Plant, values: Values) -> None:
     if values["static_ratio"] != 1.0:

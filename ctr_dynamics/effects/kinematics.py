@@ -32,7 +32,7 @@ def insertion_velocity(plant: Plant, values: Values) -> None:
     source="smooth saturation of the tilt, play * m / sqrt(m^2 + m0^2) with m0 = 0.01 N m; clearance: Ha, Fritzler, Park and Dupont (2016)",
     extended=True,
     presets=({"share": 0.0}, {"share": 1.0}),
-    probes=(0.6, 1.2, 1.6),
+    finite_sizes=(0.6, 1.2, 1.6),
     form=("play_kinematics",),
 )
 def clearance(plant: Plant, values: Values) -> None:
@@ -55,5 +55,5 @@ def clearance(plant: Plant, values: Values) -> None:
     extended=True,
     nuisance=True,
 )
-def play_kinematics(plant: Plant, values: Values) -> None:
+def clearance_kinematics(plant: Plant, values: Values) -> None:
     plant.put("play_share", values["share"])

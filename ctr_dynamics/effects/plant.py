@@ -14,7 +14,14 @@ from numpy.typing import NDArray
 
 from ctr_dynamics.kernels.layout import Layout
 from ctr_dynamics.robot import Robot
-from ctr_dynamics.sensing import SENSORS, ActuatorModel, Measurement, TrackerModel
+from ctr_dynamics.sensing import (
+    SENSORS,
+    ActuatorCorrection,
+    ActuatorModel,
+    Measurement,
+    TrackerCorrection,
+    TrackerModel,
+)
 
 Floats = NDArray[np.float64]
 CLEARANCE_MOMENT = 0.01  # N m at which 70 % of the clearance between two tubes is taken up
@@ -27,7 +34,7 @@ class Plant:
     Attributes:
         robot: where they come from.
         layout, block: rows and values of the model's parameters; actuators and tip wrench are 0 in it.
-        actuators: from encoder readings to the tubes' bases.
+        actuators: from encoders to the tubes' bases.
         sensors: by name; :attr:`tracker` is the one of the tip.
         load_delay: s, known loads act this much later than stamped.
         tip_force: (3,) N, unknown constant force in base axes.
@@ -75,6 +82,14 @@ class Plant:
         """Give the tracker model other attributes."""
         self.sensors["tracker"] = self.tracker.changed(**values)
 
+    def correct_actuators(self, correction: ActuatorCorrection) -> None:
+        """Put a further link behind gain and offset of the encoders."""
+        self.change_actuators(corrections=(*self.actuators.corrections, correction))
+
+    def correct_tracker(self, correction: TrackerCorrection) -> None:
+        """Put a further link behind the registration of the tracker."""
+        self.change_tracker(corrections=(*self.tracker.corrections, correction))
+
     def scale(self, group: str, tube: int | None, factor: float) -> None:
         """Multiply a group of the parameter block, for one tube (from 0) or all."""
         rows = self.layout[group]
@@ -103,7 +118,7 @@ class Plant:
         return other
 
     def has_inputs_of(self, other: Plant) -> bool:
-        """Whether actuators and loads of both follow alike from the same readings."""
+        """Whether actuators and loads of both follow alike from the same measurements."""
         return all(
             same(getattr(self, name), getattr(other, name))
             for name in ("actuators", "load_delay", "tip_force")

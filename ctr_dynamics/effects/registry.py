@@ -78,12 +78,12 @@ class Effect:
         apply: changes a plant by values by name (all names present, ``tubeN`` expanded).
         text: what it models, one sentence. source: where the physics comes from.
         extended: whether it needs the extended kernels.
-        probes: sizes, in scales, at which it is tried where its derivative at the off-value says little; empty where that serves.
-        far: sizes, in scales, at which its first parameter is tried besides where the misfit is large: it changes a frequency, and in time a
+        finite_sizes: sizes, in scales, at which it is tried where its derivative at the off-value says little; empty where that serves.
+        large_sizes: sizes, in scales, at which its first parameter is tried besides where the misfit is large: it changes a frequency, and in time a
             phase, beyond what its derivative says.
         joint: parameters that are only tried together (a vector); else each is a variant of its own.
         presets: values of the shape parameters from which a search starts, by name; several are tried.
-        nuisance: not a cause by itself: it widens what others may explain, and is not in the catalogue of findings.
+        nuisance: not a cause by itself: it adds to the uncertainty of others, and is not in the catalogue of findings.
         impacts: whether it strikes the robot: steps in time follow that to a limited degree only.
         form: nuisances that are free only beside this effect, for what is uncertain in its form; presets may name their parameters.
     """
@@ -94,8 +94,8 @@ class Effect:
     text: str
     source: str
     extended: bool = False
-    probes: tuple[float, ...] = ()
-    far: tuple[float, ...] = ()
+    finite_sizes: tuple[float, ...] = ()
+    large_sizes: tuple[float, ...] = ()
     joint: bool = False
     presets: tuple[Mapping[str, float], ...] = ({},)
     nuisance: bool = False

@@ -57,7 +57,7 @@ _YOUNGS = "Young's modulus; G follows where the robot file gives none"
     _all_tubes(0.04, _YOUNGS),
     text="A tube is stiffer or softer than the robot file says.",
     source="Till et al. (2020), (16): E I",
-    far=(-2.0, -1.0, 1.0, 2.0),
+    large_sizes=(-2.0, -1.0, 1.0, 2.0),
 )
 def youngs_modulus(plant: Plant, values: Values) -> None:
     for i, tube in enumerate(plant.robot.tubes):
@@ -74,7 +74,7 @@ def youngs_modulus(plant: Plant, values: Values) -> None:
     _all_tubes(0.08, "shear modulus"),
     text="A tube is stiffer or softer in torsion.",
     source="Till et al. (2020), (16): G J",
-    far=(-2.0, 2.0),
+    large_sizes=(-2.0, 2.0),
 )
 def shear_modulus(plant: Plant, values: Values) -> None:
     _scale(plant, values, "torsional_stiffness")
@@ -113,7 +113,7 @@ def density(plant: Plant, values: Values) -> None:
     ),
     text="The payload is heavier or lighter, as by a point mass at the tip.",
     source="Till et al. (2020), (21)",
-    far=(-2.0, -1.0, 1.0, 2.0),
+    large_sizes=(-2.0, -1.0, 1.0, 2.0),
 )
 def payload_mass(plant: Plant, values: Values) -> None:
     if values["added_kg"] != 0.0:
@@ -132,7 +132,7 @@ def payload_mass(plant: Plant, values: Values) -> None:
     ),
     text="The payload resists rotation more or less than its mass says.",
     source="Till et al. (2020), (21): H",
-    far=(-0.9, -0.5, 0.5, 0.9, 1.4),
+    large_sizes=(-0.9, -0.5, 0.5, 0.9, 1.4),
 )
 def payload_inertia(plant: Plant, values: Values) -> None:
     if values["scale"] != 1.0:
@@ -201,7 +201,7 @@ def torsion_damping(plant: Plant, values: Values) -> None:
     source="Timoshenko, Strength of Materials: unsymmetrical bending",
     extended=True,
     presets=tuple({"axis_rad": k * math.pi / 4} for k in range(4)),
-    far=(1.0,),
+    large_sizes=(1.0,),
     form=("oval_mean",),
 )
 def ovality(plant: Plant, values: Values) -> None:

@@ -1,4 +1,4 @@
-"""Effects between the tip and the tracker's readings."""
+"""Effects between the tip and the tracker's measurements."""
 
 from __future__ import annotations
 

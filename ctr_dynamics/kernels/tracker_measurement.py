@@ -1,4 +1,4 @@
-"""Numba kernels of the measurement: a reading against the tip, its sensitivities, and the tip as the tracker realises it."""
+"""Numba kernels of the tracker: a measurement against the tip, its sensitivities, and the tip as the tracker realises it."""
 
 import math
 
@@ -19,7 +19,7 @@ from ctr_dynamics.kernels.filter_steps import (
 
 @compiled
 def registered_pose(mean, rotation, lever, bias, pose):
-    """Fill ``pose`` (7,) with that of :func:`ctr_dynamics.sensing.tracker.registered`.
+    """Fill ``pose`` (7,) with that of :func:`ctr_dynamics.sensing.tracker.TrackerModel.registered`.
 
     ``mean`` (13,): the tip; ``rotation`` (4,), ``lever`` (3,): nominal geometry; ``bias`` (13,): tracker states. Returns the rotation of the
     tip, that of the registration's estimated error in base axes, and the registration's inverse, (3, 3) each.
@@ -78,7 +78,7 @@ def fused_tip(mean, columns, rotation, lever, bias, pi, force_rows, pose, covari
 
 
 @compiled
-def expected_reading(mean, rotation, translation, lever, bias):
+def expected_measurement(mean, rotation, translation, lever, bias):
     """(7,) position and quaternion that a tip and tracker states predict."""
     registration = multiply(from_vector(bias[0:3]), rotation)
     point = mean[0:3] + applied(matrix(mean[3:7]), lever + bias[6:9])
@@ -90,7 +90,7 @@ def expected_reading(mean, rotation, translation, lever, bias):
 
 @compiled
 def pose_difference(position, quaternion, expected_position, expected_quaternion, free):
-    """(6,) reading minus expectation: position, then rotation vector in the sensor's axes, without the turn about the axis ``free``, 1 to 3, if
+    """(6,) measurement minus expectation: position, then rotation vector in the sensor's axes, without the turn about the axis ``free``, 1 to 3, if
     not 0."""
     turned = multiply(conjugate(expected_quaternion), quaternion)
     if free:
@@ -117,7 +117,7 @@ def pose_in_base(position, quaternion, rotation, translation, lever):
 
 @compiled
 def sensitivity_rows(mean, columns, rotation, lever, bias, H):
-    """Derivative H (6, r + 13) of the expected reading; see :func:`ctr_dynamics.sensing.tracker.innovation`."""
+    """Derivative H (6, r + 13) of the expected measurement; see :func:`ctr_dynamics.sensing.tracker.TrackerModel.innovation`."""
     r = columns.shape[1]
     R, Q = matrix(mean[3:7]), matrix(multiply(from_vector(bias[0:3]), rotation))
     position, velocity, rate = mean[0:3], mean[7:10], mean[10:13]
@@ -166,9 +166,11 @@ def innovation_rows(
     H,
     S,
 ):
-    """Fill ``nu``, ``H`` and ``S`` of :func:`ctr_dynamics.sensing.tracker.innovation` on the axes ``measured`` (k,); returns the whitened
-    innovation."""
-    pose = expected_reading(mean, rotation, translation, lever, bias)
+    """Fill ``nu``, ``H`` and ``S`` of :meth:`ctr_dynamics.sensing.tracker.TrackerModel.innovation` on the axes ``measured`` (k,).
+
+    Returns the whitened innovation (k,).
+    """
+    pose = expected_measurement(mean, rotation, translation, lever, bias)
     difference = pose_difference(position, quaternion, pose[0:3], pose[3:7], free)
     whole = np.empty((6, len(pi)))
     sensitivity_rows(mean, columns, rotation, lever, bias, whole)

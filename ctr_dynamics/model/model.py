@@ -20,7 +20,7 @@ from ctr_dynamics.model.mesh import (
 )
 from ctr_dynamics.robot import Robot
 
-LOAD_KINK = 0.02  # of the force and moment that bend the robot
+LOAD_SLOPE_LIMIT = 0.02  # of the force and moment that bend the robot
 
 
 class Model:
@@ -34,9 +34,9 @@ class Model:
         layout: rows of the parameter block.
         plant: the robot file with its extensions. parameters: (NP,) its block; actuators and tip wrench are 0.
         scale: (5 + N,) N and N m, unit of each shooting residual; step: (5 + N,) perturbation of each unknown for Newton's
-            method; tangent_step: a much smaller one, for tangents: strong friction between tubes bends the imbalance, and errors of a tangent grow
+            method; tangent_step: a much smaller one, for tangents: strong friction between tubes bends the residual, and errors of a tangent grow
             from step to step.
-        load_kink: (6,) N and N m: a change of a load's slope that adds more than this within a step is worth dividing the step.
+        load_slope_limit: (6,) N and N m: a change of a load's slope that adds more than this within a step is worth dividing the step.
         nodes: requested nodes from plate to tip.
     """
 
@@ -64,7 +64,7 @@ class Model:
         stiffness = robot.tubes[0].bending_stiffness
         force, moment = stiffness / reach**2, stiffness / reach
         self.scale = np.array([force] * 3 + [moment] * (2 + n))
-        self.load_kink = LOAD_KINK * np.array([force] * 3 + [moment] * 3)
+        self.load_slope_limit = LOAD_SLOPE_LIMIT * np.array([force] * 3 + [moment] * 3)
         self.step = np.array([moment] * n + [force] * 3 + [moment] * 2) * 1e-6
         self.tangent_step = 5e-5 * self.step
         self._meshes: dict[Key, Mesh] = {}

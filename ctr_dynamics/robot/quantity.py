@@ -23,7 +23,7 @@ def problem(text: str) -> PydanticCustomError:
 
 
 def number(x: Any) -> float:
-    """A finite float; text, true/false and NaN are refused with a reason.
+    """A finite float; text, true/false and NaN is rejected with a reason.
 
     Raises:
         PydanticCustomError: `x` is not a finite number.
@@ -161,7 +161,7 @@ class VectorQuantity(Block):
 
 
 def check_unit(data: Any, unit: str) -> None:
-    """Refuse a bare number and any unit but `unit`, with the conversion where it is known."""
+    """Reject a bare number and any unit but `unit`, with the conversion where it is known."""
     if isinstance(data, BaseModel):
         data = data.model_dump()
     if not isinstance(data, dict):
@@ -182,7 +182,7 @@ def check_unit(data: Any, unit: str) -> None:
 
 
 def check_range(values: list[float], unit: str, low: float, high: float, above: bool, hint: str) -> None:
-    """Refuse values outside [low, high], or (low, high] when `above`."""
+    """Reject values outside [low, high], or (low, high] when `above`."""
     for value in values:
         if value < low or value > high or (above and value == low):
             interval = f"{'(' if above else '['}{low:g}, {high:g}]"

@@ -134,7 +134,7 @@ def robot_quantities(robot: Robot) -> dict[str, Quantity | VectorQuantity]:
 
 
 def robot_with(robot: Robot, values: Mapping[str, Any]) -> Robot:
-    """The robot with some values replaced, validated anew; absolute tolerances are kept.
+    """The robot with some values replaced, validated again; absolute tolerances are kept.
 
     Args:
         robot: where to start.

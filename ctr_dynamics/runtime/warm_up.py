@@ -40,7 +40,7 @@ def warm_up(robot: Robot, settings: Settings) -> int:
         motion = 0.5 * (1.0 - math.cos(2.0 * math.pi * tick / TICKS))
         positions = [x for alpha, beta in rest for x in (alpha + 0.02 * motion, beta - 2e-4 * motion)]
         estimator.add_joint_state(stamp_ns, names, positions)
-        force = 1e-3 * motion + (JUMP * estimator.model.load_kink[1] if tick == JUMP_AT else 0.0)
+        force = 1e-3 * motion + (JUMP * estimator.model.load_slope_limit[1] if tick == JUMP_AT else 0.0)
         estimator.add_tip_load(stamp_ns, (0.0, -float(force), 0.0), (0.0, 0.0, 0.0))
         spare_s = _no_time if tick in BUSY else None
         steps_now = estimator.advance(stamp_ns + JOINT_PERIOD_NS // 2, spare_s)

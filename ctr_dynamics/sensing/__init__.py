@@ -1,4 +1,4 @@
-"""From the robot to its readings and back: encoders and actuators, the tip tracker, and signals in time."""
+"""From the robot to its measurements and back: encoders and actuators, the tip tracker, and signals in time."""
 
 from ctr_dynamics.sensing.actuators import ActuatorCorrection, ActuatorModel, ActuatorSignal
 from ctr_dynamics.sensing.measurement import SENSORS, Measurement, Tip

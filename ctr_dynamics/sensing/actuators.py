@@ -1,12 +1,12 @@
-"""From encoder readings to the bases of the tubes, and back: gain, offset, backlash and delay of every drive.
+"""From encoder positions to the bases of the tubes, and back: gain, offset, backlash and delay of every drive.
 
 Positions are vectors (2 N,) or rows (s, 2 N): the rotations of all tubes (rad), then their translations (m). Three kinds of them occur:
 
-    reading    what the encoders report,
-    drive      gain * reading + offset for rotations, reading + beta_offset for translations, then the corrections,
+    encoder    what the encoders report,
+    drive      gain * encoder + offset for rotations, encoder + beta_offset for translations, then the corrections,
     actuator   what the tubes' bases do: rotations behind the backlash, and later than the drive by the delay; translations as the drive.
 
-The estimator and diagnosis go from readings to actuators, the simulation from the drive both ways.
+The estimator and diagnosis go from encoders to actuators, the simulation from the drive both ways.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from ctr_dynamics.kernels.backlash import behind_backlash
 from ctr_dynamics.robot import Robot
-from ctr_dynamics.sensing.interpolation import Samples, Signal
+from ctr_dynamics.sensing.interpolation import Signal, ThreePoints
 
 Floats = NDArray[np.float64]
 
@@ -48,8 +48,8 @@ class ActuatorModel:
     """Drives of a robot with N tubes.
 
     Attributes:
-        gain: (N,) angle of the drive over its reading. offset: (N,) rad, added to it. backlash: (N,) rad, whole dead zone.
-        beta_offset: (N,) m, true translation minus reading. delay: s, by which rotations follow their readings.
+        gain: (N,) angle of the drive over that of its encoder. offset: (N,) rad, added to it. backlash: (N,) rad, whole dead zone.
+        beta_offset: (N,) m, true translation minus the encoder's. delay: s, by which rotations follow the drives.
         corrections: further links behind gain and offset, in order.
     """
 
@@ -75,9 +75,9 @@ class ActuatorModel:
         """A copy with other attributes."""
         return replace(self, **values)
 
-    def forward(self, readings: Floats) -> Floats:
-        """Drive positions of encoder ``readings``."""
-        drive, n = np.array(readings, dtype=float), self.n
+    def forward(self, encoder: Floats) -> Floats:
+        """Drive positions where the encoders report the positions ``encoder``."""
+        drive, n = np.array(encoder, dtype=float), self.n
         drive[..., :n] = self.gain * drive[..., :n] + self.offset
         drive[..., n:] += self.beta_offset
         for correction in self.corrections:
@@ -86,17 +86,17 @@ class ActuatorModel:
 
     def inverse(self, drive: Floats) -> Floats:
         """What the encoders read where the drives stand at ``drive``."""
-        readings, n = np.array(drive, dtype=float), self.n
+        encoder, n = np.array(drive, dtype=float), self.n
         for correction in reversed(self.corrections):
-            readings = correction.inverse(readings)
-        readings[..., :n] = (readings[..., :n] - self.offset) / self.gain
-        readings[..., n:] -= self.beta_offset
-        return readings
+            encoder = correction.inverse(encoder)
+        encoder[..., :n] = (encoder[..., :n] - self.offset) / self.gain
+        encoder[..., n:] -= self.beta_offset
+        return encoder
 
-    def derivative(self, name: str, readings: Floats) -> Floats:
-        """Derivative of every drive position by the same tube's ``name`` ("gain", "offset" or "beta_offset"), at encoder ``readings``."""
+    def derivative(self, name: str, encoder: Floats) -> Floats:
+        """Derivative of every drive position by the same tube's ``name`` ("gain", "offset" or "beta_offset"), at the positions ``encoder``."""
         n = self.n
-        drive, columns = np.array(readings, dtype=float), np.zeros(np.shape(readings))
+        drive, columns = np.array(encoder, dtype=float), np.zeros(np.shape(encoder))
         if name == "gain":
             columns[..., :n] = drive[..., :n]
         elif name == "offset":
@@ -169,7 +169,7 @@ class ActuatorSignal(Signal):
         n = self.n
         return np.concatenate([alpha[:n], value[n:]]), np.concatenate([alpha_rate[:n], rate[n:]])
 
-    def around(self, first_ns: int, last_ns: int, extrapolate_ns: int = 0) -> Samples | None:
+    def around(self, first_ns: int, last_ns: int, extrapolate_ns: int = 0) -> ThreePoints | None:
         """See :meth:`Signal.around`; rotations that follow later than translations do not lie on their lines."""
         return None if self.delay_ns else super().around(first_ns, last_ns, extrapolate_ns)
 

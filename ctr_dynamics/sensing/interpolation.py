@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
-Samples = tuple[Floats, Floats, Floats, int, int, int]  # three values and their stamps, ns
+ThreePoints = tuple[Floats, Floats, Floats, int, int, int]  # three values and their stamps, ns
 
 
 class Signal:
@@ -78,7 +78,7 @@ class Signal:
         pairs = [self.at(t, extrapolate_ns) for t in times_ns]
         return np.array([value for value, _ in pairs]), np.array([rate for _, rate in pairs])
 
-    def around(self, first_ns: int, last_ns: int, extrapolate_ns: int = 0) -> Samples | None:
+    def around(self, first_ns: int, last_ns: int, extrapolate_ns: int = 0) -> ThreePoints | None:
         """Three samples on whose lines lies what :meth:`at` gives at all times between two; None where that is not so."""
         stamps, values = self.stamps, self.values
         i = bisect.bisect_left(stamps, last_ns)
@@ -93,7 +93,7 @@ class Signal:
             return None
         return values[j], values[i - 1], values[i], stamps[j], stamps[i - 1], stamps[i]
 
-    def bends(self, after_ns: float, until_ns: float, least: Floats) -> list[int]:
+    def slope_changes(self, after_ns: float, until_ns: float, least: Floats) -> list[int]:
         """Stamps between two times at which the rate changes by more than ``least`` (size,), 1/s, in some component."""
         stamps, values = self.stamps, self.values
         found = []

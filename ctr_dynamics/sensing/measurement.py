@@ -49,7 +49,7 @@ class Tip(NamedTuple):
 
 
 class Measurement(Protocol):
-    """A kind of sensor: from the robot to readings (forward), back (inverse), and what a small change of the robot does to them (derivative).
+    """A kind of sensor: from the robot to measurements (forward), back (inverse), and what a small change of the robot does to them (derivative).
 
     Stamps are those of the sensor's clock, times those of the robot, both in s. A sensor with states of its own (a registration, a bias) lists
     them in ``STATE_NAMES``, as the estimator carries them.
@@ -57,7 +57,7 @@ class Measurement(Protocol):
 
     @property
     def delay(self) -> float:
-        """By how much its readings are older than their stamps, s."""
+        """By how much its measurements are older than their stamps, s."""
         ...
 
     @classmethod
@@ -66,19 +66,19 @@ class Measurement(Protocol):
         ...
 
     def observed_times(self, stamps: Floats) -> Floats:
-        """Times (s,) of the robot that readings of ``stamps`` (s,) show."""
+        """Times (s,) of the robot that measurements of ``stamps`` (s,) show."""
         ...
 
     def forward(self, stamps: Floats, tip_at: At) -> tuple[Floats, ...]:
-        """Readings of ``stamps`` (s,), without noise, when ``tip_at`` gives the tip (s, 7) at any times."""
+        """Measurements of ``stamps`` (s,), without noise, when ``tip_at`` gives the tip (s, 7) at any times."""
         ...
 
     def derivative(self, stamps: Floats, tip_at: At, columns_at: At) -> Floats:
-        """Derivatives (s, k, r) of the k numbers of a reading by r parameters; ``columns_at`` gives those of the tip, (s, 7 r)."""
+        """Derivatives (s, k, r) of the k numbers of a measurement by r parameters; ``columns_at`` gives those of the tip, (s, 7 r)."""
         ...
 
     def innovation(
-        self, bias: Floats, tip: Tip, pi: Floats, *reading: Floats
+        self, bias: Floats, tip: Tip, pi: Floats, *measurement: Floats
     ) -> tuple[Floats, Floats, Floats, Floats]:
         """Innovation (k,), its derivative H (k, r + states), covariance S (k, k), and the whitened innovation (k,).
 

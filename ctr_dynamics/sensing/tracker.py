@@ -1,11 +1,11 @@
-"""The tip tracker: what it reports of a pose, what a report says of the pose, and how both change (docs/filter.md).
+"""The tip tracker: from the tip to a measurement, back, and how both change (docs/filter.md).
 
-A reading of stamp t shows the time t / (1 + skew) - delay, averaged over a window before it:
+A measurement of stamp t shows the time t / (1 + skew) - delay, averaged over a window before it:
 
     position = R_reg scale (p + R lever) + t_reg + drift t,        rotation = R_reg R,
 
 and then passes the corrections. The estimator carries errors of registration, lever arm, delay and drift as states of its own
-(``STATE_NAMES``). Its kernels know registration and lever arm alone; the rest is taken off a reading before
+(``STATE_NAMES``). Its kernels know registration and lever arm alone; the rest is taken off a measurement before
 (:meth:`TrackerModel.undistorted`).
 """
 
@@ -50,7 +50,7 @@ AVERAGE_WEIGHTS = np.array([0.11846344, 0.23931434, 0.28444444, 0.23931434, 0.11
 
 
 class TrackerCorrection(Protocol):
-    """A further link between tip and reading, behind the registration; it must be equal (``==``) to another one that does the same.
+    """A further link between tip and measurement, behind the registration; it must be equal (``==``) to another one that does the same.
 
     ``stamps`` (s,) in s, ``position`` (s, 3) in m and ``quaternion`` (s, 4) wxyz are in the tracker's frame.
     """
@@ -172,11 +172,11 @@ class TrackerModel:
 
     @property
     def age(self) -> float:
-        """How much older than its stamp a reading is in the mean, s."""
+        """How much older than its stamp a measurement is in the mean, s."""
         return self.delay + 0.5 * self.averaging
 
     def observed_times(self, stamps: Floats) -> Floats:
-        """Newest times (s,) of the robot that readings of ``stamps`` (s,) show."""
+        """Newest times (s,) of the robot that measurements of ``stamps`` (s,) show."""
         return stamps / (1.0 + self.skew) - self.delay
 
     def averaged(self, at: At, times: Floats) -> Floats:
@@ -202,7 +202,7 @@ class TrackerModel:
         )
         return Tip(time, mean, columns)
 
-    # -- arrays of readings --
+    # -- arrays of measurements --
 
     def forward(self, stamps: Floats, tip_at: At) -> tuple[Floats, Floats]:
         """Positions (s, 3) m and quaternions (s, 4) wxyz that the tracker reports at ``stamps`` (s,), without noise.
@@ -213,7 +213,11 @@ class TrackerModel:
         h = rows[:, 3:]
         if self.averaging > 0.0:
             h = h / np.linalg.norm(h, axis=1, keepdims=True)
-        position, quaternion = self._without_corrections(stamps, rows[:, :3], h)
+        return self.reported(stamps, rows[:, :3], h)
+
+    def reported(self, stamps: Floats, position: Floats, quaternion: Floats) -> tuple[Floats, Floats]:
+        """Positions (s, 3) and quaternions (s, 4) that the tracker reports at ``stamps`` (s,) of tips ``position`` and unit ``quaternion``."""
+        position, quaternion = self._without_corrections(stamps, position, quaternion)
         for correction in self.corrections:
             position, quaternion = correction.forward(stamps, position, quaternion)
         return position, quaternion
@@ -224,7 +228,7 @@ class TrackerModel:
         return position, multiply_rows(self.rotation, h)
 
     def derivative(self, stamps: Floats, tip_at: At, columns_at: At) -> Floats:
-        """Derivatives (s, 6, r) of the readings at ``stamps`` (s,) by r parameters: of the position in m, of the rotation vector about the
+        """Derivatives (s, 6, r) of the measurements at ``stamps`` (s,) by r parameters: of the position in m, of the rotation vector about the
         sensor's axes in rad.
 
         ``tip_at`` as for :meth:`forward`, with quaternions of any length; ``columns_at`` gives their derivatives at times (s,): (s, 7 r).
@@ -254,10 +258,10 @@ class TrackerModel:
             position, quaternion = correction.forward(stamps, position, quaternion)
         return columns
 
-    # -- one reading --
+    # -- one measurement --
 
     def undistorted(self, stamp: float, position: Floats, quaternion: Floats) -> tuple[float, Floats, Floats]:
-        """Stamp (s), position (3,) m and quaternion (4,) of a reading as registration and lever arm alone would give them: the corrections, the
+        """Stamp (s), position (3,) m and quaternion (4,) of a measurement as registration and lever arm alone would give them: the corrections, the
         clock's rate, the steady drift and the scale are taken off."""
         if self.corrections:
             stamps = np.array([stamp])
@@ -272,7 +276,7 @@ class TrackerModel:
     def to_base(
         self, position: Floats, quaternion: Floats, tip: Floats | None = None
     ) -> tuple[Floats, Floats]:
-        """Undistorted reading as a tip pose in ``ctr_base`` with the nominal geometry.
+        """Undistorted measurement as a tip pose in ``ctr_base`` with the nominal geometry.
 
         Where not all of the rotation is measured, that of the ``tip`` (4,) wxyz turns the lever arm, if it is given.
         """
@@ -284,24 +288,24 @@ class TrackerModel:
     def inverse(
         self, stamp: float, position: Floats, quaternion: Floats, tip: Floats | None = None
     ) -> tuple[float, Floats, Floats]:
-        """Time (s), position (3,) m and quaternion (4,) of the tip in ``ctr_base`` that a reading shows; ``tip`` as for :meth:`to_base`."""
+        """Time (s), position (3,) m and quaternion (4,) of the tip in ``ctr_base`` that a measurement shows; ``tip`` as for :meth:`to_base`."""
         time, position, quaternion = self.undistorted(stamp, position, quaternion)
         return time - self.age, *self.to_base(position, quaternion, tip)
 
     def innovation(
-        self, bias: Floats, tip: Tip, pi: Floats, *reading: Floats
+        self, bias: Floats, tip: Tip, pi: Floats, *measurement: Floats
     ) -> tuple[Floats, Floats, Floats, Floats]:
-        """An undistorted ``reading`` (position (3,) m, quaternion (4,) wxyz) against what the ``tip`` and the states ``bias`` (13,) predict.
+        """An undistorted ``measurement`` (position (3,) m, quaternion (4,) wxyz) against what the ``tip`` and the states ``bias`` (13,) predict.
 
         Returns:
             On the k measured axes: innovation (k,), position in the tracker's axes, rotation vector in the sensor's; H (k, r + 13), the
-            derivative of the expected reading by the columns' coefficients and the tracker states; its covariance S (k, k) under ``pi``
+            derivative of the expected measurement by the columns' coefficients and the tracker states; its covariance S (k, k) under ``pi``
             (r + 13, r + 13); and the innovation whitened by the Cholesky root of S.
 
         Where one rotation axis is not measured, the sensor's turn about it is arbitrary and often large. It is taken off first, or it would turn
         the other two components.
         """
-        position, quaternion = reading
+        position, quaternion = measurement
         axes = self.axes
         nu, H, S = np.empty(len(axes)), np.empty((len(axes), len(pi))), np.empty((len(axes), len(axes)))
         white = innovation_rows(

@@ -25,7 +25,7 @@ from ctr_dynamics.robot_files import load_robot
 
 sys.path.insert(0, str(Path(__file__).parent))
 from damper import DriveHistory, Estimate, Limits, ModalDamper, Tuning
-from plant import Hardware, Plant, settling_time
+from simulated_robot import Hardware, SimulatedRobot, settling_time
 
 START_NS = 1_700_000_000_000_000_000
 ESTIMATOR_LATENCY_S = 0.006  # from a step's stamp to its message in the controller's hands
@@ -50,9 +50,9 @@ def run(
     limits: Limits | None = None,
     period_s: float = 0.01,
     mode: int = 0,
-) -> Plant:
+) -> SimulatedRobot:
     """Release the weight and let the loop run; returns the plant with its truth."""
-    plant = Plant(robot, START_NS, hardware)
+    plant = SimulatedRobot(robot, START_NS, hardware)
     estimator = Estimator(robot, Settings({"output.policy": "predict"}))
     jacobian = tip_jacobian(robot)
     axis = int(np.argmax(np.abs(jacobian)))

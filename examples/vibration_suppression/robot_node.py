@@ -1,4 +1,4 @@
-"""The simulated robot as a ROS node: subscribes to joint commands, publishes joints, tracker poses and loads; `plant.py` is the robot.
+"""The simulated robot as a ROS node: subscribes to joint commands, publishes joints, tracker poses and loads; `simulated_robot.py` is the robot.
 
     python robot_node.py --ros-args -p seconds:=6.0 -p speed:=0.5 -p report:=truth.npz
 
@@ -30,7 +30,7 @@ from ctr_dynamics.ros.node_runner import spin_until, stop_on_signals
 from ctr_dynamics.ros.topic_names import NAMESPACE, message_class
 
 sys.path.insert(0, str(Path(__file__).parent))
-from plant import DT_NS, Hardware, Plant
+from simulated_robot import DT_NS, Hardware, SimulatedRobot
 
 COMMANDS = "/ctr/joint_commands"
 SIM_START_NS = 1_000_000_000_000
@@ -82,7 +82,7 @@ class RobotNode(Node):
                 raise TimeoutError("no estimator has subscribed to the joints")
             time.sleep(0.05)
         simulated = values["speed"] > 0
-        plant = Plant(
+        plant = SimulatedRobot(
             self._file,
             SIM_START_NS if simulated else time.time_ns(),
             Hardware(joint_outage_s=(values["outage_from_s"], values["outage_to_s"])),

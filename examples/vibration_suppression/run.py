@@ -24,7 +24,7 @@ import numpy as np
 from ctr_dynamics.ros.node_processes import ESTIMATOR, NodeProcess, free_domain
 
 sys.path.insert(0, str(Path(__file__).parent))
-from plant import Hardware, Truth, settling_time
+from simulated_robot import Hardware, Truth, settling_time
 
 HERE = Path(__file__).parent
 BAND_M = 0.003

@@ -55,8 +55,8 @@ def same_plants(a: Plant, b: Plant) -> bool:
 
 def test_ids_and_parameter_names_are_those_of_the_contract():
     catalogue = {name for name, effect in EFFECTS.items() if not effect.nuisance}
-    assert catalogue == set(CONTRACT) - COMPUTATION
-    for name in catalogue:
+    assert catalogue >= set(CONTRACT) - COMPUTATION
+    for name in set(CONTRACT) - COMPUTATION:
         assert {p.name for p in EFFECTS[name].parameters} == set(CONTRACT[name]["params"]), name
 
 
@@ -115,7 +115,7 @@ def test_bounds_priors_and_descriptions_are_sane(name):
             shapes = [p for p in effect.parameters if p.shape]
             forms = [p for form in effect.form for p in EFFECTS[form].parameters]
             assert any(p.name.replace("tubeN.", "") == parameter for p in shapes + forms)
-    assert not effect.probes or sum(not p.shape for p in effect.parameters) == 1  # a size of one number
+    assert not effect.finite_sizes or sum(not p.shape for p in effect.parameters) == 1  # a size of one number
 
 
 @pytest.mark.parametrize("name", sorted(EFFECTS))

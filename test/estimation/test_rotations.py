@@ -88,10 +88,10 @@ def test_signal_takes_late_and_refuses_known_stamps():
 def test_signal_bends_where_its_rate_changes_by_more_than_the_least():
     signal = ramp()  # rates 0, 100, 200, and 0 when held
     least = np.array([90.0, np.inf])
-    assert signal.bends(-1, 40_000_000, least) == [0, 10_000_000, 30_000_000]
-    assert signal.bends(0, 30_000_000, least) == [10_000_000]  # strictly between
-    assert signal.bends(-1, 40_000_000, np.array([150.0, np.inf])) == [30_000_000]
-    assert signal.bends(-1, 40_000_000, np.full(2, 300.0)) == []
+    assert signal.slope_changes(-1, 40_000_000, least) == [0, 10_000_000, 30_000_000]
+    assert signal.slope_changes(0, 30_000_000, least) == [10_000_000]  # strictly between
+    assert signal.slope_changes(-1, 40_000_000, np.array([150.0, np.inf])) == [30_000_000]
+    assert signal.slope_changes(-1, 40_000_000, np.full(2, 300.0)) == []
 
 
 def test_signal_forgets_only_what_no_later_time_needs():

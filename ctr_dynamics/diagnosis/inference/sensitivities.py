@@ -143,12 +143,12 @@ def with_large_sizes(
     problem: Problem, known: Sensitivities, pool: Sequence[Candidate], context: RunContext
 ) -> Sensitivities:
     """``known`` with trials at large sizes, of which the derivative says little, and of candidates in ``pool`` that it does not have."""
-    new = [c for c in pool if EFFECTS[c.effect].probes and c not in known.by_candidate]
+    new = [c for c in pool if EFFECTS[c.effect].finite_sizes and c not in known.by_candidate]
     sizes = [
         Size(c, size, beside)
         for beside in _nuisance_places(problem, known.point)
         for c in pool
-        for size in (_finite_sizes(c) if c in new else EFFECTS[c.effect].far)
+        for size in (_finite_sizes(c) if c in new else EFFECTS[c.effect].large_sizes)
     ]
     coarse = problem.with_step(problem.options.screening.finite_size_dt_s)
     found = _trials(known, sizes, context.run(_residual_jobs(coarse, known.point, sizes)))
@@ -172,7 +172,7 @@ def _by_kind(
     shaped: list[Candidate] = []
     finite: list[Candidate] = []
     for c in pool:
-        if EFFECTS[c.effect].probes:
+        if EFFECTS[c.effect].finite_sizes:
             finite.append(c)
         elif c.shapes or c.quantities[0].extended:
             shaped.append(c)
@@ -207,7 +207,7 @@ def _nuisance_places(problem: Problem, point: Mapping[Key, float]) -> list[dict[
 def _finite_sizes(c: Candidate) -> tuple[float, ...]:
     """Finite sizes, in scales, at which a candidate without a useful derivative is tried."""
     q = c.quantities[0]
-    return tuple((size - q.off) / q.scale for size in c.sizes[:1]) or EFFECTS[c.effect].probes
+    return tuple((size - q.off) / q.scale for size in c.sizes[:1]) or EFFECTS[c.effect].finite_sizes
 
 
 def _residual_jobs(problem: Problem, point: Mapping[Key, float], sizes: Sequence[Size]) -> list:

@@ -9,7 +9,7 @@ from ctr_dynamics.estimation.inputs.input_buffer import InputBuffer
 from ctr_dynamics.kernels.filter_steps import corrected_rows, stage_rows
 from ctr_dynamics.model.model import Model
 from ctr_dynamics.model.simulator import Inputs
-from ctr_dynamics.sensing.interpolation import Samples
+from ctr_dynamics.sensing.interpolation import ThreePoints
 
 Floats = NDArray[np.float64]
 REJOIN_S = 0.01
@@ -21,7 +21,7 @@ class Signals:
 
     def __init__(self, model: Model, inputs: InputBuffer) -> None:
         self.n, self.count, self.inputs = model.n, model.input_count, inputs
-        self._no_load: Samples = (*np.zeros((3, 6)), 0, 1, 2)
+        self._no_load: ThreePoints = (*np.zeros((3, 6)), 0, 1, 2)
         self.clear()
 
     def clear(self) -> None:

@@ -58,7 +58,7 @@ class InputBuffer:
         self.timeline = Timeline()
         self.measurements = MeasurementQueue(tracker, self.frame, self.window_ns, self.timeline, health)
         self._load_delay_ns = round(model.plant.load_delay * 1e9)
-        self._least_change = model.load_kink / (STEP_NS * 1e-9)  # of the load's rate, 1/s
+        self._least_change = model.load_slope_limit / (STEP_NS * 1e-9)  # of the load's rate, 1/s
         self.load = Signal(6)
         self.clear()
 
@@ -180,7 +180,7 @@ class InputBuffer:
             from_ns = load.stamps[i - 1]
         else:
             return None
-        return LoadChange(from_ns, bool(np.any(np.abs(value - known) > self.model.load_kink)))
+        return LoadChange(from_ns, bool(np.any(np.abs(value - known) > self.model.load_slope_limit)))
 
     def _open_load(self, t0_ns: int) -> None:
         """Before the first load there is none, or that one if it comes soon enough after the first joints."""
@@ -199,7 +199,7 @@ class InputBuffer:
         if len(self.load.stamps) < 2:
             return []
         end_ns = t0_ns + k * STEP_NS
-        found = self.load.bends(end_ns - STEP_NS, end_ns, self._least_change)
+        found = self.load.slope_changes(end_ns - STEP_NS, end_ns, self._least_change)
         return [(stamp - t0_ns) * 1e-9 for stamp in found]
 
     def covers_no_more(self, k: int) -> bool:

@@ -75,7 +75,7 @@ class Truth:
     delta: list[float] = field(default_factory=list)
 
 
-class Plant:
+class SimulatedRobot:
     """Robot, drives and sensors on a time of their own that begins at 0.
 
     Args:
