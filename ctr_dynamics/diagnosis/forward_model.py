@@ -51,6 +51,8 @@ class ForwardModel:
 
     Args:
         options: resolution of the model.
+    Attributes:
+        models: without extended physics and with it. nominal: plant of the robot file.
     """
 
     def __init__(
@@ -61,14 +63,14 @@ class ForwardModel:
         nodes, dt = self.options.nodes, self.options.dt_s
         self.nodes = nodes
         self.scheme = make_scheme("sdirk3", dt)
-        self._models = {False: Model(robot, nodes=nodes), True: Model(robot, nodes=nodes, extended=True)}
+        self.models = {False: Model(robot, nodes=nodes), True: Model(robot, nodes=nodes, extended=True)}
         self.nominal = make_plant(robot)
         load = Signal(6)
         for time, *wrench in recording.load.tolist():
             load.add(round(time * 1e9), np.array(wrench))
         # a step across a slope discontinuity of the load would make the error of the prediction depend on where in the step it lies, and the
         # misfit a rough function of every delay
-        discontinuities = load.slope_changes(-np.inf, np.inf, self._models[False].load_slope_limit / dt)
+        discontinuities = load.slope_changes(-np.inf, np.inf, self.models[False].load_slope_limit / dt)
         self._load_events = 1e-9 * np.array(discontinuities, dtype=float)
 
     def resolved(self, nodes: int, dt: float) -> ForwardModel:
@@ -144,7 +146,7 @@ class ForwardModel:
 
     def _run(self, plant: Plant, extended: bool, **columns: object) -> Trajectory:
         return run(
-            self._models[extended],
+            self.models[extended],
             self.scheme,
             plant.block,
             self.inputs(plant, extended),
@@ -223,7 +225,7 @@ class ForwardModel:
             for i, other in enumerate(changed)
             if not other.has_inputs_of(plant)
         ]
-        width = self._models[extended].input_count
+        width = self.models[extended].input_count
 
         difference = self.options.difference
 

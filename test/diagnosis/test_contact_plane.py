@@ -14,27 +14,15 @@ from ctr_dynamics.diagnosis.inference.hypotheses import Hypothesis, check_time_e
 from ctr_dynamics.diagnosis.inference.map_fit import fit
 from ctr_dynamics.diagnosis.recording import read_recording
 from ctr_dynamics.diagnosis.run_context import RunContext
-from ctr_dynamics.effects import quantities
-from ctr_dynamics.robot_files import load_robot
 
 STIFFNESS = ("contact", "stiffness_N_per_m")
 NORMAL = [("contact", "n" + axis) for axis in "xyz"]
 
 
-@pytest.fixture(scope="module")
-def robot():
-    return load_robot("till2020_tissue")
-
-
-@pytest.fixture(scope="module")
-def known(robot):
-    return quantities(robot)
-
-
 def _problem(folder, robot, known, effect, seed):
     case = make_case(seed, "single", folder, effects=(effect,), duration_s=2.2)
     recording = read_recording(case.protocol, robot)
-    nuisances = [q for q in known if q.effect == "registration_translation"]
+    nuisances = [q for q in known.values() if q.effect == "registration_translation"]
     answer = json.loads((folder / "answer.json").read_text())["hidden"][0]["parameters"]
     truth = {name: item["total"] for name, item in answer.items()}
     return make_problem(robot, [recording], nuisances, np.ones(6, bool)), truth
@@ -52,12 +40,12 @@ def _angle(a, b) -> float:
 
 def test_the_first_impacts_tell_plane_and_stiffness(hit, known):
     problem, truth = hit
-    found = find_contact_plane(problem, known, RunContext())
+    found = find_contact_plane(problem, list(known.values()), RunContext())
     assert isinstance(found, Candidate)
     start = dict(found.start)
     assert _angle([start[key] for key in NORMAL], [truth[name] for _, name in NORMAL]) < 15.0
     assert 0.4 < found.sizes[0] / truth["stiffness_N_per_m"] < 2.5
-    assert found.keys == {q.key for q in known if q.effect == "contact"}
+    assert found.keys == {q.key for q in known.values() if q.effect == "contact"}
     before = problem.residual({})
     result = fit(problem, causes_of([found]), {**start, STIFFNESS: found.sizes[0]})
     assert result is not None
@@ -68,13 +56,13 @@ def test_the_first_impacts_tell_plane_and_stiffness(hit, known):
 def test_a_delay_is_no_contact_plane(tmp_path, robot, known):
     """A late tracker and the model diverge as suddenly, when the weight is cut."""
     problem, _ = _problem(tmp_path, robot, known, "tracker_latency", 91021)
-    assert find_contact_plane(problem, known, RunContext()) is None
+    assert find_contact_plane(problem, list(known.values()), RunContext()) is None
 
 
 def test_what_impacts_leave_is_measured_against_the_error_in_time(hit, known):
     problem, truth = hit
     point = {("contact", name): value for name, value in truth.items()}
-    contact = tuple(q for q in known if q.effect == "contact")
+    contact = tuple(q for q in known.values() if q.effect == "contact")
     candidate = Candidate("contact", contact)
     residual = problem.residual(point)
     finer = problem.with_step(0.5 * problem.forward_models[0].scheme.dt).residual(point)

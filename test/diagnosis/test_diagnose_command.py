@@ -5,7 +5,7 @@ import json
 import pytest
 from truth.cases import make_case
 
-from ctr_dynamics.cli.main import main
+from ctr_dynamics.cli.main import main, spread
 
 
 @pytest.fixture(scope="module")
@@ -87,3 +87,10 @@ def test_a_folder_that_cannot_be_is_said_before_the_work(resting, tmp_path, caps
     error = capsys.readouterr().err
     assert "is a file, a folder is expected" in error
     assert "reading" not in error
+
+
+def test_validate_takes_every_bag_up_to_the_next_option():
+    given = ["diagnose", "a", "--validate", "b", "c", "--robot", "r", "--validate", "d", "--json"]
+    assert spread(given, ("--validate",)) == [
+        "diagnose", "a", "--validate", "b", "--validate", "c", "--robot", "r", "--validate", "d", "--json",
+    ]  # fmt: skip

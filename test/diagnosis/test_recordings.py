@@ -11,15 +11,9 @@ from ctr_dynamics.errors import InputError
 from ctr_dynamics.io.bag_writer import write_bag
 from ctr_dynamics.io.messages import topics
 from ctr_dynamics.io.messages.encode import encode_joint_state, encode_pose_stamped, encode_wrench_stamped
-from ctr_dynamics.robot_files import load_robot
 
 OPTIONS = RecordingOptions()
 START_NS = 1_700_000_000_000_000_000
-
-
-@pytest.fixture
-def robot():
-    return load_robot("till2020_tissue")
 
 
 @pytest.fixture

@@ -1,0 +1,80 @@
+"""The solver's own error: measured, corrected, and measured again where causes are found."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from ctr_dynamics.diagnosis.diagnosis_options import DiagnosisOptions, DiscretisationOptions
+from ctr_dynamics.diagnosis.forward_model import ForwardModel
+from ctr_dynamics.diagnosis.inference import discretisation_error
+from ctr_dynamics.diagnosis.inference.discretisation_error import correct_discretisation, renew_correction
+from ctr_dynamics.diagnosis.inference.fit_problem import make_problem
+from ctr_dynamics.diagnosis.inference.map_fit import corrected, fit
+from ctr_dynamics.diagnosis.run_context import RunContext
+
+OPTIONS = DiagnosisOptions()
+SILENT = RunContext(workers=1)
+
+
+def test_more_nodes_where_the_data_can_see_them(recording, robot):
+    problem = make_problem(robot, [recording], [], np.ones(6, bool))
+    errors = correct_discretisation(problem, {}, SILENT)
+    assert problem.forward_models[0].nodes == OPTIONS.forward_model.nodes
+    keen = DiscretisationOptions(space_limit=0.0)
+    problem.options = replace(OPTIONS, discretisation=keen)
+    finer = correct_discretisation(problem, {}, SILENT)
+    assert problem.forward_models[0].nodes == keen.most_nodes
+    assert finer["space_error_m"] < 0.3 * errors["space_error_m"]
+    assert finer["time_error_m"] == pytest.approx(errors["time_error_m"], rel=0.2)
+
+
+def test_the_error_of_the_solver_is_that_of_the_point(recording, robot, known, monkeypatch):
+    """Where it is larger there, residuals and evidence are those with it, without a simulation."""
+    problem = make_problem(
+        robot, [recording], [known["encoder_offset", "tube1.offset_rad"]], np.ones(6, bool)
+    )
+    correct_discretisation(problem, {}, SILENT)
+    friction = known["tube_coulomb", "mu"]
+    there = fit(problem, [friction], {friction.key: friction.off + 0.1}, iterations=0)
+    assert there is not None
+    assert renew_correction(problem, there.point, SILENT) is None  # about the same: all stays
+    np.testing.assert_array_equal(problem.residual(there.point), there.residual)
+    measured = discretisation_error.differences
+    monkeypatch.setattr(
+        discretisation_error, "differences", lambda *given: tuple(20.0 * part for part in measured(*given))
+    )
+    change = renew_correction(problem, there.point, SILENT)
+    assert change is not None
+    assert np.linalg.norm(change) >= OPTIONS.discretisation.renewed
+    moved = corrected(problem, there, change)
+    np.testing.assert_allclose(moved.residual, problem.residual(there.point), atol=1e-9)
+    again = fit(problem, [friction], there.point, iterations=0)
+    assert again is not None
+    assert moved.log_evidence == pytest.approx(again.log_evidence, abs=1e-6)
+    assert moved.log_evidence != pytest.approx(there.log_evidence, abs=1.0)
+
+
+def test_a_shorter_step_that_fails_is_followed_by_a_longer_one(recording, robot, monkeypatch):
+    """Its difference is brought to that of half a step; where none succeeds there is no correction."""
+    problem = make_problem(robot, [recording], [], np.ones(6, bool))
+    plain, dt = ForwardModel.residual_at, problem.forward_models[0].scheme.dt
+
+    def errors():
+        return correct_discretisation(problem, {}, SILENT)["time_error_m"], problem.offset
+
+    half, offset = errors()
+    monkeypatch.setattr(
+        ForwardModel,
+        "residual_at",
+        lambda model, point: None if model.scheme.dt < 0.6 * dt else plain(model, point),
+    )
+    longer, other = errors()
+    assert not np.array_equal(offset, other)
+    assert longer == pytest.approx(half, rel=0.5)
+    monkeypatch.setattr(
+        ForwardModel,
+        "residual_at",
+        lambda model, point: None if model.scheme.dt < dt else plain(model, point),
+    )
+    assert errors()[0] == 0.0

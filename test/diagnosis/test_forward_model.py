@@ -1,0 +1,92 @@
+"""Predictions and derivatives of one second of a motion: interpolation, columns, smoothness."""
+
+import numpy as np
+
+from ctr_dynamics.diagnosis.diagnosis_options import DiagnosisOptions
+from ctr_dynamics.diagnosis.forward_model import ForwardModel, at_times, smooth
+from ctr_dynamics.diagnosis.recording import Recording
+from ctr_dynamics.model import trajectory
+
+OPTIONS = DiagnosisOptions()
+AIR = ("air_drag", "linear_Ns_per_m2")
+STIFFNESS = ("youngs_modulus", "tube1.scale")
+
+
+def test_interpolation_is_exact_for_cubics_and_held_outside():
+    t = np.arange(20) * 0.003
+    values = np.stack([t**3 - t, 2 * t**2], axis=1)
+    at = np.array([0.0, 0.0041, 0.02, 0.0559])
+    np.testing.assert_allclose(at_times(values, t, at), np.stack([at**3 - at, 2 * at**2], axis=1), atol=1e-14)
+    np.testing.assert_allclose(at_times(values, t, np.array([9.0])), values[-1:], atol=1e-14)
+
+
+def test_joints_are_smooth_between_samples_straight_across_gaps_and_held_outside():
+    t = np.concatenate([0.01 * np.arange(6), 0.2 + 0.01 * np.arange(4)])
+    values = np.stack([3.0 * t**2 - t, np.cos(40.0 * t)], axis=1)
+    at = smooth(t, values, OPTIONS.forward_model.joint_gap_s)
+    np.testing.assert_allclose(at(t)[0], values, atol=1e-14)
+    inner = np.linspace(0.0101, 0.0399, 50)
+    np.testing.assert_allclose(at(inner)[0][:, 0], 3.0 * inner**2 - inner, atol=1e-14)  # parabolas exactly
+    times, h = np.linspace(0.001, 0.0489, 400), 1e-7
+    numbers = (at(times + h)[0] - at(times - h)[0]) / (2 * h)
+    np.testing.assert_allclose(at(times)[1], numbers, atol=2e-3)
+    assert (
+        np.abs(np.diff(at(times)[1], axis=0)).max() < 2.0 * 40.0**2 * np.diff(times).max()
+    )  # no jump at a sample
+    gap = np.array([0.08, 0.11, 0.14])
+    assert np.ptp(at(gap)[1], axis=0).max() < 1e-12
+    value, rate = at(np.array([-1.0, 0.0, 1.0]))
+    np.testing.assert_array_equal(value, values[[0, 0, -1]])
+    assert not rate.any()
+
+
+def test_columns_together_are_those_apart(recording, robot, known, monkeypatch):
+    """With a cause that needs the extended model, plain columns go through that one too."""
+    forward_model = ForwardModel(recording, robot)
+
+    def apart():
+        """Largest difference of the stiffness' columns, of their size on each axis; and all columns."""
+        alone = forward_model.jacobian({}, [known[STIFFNESS]])[1][:, :, 0]
+        together = forward_model.jacobian({}, [known[STIFFNESS], known[AIR]])[1]
+        return np.abs((together[:, :, 0] - alone) / np.abs(alone).max(axis=0)).max(), together
+
+    difference, together = apart()
+    assert difference < 1e-3  # rounding: changes are as small as strong friction needs
+    with monkeypatch.context() as patch:
+        patch.setattr(trajectory, "EPSILON", 1e-6)
+        for model in forward_model.models.values():
+            patch.setattr(model, "tangent_step", 0.1 * model.step)
+        assert apart()[0] < 1e-5
+    step = 0.01
+    shifted = [
+        forward_model.predict({AIR: known[AIR].off + side * step * known[AIR].scale}).position
+        for side in (0, 1)
+    ]
+    slope = (shifted[1] - shifted[0]) / step
+    assert np.abs(together[:, :3, 1] - slope).max() < 0.03 * np.abs(slope).max()
+
+
+def test_the_misfit_is_a_smooth_function_of_delays(robot, known):
+    """Drives and load later by as much as the tracker is earlier is the same experiment, wherever in the steps their samples fall."""
+    rng = np.random.default_rng(2)
+    t = np.arange(101) / 100.0
+    turn = 0.3 * (1.0 - np.cos(np.pi * np.clip(t / 0.3, 0.0, 1.0)))[:, None] + 5e-4 * rng.standard_normal(
+        (101, 2)
+    )
+    joints = np.column_stack([t, robot.rest.alpha.value + turn, np.tile(robot.rest.beta.value, (len(t), 1))])
+    load = np.zeros((4, 7))
+    load[:, 0], load[:, 2] = (0.0, 0.5, 0.51, 1.0), (-0.3, -0.3, 0.0, 0.0)
+    stamps = np.arange(2, 39) / 40.0
+    nothing = np.zeros((len(stamps), 3))
+    recording = Recording(
+        "", "", {}, joints, load, stamps, nothing, np.tile([1.0, 0, 0, 0], (len(stamps), 1)), ()
+    )
+    forward_model = ForwardModel(recording, robot)
+
+    def seen(drives, tracker):
+        later = {("actuator_latency", "delay_s"): drives, ("load_time", "delay_s"): drives}
+        return forward_model.predict({**later, ("tracker_latency", "delay_s"): tracker}).position
+
+    base, moved = seen(0.0, 0.004), seen(0.0, 0.0)
+    shifts = [seen(d, 0.004 - d) for d in (0.0003, 0.0007, 0.0013, 0.0019, 0.0026, 0.004)]
+    assert max(np.abs(shift - base).max() for shift in shifts) < 0.02 * np.abs(moved - base).max()

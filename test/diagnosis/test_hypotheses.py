@@ -1,0 +1,47 @@
+"""Fits of hypotheses: sizes that a derivative does not reach, and alternatives in the place of a cause."""
+
+import numpy as np
+import pytest
+from diagnosis_cases import Vibration, quantity
+
+from ctr_dynamics.diagnosis.diagnosis_options import DiagnosisOptions
+from ctr_dynamics.diagnosis.inference.candidates import candidates, causes_of
+from ctr_dynamics.diagnosis.inference.fit_problem import make_problem
+from ctr_dynamics.diagnosis.inference.hypotheses import Hypothesis, best_size_nearby
+from ctr_dynamics.diagnosis.inference.map_fit import fit
+from ctr_dynamics.diagnosis.inference.search_moves import SearchState, alternatives, fit_alternatives
+from ctr_dynamics.diagnosis.inference.sensitivities import sensitivities_at
+from ctr_dynamics.diagnosis.run_context import RunContext
+
+OPTIONS = DiagnosisOptions()
+SILENT = RunContext(workers=1)
+
+
+def test_a_size_is_looked_for_beyond_the_reach_of_its_column():
+    """Half a turn of phase has run away before the vibration has decayed."""
+    frequency = quantity("frequency")
+    problem = Vibration({frequency.key: 0.4})
+    found = best_size_nearby(problem, {frequency.key: 0.3}, frequency)
+    assert found[frequency.key] == pytest.approx(0.4, abs=0.003)
+    assert problem.steps == [OPTIONS.screening.finite_size_dt_s]
+
+
+def test_what_looks_like_a_cause_is_fitted_in_its_place(recording, robot, known):
+    nuisances = [known["encoder_offset", "tube1.offset_rad"], known["registration_translation", "ty_m"]]
+    problem = make_problem(robot, [recording], nuisances, np.ones(6, bool))
+    pool = [
+        c
+        for c in candidates(list(known.values()), recording.position)
+        if c.effect in ("payload_mass", "density")
+    ]
+    other = next(c for c in pool if c.effect == "density")
+    wrong = fit(problem, causes_of([other]), {})
+    assert wrong is not None
+    state = SearchState(problem, pool, wrong, SILENT, [Hypothesis((other,), wrong)])
+    here = sensitivities_at(problem, wrong.point, pool, SILENT, again=wrong)
+    assert here is not None
+    new = fit_alternatives(state, alternatives(problem, state.found, here), here)
+    (right,) = [e for e in new if e.effects == ("payload_mass",)]
+    assert right.fit.cost < wrong.cost - 1.0
+    known_ones = [*state.found, *new]
+    assert not [s for s in alternatives(problem, known_ones, here) if s[0].effect == "payload_mass"]

@@ -1,0 +1,89 @@
+"""Fits on problems with known answers: the posterior, steps inside bounds, how far nuisances go."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from diagnosis_cases import Vibration, quantity
+
+from ctr_dynamics.diagnosis.diagnosis_options import DiagnosisOptions
+from ctr_dynamics.diagnosis.inference.fit_problem import make_problem
+from ctr_dynamics.diagnosis.inference.gaussian_posterior import posterior
+from ctr_dynamics.diagnosis.inference.map_fit import GaussNewton, fit
+
+OPTIONS = DiagnosisOptions()
+PAYLOAD = ("payload_mass", "added_kg")
+
+
+def test_posterior_is_bayes_rule():
+    """Against the dense formulas of a linear Gaussian model."""
+    rng = np.random.default_rng(1)
+    J, N = rng.normal(size=(40, 3)), rng.normal(size=(40, 2))
+    variance = np.array([0.5, 2.0, 0.01])
+    departure = np.array([0.3, -0.2, 0.1])
+    y = rng.normal(size=40)  # residual at the departure
+    mean, covariance, evidence = posterior(y, J, departure, variance, N)
+    data = y + J @ departure
+    noise = np.eye(40) + N @ N.T
+    precision = np.diag(1 / variance) + J.T @ np.linalg.solve(noise, J)
+    np.testing.assert_allclose(covariance, np.linalg.inv(precision), rtol=1e-9)
+    np.testing.assert_allclose(
+        mean, np.linalg.solve(precision, J.T @ np.linalg.solve(noise, data)), rtol=1e-9
+    )
+    total = noise + J @ np.diag(variance) @ J.T
+    expected = -0.5 * data @ np.linalg.solve(total, data) - 0.5 * np.linalg.slogdet(total)[1]
+    assert evidence == pytest.approx(expected, rel=1e-9)
+
+
+def test_steps_are_the_best_inside_the_bounds():
+    rng = np.random.default_rng(3)
+    names = ("a", "b", "c", "d")
+    nuisances = tuple(quantity(n, tolerance=0.5) for n in names)
+    cause = quantity("size", low=0.0, scale=2.0)
+    descent = GaussNewton(Vibration({}, nuisances), (cause,), {})
+    descent.columns, descent.residual = rng.normal(size=(500, 5)), 3.0 * rng.normal(size=500)
+    descent.residual += descent.columns @ np.array([4.0, -3.0, 0.2, 0.1, -1.0])  # beyond the bounds of three
+    descent.cost = descent.cost_at(descent.residual, descent.values)
+    step = descent.step()
+    assert np.all(step >= descent.low - descent.values)
+    assert np.all(step <= descent.high - descent.values)
+    assert sum(np.isclose(step, (1.0, -1.0, 9.0, 9.0, 0.0))) == 3
+    best = descent.promise(step)
+    for _ in range(200):
+        other = np.clip(step + rng.normal(scale=0.1, size=5), descent.low, descent.high)
+        assert descent.promise(other) <= best + 1e-9
+    sizes = [np.linalg.norm(descent.step(damping)) for damping in (0.0, 1e3, 1e5)]
+    assert sizes == sorted(sizes, reverse=True)
+    assert sizes[-1] < 0.1 * sizes[0]
+    assert descent.promise(descent.step(1e5)) > 0.0
+
+
+def test_a_fit_finds_the_payload_and_one_without_a_chance_does_not_move(recording, robot, known):
+    nuisances = [known[key] for key in known if key[0] in ("registration_translation", "encoder_offset")]
+    problem = make_problem(robot, [recording], nuisances, np.ones(6, bool))
+    found = fit(problem, [known[PAYLOAD]], {})
+    assert found is not None
+    sigma = found.sigma[[q.key for q in found.active].index(PAYLOAD)]
+    assert abs(found.point[PAYLOAD] - 3e-4) < 0.3 * sigma
+    assert found.chi2 < 1.0
+    # without the payload no tolerance reaches that
+    given_up = fit(problem, (), {}, limit=found.cost + 1.0)
+    best = fit(problem, (), {})
+    assert given_up is not None
+    assert best is not None
+    assert given_up.cost > best.cost > found.cost + 1.0
+    assert np.all(given_up.values == [q.off for q in problem.nuisances])
+
+
+def test_nuisances_stay_near_their_tolerances_unless_they_may_go_far(recording, robot, known):
+    nuisance = known["registration_translation", "tx_m"]
+    there = replace(recording, position=recording.position + [0.002, 0.0, 0.0])  # ten tolerances
+    problem = make_problem(robot, [there], [nuisance], np.ones(6, bool))
+    near, far = fit(problem, (), {}), fit(replace(problem, reach=np.inf), (), {})
+    cause = fit(problem, [nuisance], {})
+    assert near is not None
+    assert far is not None
+    assert cause is not None
+    assert near.values[0] == pytest.approx(OPTIONS.calibration.reach * nuisance.tolerance)
+    assert 7 < far.values[0] / nuisance.tolerance < 11
+    assert 7 < cause.values[0] / nuisance.tolerance < 11

@@ -1,0 +1,48 @@
+"""Candidates and their screening, at small and at large sizes."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from ctr_dynamics.diagnosis.forward_model import ForwardModel
+from ctr_dynamics.diagnosis.inference.candidates import candidates
+from ctr_dynamics.diagnosis.inference.fit_problem import make_problem
+from ctr_dynamics.diagnosis.inference.map_fit import fit
+from ctr_dynamics.diagnosis.inference.screening import screen
+from ctr_dynamics.diagnosis.inference.sensitivities import sensitivities_at, with_large_sizes
+from ctr_dynamics.diagnosis.run_context import RunContext
+from ctr_dynamics.effects import EFFECTS, quantities
+from ctr_dynamics.robot_files import load_robot
+
+SILENT = RunContext(workers=1)
+
+
+def test_every_effect_of_the_catalogue_is_a_candidate():
+    robot = load_robot("till2020_tissue")
+    positions = np.random.default_rng(4).normal(size=(100, 3)) * 0.02
+    found = {c.effect for c in candidates(quantities(robot), positions)}
+    assert found == {name for name, effect in EFFECTS.items() if not effect.nuisance}
+
+
+def test_large_sizes_are_looked_at_where_the_misfit_is_large(recording, robot, known):
+    heavy = ("payload_inertia", "scale")
+    seen = ForwardModel(recording, robot).predict({heavy: 0.5})
+    there = replace(recording, position=seen.position, quaternion=seen.quaternion)
+    problem = make_problem(robot, [there], [known["encoder_offset", "tube1.offset_rad"]], np.ones(6, bool))
+    pool = [
+        c
+        for c in candidates(list(known.values()), there.position)
+        if c.effect in ("payload_inertia", "density")
+    ]
+    clean = fit(problem, (), {})
+    near = sensitivities_at(problem, {}, pool, SILENT)
+    assert clean is not None
+    assert near is not None
+    far = with_large_sizes(problem, near, pool, SILENT)
+    assert not near.trials
+    (inertia,) = [c for c in pool if c.effect == "payload_inertia"]
+    assert [p.shift[heavy] for p in far.trials[inertia]] == pytest.approx([0.55, 0.75, 1.25, 1.45, 1.7])
+    np.testing.assert_array_equal(near.by_candidate[inertia], far.by_candidate[inertia])
+    best = screen(problem, far, clean, (), pool)[0]
+    assert best.candidate is inertia
