@@ -33,7 +33,9 @@ setup(
     name=PACKAGE,
     version=version(),
     packages=find_packages(include=[PACKAGE, f"{PACKAGE}.*"]),
-    package_data={PACKAGE: ["config/*.yaml", "config/*/*.yaml", "config/view/*", "data/bags/*", "py.typed"]},
+    package_data={
+        PACKAGE: ["config/*.yaml", "config/*/*.yaml", "config/view/*", "data/bags/*", "py.typed", "*.pyi"]
+    },
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{PACKAGE}"]),
         (f"share/{PACKAGE}", ["package.xml"]),

@@ -13,6 +13,14 @@ class InputError(ValueError):
         what: what is wrong, in one sentence without a full stop at its end; line breaks become blanks.
         do: what the reader can do about it; appended after a semicolon.
         where: file, key path or parameter name, put in front.
+
+    Example:
+        >>> from ctr_dynamics import InputError, Settings
+        >>> try:
+        ...     Settings({"model.nodes": 5})
+        ... except InputError as error:
+        ...     print(error)
+        parameter model.nodes: 5 is outside its range; write 8 to 1000
     """
 
     def __init__(self, what: str, *, do: str = "", where: str = "") -> None:

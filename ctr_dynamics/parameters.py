@@ -332,13 +332,19 @@ def parameter(name: str) -> Parameter:
 
 
 class Settings(Mapping[str, Value]):
-    """Every parameter with its checked value; immutable.
+    """Every parameter of the estimator with its checked value; an immutable mapping. docs/parameters.md lists names, units and ranges.
 
     Args:
         values: name to value; those not given have their default.
 
     Raises:
         InputError: unknown name, wrong type or out of range.
+
+    Example:
+        >>> from ctr_dynamics import Settings
+        >>> settings = Settings({"tracker.delay_s": 0.018, "output.policy": "wait"})
+        >>> settings["tracker.delay_s"], settings["model.nodes"]
+        (0.018, 12)
     """
 
     __slots__ = ("_values",)

@@ -11,27 +11,23 @@ from typing import Any
 
 import typer.main
 
+import ctr_dynamics
 from ctr_dynamics.cli.main import available, build_app
 from ctr_dynamics.runtime.node_parameters import NODES
 
 PAGE = Path("docs/reference.md")
 
-# Module -> public names of the Python interface.
-API: dict[str, tuple[str, ...]] = {
-    "ctr_dynamics.robot_files": ("load_robot", "robot_with", "robot_quantities", "robot_to_yaml"),
+# Module -> what the public names of `ctr_dynamics` return, and what else a program may use.
+FURTHER: dict[str, tuple[str, ...]] = {
     "ctr_dynamics.robot": ("Robot", "Tube"),
-    "ctr_dynamics.parameters": ("Settings",),
-    "ctr_dynamics.model.model": ("Model",),
-    "ctr_dynamics.model.statics": ("Statics", "Equilibrium"),
-    "ctr_dynamics.model.simulator": ("Simulator", "Inputs"),
-    "ctr_dynamics.estimation.estimator": ("Estimator",),
+    "ctr_dynamics.robot_files": ("robot_with", "robot_quantities", "robot_to_yaml"),
+    "ctr_dynamics.model.statics": ("Equilibrium",),
     "ctr_dynamics.estimation.step_output": ("StepOutput", "Innovation", "Modes"),
-    "ctr_dynamics.io": ("open_bag", "Bag", "write_bag", "BagWriter", "LiveRecorder"),
-    "ctr_dynamics.runtime.replay": ("replay", "ReplayResult", "Player"),
+    "ctr_dynamics.io": ("Bag", "write_bag", "BagWriter", "LiveRecorder"),
+    "ctr_dynamics.runtime.replay": ("ReplayResult", "Player"),
+    "ctr_dynamics.simulation": ("Recording", "write_recording"),
     "ctr_dynamics.csv_import.convert": ("read_log", "write"),
-    "ctr_dynamics.simulation": ("load_scenario", "simulate", "write_recording"),
     "ctr_dynamics.reporting": ("Page", "Panel", "figure_svg"),
-    "ctr_dynamics.errors": ("InputError",),
 }
 SERVICES = {
     "/ctr/estimator/reset": (
@@ -161,8 +157,8 @@ def commands() -> Iterator[tuple[str, Any]]:
 
 
 def public() -> Iterator[tuple[str, Any]]:
-    """Full name and object of everything in `API`, with the public methods of its classes behind them."""
-    for module, names in API.items():
+    """Name and object of the public names and of everything in `FURTHER`, with the public methods of classes behind them."""
+    for module, names in [("ctr_dynamics", tuple(ctr_dynamics.__all__)), *FURTHER.items()]:
         for name in names:
             thing = getattr(importlib.import_module(module), name)
             yield f"{module}.{name}", thing
@@ -239,6 +235,8 @@ def render() -> str:
         "",
         "## Python",
         "",
+        "`import ctr_dynamics` offers the names of this section, imported at their first use.",
+        "",
         "Names that recur mean the same everywhere, unless a text says otherwise:",
         "",
     ]
@@ -248,8 +246,16 @@ def render() -> str:
         *(f"| `{name}` | {text} |" for name, text in sorted(GLOSSARY.items())),
         "",
     ]
+    first_further = next(iter(FURTHER))
     for name, thing in public():
-        short = name.removeprefix("ctr_dynamics.")
+        if name == f"{first_further}.{FURTHER[first_further][0]}":
+            lines += [
+                "## Further names",
+                "",
+                "What the names above return, and what else a program may use. Import them from the modules shown.",
+                "",
+            ]
+        short = name if name.count(".") < 2 else name.removeprefix("ctr_dynamics.")
         level = "####" if inspect.isfunction(thing) and "." in thing.__qualname__ else "###"
         fields = inspect.isclass(thing) and hasattr(thing, "model_fields")
         document = re.sub(r"``", "`", inspect.getdoc(thing) or "")

@@ -63,7 +63,7 @@ class EstimatorOptions:
 
 
 class Estimator:
-    """Dynamic model and filter of one robot, driven by stamped inputs.
+    """Dynamic model and filter of one robot, driven by stamped inputs: what node and replay run. Stamps in ns, outputs every 3 ms.
 
     Args:
         robot: from a robot file.
@@ -73,6 +73,20 @@ class Estimator:
         health: counters and statuses.
         tracker: measurement model, with the parameters' corrections.
         step_times_s: s of every step, for those who set it to an empty array; else None.
+
+    Example:
+        Joint states of a robot at rest come every 10 ms; the steps that they cover are taken:
+
+        >>> from ctr_dynamics import Estimator, Settings, load_robot
+        >>> estimator = Estimator(load_robot("till2020_tissue"), Settings({"output.policy": "wait"}))
+        >>> names = ["tube1_rotation", "tube1_translation", "tube2_rotation", "tube2_translation"]
+        >>> for stamp_ns in range(1_000_000_000, 1_050_000_000, 10_000_000):
+        ...     estimator.add_joint_state(stamp_ns, names, [1.57, -0.2521, 1.57, -0.1977])  # rad, m
+        >>> outputs = estimator.advance()
+        >>> len(outputs), outputs[-1].valid
+        (14, True)
+        >>> outputs[-1].tip_position.shape, outputs[-1].tip_covariance.shape  # m; m^2 and rad^2
+        ((3,), (6, 6))
     """
 
     def __init__(self, robot: Robot, settings: Settings) -> None:

@@ -211,12 +211,25 @@ def sha256_of(path: Path) -> str:
 
 
 def open_bag(path: str | Path) -> Bag:
-    """Open a bag: an ``.mcap`` file, a rosbag2 folder, or a folder that holds exactly one ``.mcap``.
+    """Open a bag for reading. A file that was cut off or not closed is opened too; `Bag.notes` says what is missing.
 
-    A file that was cut off or not closed is opened too; `Bag.notes` says what is missing.
+    Args:
+        path: an ``.mcap`` file, a rosbag2 folder, or a folder that holds exactly one ``.mcap``.
+
+    Returns:
+        The bag: `inputs()` yields the decoded messages of the estimator's inputs in the order of their arrival, `messages()` all of them as bytes.
 
     Raises:
         InputError: nothing there, or not a bag.
+
+    Example:
+        >>> from ctr_dynamics import open_bag
+        >>> from ctr_dynamics.io.shipped_bags import shipped_bag
+        >>> bag = open_bag(shipped_bag())
+        >>> list(bag.topics)
+        ['/ctr/joint_states', '/ctr/tip_load', '/ctr/tracker/tip']
+        >>> next(bag.inputs()).message.names
+        ('tube1_rotation', 'tube1_translation', 'tube2_rotation', 'tube2_translation')
     """
     located = locate(path)
     return Bag(located.path, [read_mcap(file) for file in located.files], located.notes)

@@ -24,7 +24,19 @@ LOAD_SLOPE_LIMIT = 0.02  # of the force and moment that bend the robot
 
 
 class Model:
-    """Numbers of one robot for the kernels.
+    """A robot in the form that the solvers use: build one and give it to :class:`Statics` and :class:`Simulator`.
+
+    Args:
+        robot: from a robot file.
+        nodes: arc-length nodes from the base plate to the tip.
+        base_cells: cells of each tube behind the plate.
+        extended: use the kernels of the extended physics even where the robot file asks for none.
+
+    Example:
+        >>> from ctr_dynamics import Model, load_robot
+        >>> model = Model(load_robot("till2020_tissue"), nodes=24)
+        >>> model.n, model.scale.shape  # tubes, and the units of the 5 + N shooting residuals
+        (2, (7,))
 
     Attributes:
         n: number of tubes; tube 1 is the innermost.

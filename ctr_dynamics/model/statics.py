@@ -55,7 +55,19 @@ class Equilibrium:
 
 
 class Statics:
-    """Solver of static equilibria of one model."""
+    """Solver of static equilibria: the dynamic model with every velocity zero.
+
+    Args:
+        model: the robot.
+        tolerance: largest scaled residual at the tip.
+
+    Example:
+        >>> from ctr_dynamics import Model, Statics, load_robot
+        >>> robot = load_robot("till2020_tissue")
+        >>> shape = Statics(Model(robot)).solve(robot.rest.beta.value, robot.rest.alpha.value)  # m, rad
+        >>> (1e3 * shape.tip_position).round(1).tolist()  # mm in ctr_base
+        [83.5, -7.4, 105.1]
+    """
 
     def __init__(self, model: Model, tolerance: float = 1e-9) -> None:
         self.model = model

@@ -35,8 +35,19 @@ def load_robot(name_or_path: str | Path) -> Robot:
     Args:
         name_or_path: for example "till2020_tissue" or "my_robot.yaml".
 
+    Returns:
+        The robot: tubes (innermost first), payloads, friction, encoders, tracker, gravity and rest position, each value with its tolerance.
+
     Raises:
         InputError: no such robot, not readable, or not a valid robot file.
+
+    Example:
+        >>> from ctr_dynamics import load_robot
+        >>> robot = load_robot("till2020_tissue")
+        >>> robot.n_tubes
+        2
+        >>> robot.rest.beta.value  # translations of the tubes' bases behind the plate, m
+        (-0.2521, -0.1977)
     """
     name = str(name_or_path)
     if name in robot_names():

@@ -165,10 +165,19 @@ def scenario_names() -> tuple[str, ...]:
 
 
 def load_scenario(name_or_path: str | Path) -> Scenario:
-    """A scenario by its shipped name or from a YAML file.
+    """A scenario by its shipped name or from a YAML file: motions of the tubes, loads on the tip, sensors, and how finely to step.
+
+    Args:
+        name_or_path: for example "release" or "my_scenario.yaml".
 
     Raises:
         InputError: no such file, not readable, or not a valid scenario.
+
+    Example:
+        >>> from ctr_dynamics import load_scenario
+        >>> scenario = load_scenario("release")
+        >>> scenario.loads[0].hung_mass_kg, scenario.loads[0].end_s  # a weight that is cut off, kg and s
+        (0.06, 1.0)
     """
     name = str(name_or_path)
     path = Path(name_or_path)

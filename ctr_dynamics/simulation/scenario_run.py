@@ -169,12 +169,26 @@ def drives(scenario: Scenario, robot: Robot, model: Model) -> tuple[Drive, Drive
 
 
 def simulate(scenario: Scenario, robot: Robot, progress: Progress | None = None) -> Recording:
-    """Run ``scenario`` with ``robot`` from rest in the static equilibrium of its first inputs.
+    """Run a scenario with a robot from rest in the static equilibrium of its first inputs.
 
-    A step that the solver cannot take ends the run there; ``failure`` says why.
+    Args:
+        scenario: from :func:`load_scenario`, or built in Python.
+        robot: from :func:`load_robot`.
+        progress: called now and then with the fraction done.
+
+    Returns:
+        The recording: ``t`` (k,) s, ``position`` (k, 3) m and ``quaternion`` (k, 4) wxyz of the tip in ``ctr_base``, the known wrench and the
+        encoders over time. A step that the solver cannot take ends the run there; ``failure`` says why.
 
     Raises:
-        InputError: as :func:`drives`.
+        InputError: the scenario does not fit the robot, or moves an actuator out of its range.
+
+    Example:
+        >>> from ctr_dynamics import load_robot, load_scenario, simulate
+        >>> scenario = load_scenario("release").model_copy(update={"duration_s": 0.02})
+        >>> recording = simulate(scenario, load_robot("till2020_tissue"))
+        >>> recording.position.shape, recording.failure
+        ((21, 3), '')
     """
     model = Model(robot, nodes=scenario.solver.nodes)
     at, known = drives(scenario, robot, model)
