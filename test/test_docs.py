@@ -168,6 +168,75 @@ def test_names_and_files_of_the_code_in_the_pages_exist(page):
             assert (ROOT / span).exists(), f"{page.name}: {span}"
 
 
+def function_source(name: str) -> tuple[Path, str]:
+    """File and source of a function, method or class by its dotted name below `ctr_dynamics`."""
+    place, parts = ROOT / "ctr_dynamics", name.split(".")
+    while (place / parts[0]).is_dir():
+        place /= parts.pop(0)
+    file = place / f"{parts.pop(0)}.py"
+    text = file.read_text(encoding="utf-8")
+    node: ast.AST = ast.parse(text)
+    for part in parts:
+        node = next(
+            child
+            for child in getattr(node, "body", [])
+            if isinstance(child, (ast.FunctionDef, ast.ClassDef)) and child.name == part
+        )
+    return file, ast.get_source_segment(text, node) or ""
+
+
+def calls(source: str, name: str) -> bool:
+    """Whether the source of a function names the function or class of that dotted name."""
+    *_, owner, last = name.split(".")
+    return re.search(rf"\b{owner if last == '__init__' else last}\b", source) is not None
+
+
+def walks() -> dict[str, list[tuple[str, str]]]:
+    """Functions of each walk in docs/architecture.md, each with the attribute in which it stores its result."""
+    page = TEXT[ROOT / "docs" / "architecture.md"]
+    section = page.partition("## Three walks through the code")[2]
+    found = {}
+    for part in section.split("\n### ")[1:]:
+        title, _, text = part.partition("\n")
+        found[title] = re.findall(r"^\| `([\w.]+)` \|[^|]*\| (?:`(\w+)`)? ?\|$", text, re.MULTILINE)
+    return found
+
+
+@pytest.mark.parametrize("title", list(walks()))
+def test_a_walk_leads_through_the_code(title):
+    steps = walks()[title]
+    assert len(steps) >= 4
+    files = set()
+    for i, (name, stored) in enumerate(steps):
+        file, source = function_source(name)
+        files.add(file)
+        if i + 1 == len(steps):
+            break
+        after = steps[i + 1][0]
+        _, next_source = function_source(after)
+        if stored:
+            assert re.search(rf"\b{stored}\b", source), f"{name} does not store `{stored}`"
+            assert re.search(rf"\b{stored}\b", next_source), f"{after} does not take `{stored}`"
+        else:
+            assert calls(source, after) or calls(next_source, name), (
+                f"neither calls the other: {name}, {after}"
+            )
+    assert len(files) <= 7, sorted(file.name for file in files)
+
+
+def test_layers_are_those_that_are_checked():
+    checked = (ROOT / "pyproject.toml").read_text().partition("layers = [")[2].partition("]")[0]
+    shown = TEXT[ROOT / "docs" / "architecture.md"].partition("## Layers")[2].partition("## Data flow")[0]
+    rows = re.findall(r"^\| [^|]*\| (`[^|]+) \|", shown, re.MULTILINE)
+    assert [re.findall(r"`(\w+)`", row) for row in rows] == [
+        re.findall(r"\w+", layer) for layer in re.findall(r'"([^"]+)"', checked)
+    ]
+
+
+def test_there_are_three_walks():
+    assert len(walks()) == 3
+
+
 def string_constants() -> str:
     """Every string of the package, f-strings with their fields as *."""
     texts = []
