@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from ctr_dynamics.diagnosis.diagnosis_options import ForwardModelOptions
 from ctr_dynamics.diagnosis.recording import Recording
-from ctr_dynamics.effects import EFFECTS, Plant, Quantity, apply_effects, make_plant
+from ctr_dynamics.effects import EFFECTS, EffectQuantity, Plant, apply_effects, make_plant
 from ctr_dynamics.errors import InputError
 from ctr_dynamics.kernels.lanes import PACK
 from ctr_dynamics.kernels.rotations import conjugate_rows, multiply_rows, to_vector_rows
@@ -174,7 +174,7 @@ class ForwardModel:
             return None
         return None if prediction.failure else self.residual(prediction)
 
-    def jacobian(self, point: Point, wanted: Sequence[Quantity]) -> tuple[Prediction, Floats]:
+    def jacobian(self, point: Point, wanted: Sequence[EffectQuantity]) -> tuple[Prediction, Floats]:
         """Prediction at ``point`` and its derivatives (s, 6, len(wanted)) by the coordinates of ``wanted``, each times its ``scale``."""
         plant = self.plant(point)
         changed = [self.plant(moved(point, q, self.options.difference)) for q in wanted]
@@ -249,7 +249,7 @@ class ForwardModel:
         )
 
 
-def moved(point: Point, quantity: Quantity, fraction: float) -> dict[Key, float]:
+def moved(point: Point, quantity: EffectQuantity, fraction: float) -> dict[Key, float]:
     """``point`` with one coordinate changed by ``fraction`` of its scale."""
     other = dict(point)
     other[quantity.key] = other.get(quantity.key, quantity.off) + fraction * quantity.scale

@@ -8,7 +8,7 @@ import numpy as np
 
 from ctr_dynamics.diagnosis.forward_model import ForwardModel
 from ctr_dynamics.diagnosis.recording import Recording
-from ctr_dynamics.effects import quantities
+from ctr_dynamics.effects import effect_quantities
 from ctr_dynamics.robot import Robot
 
 MOMENT = 0.02  # s
@@ -29,7 +29,7 @@ def warm_up(robot: Robot, models: Sequence[str] = ("plain", "extended")) -> None
         np.tile([1.0, 0.0, 0.0, 0.0], (3, 1)),
         (),
     )
-    known = {q.key: q for q in quantities(robot)}
+    known = {q.key: q for q in effect_quantities(robot)}
     forward_model = ForwardModel(still, robot)
     if "plain" in models:
         forward_model.predict({})

@@ -26,7 +26,7 @@ from ctr_dynamics.diagnosis.verdict.decision import Evidence, Verdict, decide, n
 from ctr_dynamics.diagnosis.verdict.residual_tests import rms, whiteness
 from ctr_dynamics.diagnosis.verdict.separability import Cause, observability
 from ctr_dynamics.diagnosis.verdict.validation import validate
-from ctr_dynamics.effects import quantities
+from ctr_dynamics.effects import effect_quantities
 from ctr_dynamics.errors import InputError
 from ctr_dynamics.robot import Robot
 
@@ -82,7 +82,7 @@ def diagnose(
 
     # screening and hypotheses: what explains the rest
     positions = np.concatenate([r.position[np.isfinite(r.position).all(axis=1)] for r in recordings])
-    pool = candidates(quantities(robot), positions, options.prior)
+    pool = candidates(effect_quantities(robot), positions, options.prior)
     effects = sorted({c.effect for c in pool})
     result.tested += effects
     found = result.search = search_hypotheses(problem, pool, recalibrated, context)

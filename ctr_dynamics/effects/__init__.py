@@ -6,13 +6,13 @@ from ctr_dynamics.effects.registry import (
     EFFECTS,
     Effect,
     EffectParameter,
-    Quantity,
+    EffectQuantity,
     Values,
     apply_effects,
     effect,
+    effect_quantities,
     make_plant,
     per_tube,
-    quantities,
     register,
 )
 
@@ -20,14 +20,14 @@ __all__ = [
     "EFFECTS",
     "Effect",
     "EffectParameter",
+    "EffectQuantity",
     "Plant",
-    "Quantity",
     "Values",
     "apply_effects",
     "effect",
+    "effect_quantities",
     "make_plant",
     "per_tube",
-    "quantities",
     "register",
 ]
 

@@ -145,7 +145,7 @@ def register(*effects: Effect) -> None:
 
 
 @dataclass(frozen=True)
-class Quantity:
+class EffectQuantity:
     """One parameter of one effect for one robot: what diagnosis estimates.
 
     Attributes:
@@ -188,7 +188,7 @@ def _expanded(p: EffectParameter, robot: Robot) -> list[tuple[str, int]]:
     return [(p.name.replace("tubeN", f"tube{tube + 1}"), tube) for tube in tubes]
 
 
-def quantities(robot: Robot) -> list[Quantity]:
+def effect_quantities(robot: Robot) -> list[EffectQuantity]:
     """Every parameter of every registered effect for ``robot``, tubes expanded."""
     found = []
     for entry in EFFECTS.values():
@@ -200,7 +200,7 @@ def quantities(robot: Robot) -> list[Quantity]:
                 off = p.coordinate(_number(p.off, robot, tube))
                 tolerance = p.tolerance(robot, tube) if p.tolerance else 0.0
                 found.append(
-                    Quantity(entry.name, name, off, tolerance, scale, max(p.low, -math.inf), p.high, p)
+                    EffectQuantity(entry.name, name, off, tolerance, scale, max(p.low, -math.inf), p.high, p)
                 )
     return found
 

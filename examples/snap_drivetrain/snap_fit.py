@@ -18,7 +18,7 @@ from scipy.interpolate import CubicSpline
 from scipy.optimize import least_squares
 from scipy.stats import chi2
 
-from ctr_dynamics.effects import quantities
+from ctr_dynamics.effects import effect_quantities
 from ctr_dynamics.robot import Robot
 from ctr_dynamics.snap.experiment import robot_for_snap
 from ctr_dynamics.snap.features import LEVEL, crossing
@@ -276,7 +276,7 @@ class Fitter:
 
     def __init__(self, robot: Robot, snap: Snap, coarse: Grid = COARSE, fine: Grid = FINE) -> None:
         self.robot, self.snap, self.coarse, self.fine = robot, snap, coarse, fine
-        known = {q.key: q for q in quantities(robot)}
+        known = {q.key: q for q in effect_quantities(robot)}
         self.nuisances = [known[key] for key in NUISANCES if known[key].tolerance > 0.0]
         self.simulations = 0
         self.frames = snap.t - snap.passed

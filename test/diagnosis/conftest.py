@@ -11,7 +11,7 @@ sys.path.insert(0, str(Path(__file__).parent.parent / "model"))
 
 from ctr_dynamics.diagnosis.forward_model import ForwardModel
 from ctr_dynamics.diagnosis.recording import Recording
-from ctr_dynamics.effects import quantities
+from ctr_dynamics.effects import effect_quantities
 from ctr_dynamics.robot_files import load_robot
 
 
@@ -23,7 +23,7 @@ def robot():
 @pytest.fixture(scope="session")
 def known(robot):
     """Quantities of the catalogue by key."""
-    return {q.key: q for q in quantities(robot)}
+    return {q.key: q for q in effect_quantities(robot)}
 
 
 @pytest.fixture(scope="session")

@@ -5,12 +5,14 @@ import math
 import numpy as np
 
 from ctr_dynamics.diagnosis.diagnosis_options import DiagnosisOptions
-from ctr_dynamics.effects import EffectParameter, Quantity
+from ctr_dynamics.effects import EffectParameter, EffectQuantity
 
 
 def quantity(name, low=-math.inf, high=math.inf, *, tolerance=0.0, scale=1.0, off=0.0):
     """A coordinate of no effect of the catalogue."""
-    return Quantity("made_up", name, off, tolerance, scale, low, high, EffectParameter(name, "1", off, scale))
+    return EffectQuantity(
+        "made_up", name, off, tolerance, scale, low, high, EffectParameter(name, "1", off, scale)
+    )
 
 
 class Vibration:

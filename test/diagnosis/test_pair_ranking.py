@@ -22,7 +22,7 @@ from ctr_dynamics.diagnosis.inference.search_moves import SearchState, add_pairs
 from ctr_dynamics.diagnosis.inference.sensitivities import Sensitivities
 from ctr_dynamics.diagnosis.run_context import RunContext
 from ctr_dynamics.diagnosis.verdict.decision import needed_hypothesis
-from ctr_dynamics.effects import EffectParameter, Quantity
+from ctr_dynamics.effects import EffectParameter, EffectQuantity
 
 OPTIONS = DiagnosisOptions()
 SILENT = RunContext(workers=1)
@@ -32,7 +32,7 @@ EFFECT = {"one": "density", "two": "payload_mass", "both": "youngs_modulus", "ot
 
 def quantity(effect, *, tolerance=0.0, low=-math.inf):
     """A coordinate of unit prior size."""
-    return Quantity(
+    return EffectQuantity(
         effect, "size", 0.0, tolerance, 1.0, low, math.inf, EffectParameter("size", "1", 0.0, 1.0)
     )
 

@@ -12,7 +12,7 @@ from ctr_dynamics.diagnosis.inference.map_fit import fit
 from ctr_dynamics.diagnosis.inference.screening import screen
 from ctr_dynamics.diagnosis.inference.sensitivities import sensitivities_at, with_large_sizes
 from ctr_dynamics.diagnosis.run_context import RunContext
-from ctr_dynamics.effects import EFFECTS, quantities
+from ctr_dynamics.effects import EFFECTS, effect_quantities
 from ctr_dynamics.robot_files import load_robot
 
 SILENT = RunContext(workers=1)
@@ -21,7 +21,7 @@ SILENT = RunContext(workers=1)
 def test_every_effect_of_the_catalogue_is_a_candidate():
     robot = load_robot("till2020_tissue")
     positions = np.random.default_rng(4).normal(size=(100, 3)) * 0.02
-    found = {c.effect for c in candidates(quantities(robot), positions)}
+    found = {c.effect for c in candidates(effect_quantities(robot), positions)}
     assert found == {name for name, effect in EFFECTS.items() if not effect.nuisance}
 
 

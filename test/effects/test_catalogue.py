@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ctr_dynamics.effects import EFFECTS, Plant, apply_effects, make_plant, quantities
+from ctr_dynamics.effects import EFFECTS, Plant, apply_effects, effect_quantities, make_plant
 from ctr_dynamics.effects.plant import same
 from ctr_dynamics.model.model import Model
 from ctr_dynamics.model.simulator import Inputs, Simulator
@@ -126,13 +126,13 @@ def test_one_scale_away_from_off_every_parameter_acts(name):
     data = copy.deepcopy(robot_to_dict(ROBOT))
     data["gravity"]["value"] = [2.0, -9.0, 3.0]  # a turn about gravity's own axis does nothing
     robot = robot_from_dict(data)
-    strengths = [q for q in quantities(ROBOT) if q.effect == name and not q.parameter.shape]
+    strengths = [q for q in effect_quantities(ROBOT) if q.effect == name and not q.parameter.shape]
     assert strengths
 
     def away(chosen):
         return {chosen.effect: {chosen.name: chosen.parameter.value(chosen.off + chosen.scale)}}
 
-    on = next((away(q) for q in quantities(ROBOT) if q.effect == host), {})
+    on = next((away(q) for q in effect_quantities(ROBOT) if q.effect == host), {})
     for q in strengths:
         plant, without = make_plant(robot), make_plant(robot)
         apply_effects(without, on)

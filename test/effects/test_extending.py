@@ -11,7 +11,7 @@ import pytest
 
 from ctr_dynamics.diagnosis.forward_model import ForwardModel
 from ctr_dynamics.diagnosis.recording import read_recording
-from ctr_dynamics.effects import EFFECTS, EffectParameter, effect, quantities, register
+from ctr_dynamics.effects import EFFECTS, EffectParameter, effect, effect_quantities, register
 from ctr_dynamics.errors import InputError
 from ctr_dynamics.estimation.estimator import Estimator
 from ctr_dynamics.io import open_bag
@@ -154,7 +154,7 @@ def test_an_effect_of_one_file_is_seen_everywhere_and_off_it_changes_no_bit(name
     assert explained < 0.05 * missed
     # diagnosis: prediction, derivative and what the derivative says of the bag
     forward = ForwardModel(read_recording(own_bag, PLAIN), PLAIN)
-    (quantity,) = [q for q in quantities(PLAIN) if q.key == (name, SIZES[name][0])]
+    (quantity,) = [q for q in effect_quantities(PLAIN) if q.key == (name, SIZES[name][0])]
     zero = {quantity.key: quantity.off}
     assert np.array_equal(forward.predict(zero).position, forward.predict({}).position)
     prediction, columns = forward.jacobian({}, [quantity])

@@ -9,15 +9,15 @@ from ctr_dynamics.diagnosis.inference.discretisation_error import correct_discre
 from ctr_dynamics.diagnosis.inference.fit_problem import Local, Problem
 from ctr_dynamics.diagnosis.inference.map_fit import Fit, fit
 from ctr_dynamics.diagnosis.run_context import RunContext
-from ctr_dynamics.effects import EFFECTS, Quantity, quantities
+from ctr_dynamics.effects import EFFECTS, EffectQuantity, effect_quantities
 from ctr_dynamics.errors import InputError
 from ctr_dynamics.robot import Robot
 
 
-def nuisances_of(robot: Robot) -> list[Quantity]:
+def nuisances_of(robot: Robot) -> list[EffectQuantity]:
     """Quantities of ``robot`` with a tolerance, without those that are free beside one effect only."""
     forms = {name for effect in EFFECTS.values() for name in effect.form}
-    return [q for q in quantities(robot) if q.tolerance > 0.0 and q.effect not in forms]
+    return [q for q in effect_quantities(robot) if q.tolerance > 0.0 and q.effect not in forms]
 
 
 def calibrate(problem: Problem, context: RunContext) -> tuple[Fit, dict[str, float]]:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from ctr_dynamics.diagnosis.diagnosis_options import PriorOptions
 from ctr_dynamics.diagnosis.forward_model import Key
-from ctr_dynamics.effects import EFFECTS, Quantity
+from ctr_dynamics.effects import EFFECTS, EffectQuantity
 
 Floats = NDArray[np.float64]
 
@@ -30,8 +30,8 @@ class Candidate:
     """
 
     effect: str
-    quantities: tuple[Quantity, ...]
-    shapes: tuple[Quantity, ...] = ()
+    quantities: tuple[EffectQuantity, ...]
+    shapes: tuple[EffectQuantity, ...] = ()
     start: tuple[tuple[Key, float], ...] = ()
     sizes: tuple[float, ...] = ()
 
@@ -48,7 +48,7 @@ class Candidate:
 
 
 def candidates(
-    known: Sequence[Quantity], positions: Floats, options: PriorOptions | None = None
+    known: Sequence[EffectQuantity], positions: Floats, options: PriorOptions | None = None
 ) -> list[Candidate]:
     """Every candidate of the catalogue.
 
@@ -74,7 +74,7 @@ def candidates(
         own = [q for q in known if q.effect == name]
         amplitudes = [q for q in own if not q.parameter.shape]
         shapes = [q for q in own if q.parameter.shape]
-        groups: list[tuple[list[Quantity], list[Quantity]]]
+        groups: list[tuple[list[EffectQuantity], list[EffectQuantity]]]
         if effect.joint:
             groups = [(amplitudes, shapes)]
         else:
@@ -94,7 +94,7 @@ def candidates(
     return found
 
 
-def causes_of(members: Sequence[Candidate]) -> tuple[Quantity, ...]:
+def causes_of(members: Sequence[Candidate]) -> tuple[EffectQuantity, ...]:
     """Every free parameter of ``members``, shapes included."""
     return tuple(q for c in members for q in c.quantities + c.shapes)
 
@@ -104,7 +104,7 @@ def keys_of(members: Sequence[Candidate]) -> frozenset[Key]:
     return frozenset().union(*(c.keys for c in members)) if members else frozenset()
 
 
-def tube_of(q: Quantity) -> str:
+def tube_of(q: EffectQuantity) -> str:
     """Tube of a quantity, empty where it belongs to none."""
     return q.name.split(".")[0] if q.name.startswith("tube") else ""
 

@@ -24,7 +24,7 @@ from ctr_dynamics.diagnosis.inference.fit_problem import Problem
 from ctr_dynamics.diagnosis.recording import Recording
 from ctr_dynamics.diagnosis.run_context import RunContext
 from ctr_dynamics.diagnosis.whitening import noise_floor
-from ctr_dynamics.effects import Quantity
+from ctr_dynamics.effects import EffectQuantity
 from ctr_dynamics.kernels.rotations import matrix
 
 Floats = NDArray[np.float64]
@@ -32,7 +32,9 @@ EFFECT = "contact"
 FAILED = 1e3  # noise floors: residual where the model cannot be simulated
 
 
-def find_contact_plane(problem: Problem, known: Sequence[Quantity], context: RunContext) -> Candidate | None:
+def find_contact_plane(
+    problem: Problem, known: Sequence[EffectQuantity], context: RunContext
+) -> Candidate | None:
     """A candidate whose plane explains the first moments after measurement and nominal model diverge; None where no plane does."""
     own = [q for q in known if q.effect == EFFECT]
     options = problem.options.contact_plane

@@ -12,7 +12,7 @@ from ctr_dynamics.diagnosis.diagnosis_options import DiagnosisOptions
 from ctr_dynamics.diagnosis.forward_model import ForwardModel, Key
 from ctr_dynamics.diagnosis.recording import Recording
 from ctr_dynamics.diagnosis.whitening import Whitener
-from ctr_dynamics.effects import Quantity
+from ctr_dynamics.effects import EffectQuantity
 from ctr_dynamics.errors import InputError
 from ctr_dynamics.robot import Robot
 
@@ -43,7 +43,7 @@ class Problem:
     robot: Robot
     forward_models: list[ForwardModel]
     whiteners: list[Whitener]
-    nuisances: tuple[Quantity, ...]
+    nuisances: tuple[EffectQuantity, ...]
     numerics: Floats
     offset: Floats
     reach: float
@@ -85,7 +85,7 @@ class Problem:
         return np.concatenate(parts) - self.offset
 
     def linearise(
-        self, point: Mapping[Key, float], wanted: Sequence[Quantity]
+        self, point: Mapping[Key, float], wanted: Sequence[EffectQuantity]
     ) -> tuple[Floats, Floats] | None:
         """Whitened residual (m,) at ``point`` and derivatives (m, len(wanted)) of the prediction, each by its coordinate."""
         residuals, columns = [], []
@@ -109,7 +109,7 @@ class Problem:
 def make_problem(
     robot: Robot,
     recordings: Sequence[Recording],
-    nuisances: Sequence[Quantity],
+    nuisances: Sequence[EffectQuantity],
     mask: NDArray[np.bool_],
     options: DiagnosisOptions | None = None,
 ) -> Problem:

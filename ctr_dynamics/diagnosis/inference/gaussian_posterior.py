@@ -14,19 +14,19 @@ from numpy.typing import NDArray
 from scipy.special import log_ndtr
 
 from ctr_dynamics.diagnosis.forward_model import Key
-from ctr_dynamics.effects import Quantity
+from ctr_dynamics.effects import EffectQuantity
 
 Floats = NDArray[np.float64]
 
 
-def prior_variance(quantity: Quantity, cause: bool) -> float:
+def prior_variance(quantity: EffectQuantity, cause: bool) -> float:
     """Of a coordinate: tolerance^2, plus scale^2 where it may be a cause."""
     return quantity.tolerance**2 + (quantity.scale**2 if cause else 0.0)
 
 
 def variances(
-    nuisances: Sequence[Quantity], causes: Sequence[Quantity]
-) -> tuple[tuple[Quantity, ...], Floats]:
+    nuisances: Sequence[EffectQuantity], causes: Sequence[EffectQuantity]
+) -> tuple[tuple[EffectQuantity, ...], Floats]:
     """Free quantities and their prior variances: nuisances, then causes that are none."""
     active = list(nuisances)
     names = {q.key for q in nuisances}
@@ -77,7 +77,7 @@ def numerics_part(residual: Floats, numerics: Floats) -> Floats:
 
 
 def within_tolerance(
-    active: Sequence[Quantity], causes: set[Key], departure: Floats, covariance: Floats, limit: float
+    active: Sequence[EffectQuantity], causes: set[Key], departure: Floats, covariance: Floats, limit: float
 ) -> float:
     """Log probability that the nuisances lie within ``limit`` tolerances, over that before the data.
 

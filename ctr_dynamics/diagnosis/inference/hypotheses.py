@@ -21,7 +21,7 @@ from ctr_dynamics.diagnosis.inference.gaussian_posterior import posterior, varia
 from ctr_dynamics.diagnosis.inference.map_fit import Fit, fit
 from ctr_dynamics.diagnosis.inference.screening import Screened
 from ctr_dynamics.diagnosis.inference.sensitivities import Sensitivities, off_nominal
-from ctr_dynamics.effects import EFFECTS, Quantity, quantities
+from ctr_dynamics.effects import EFFECTS, EffectQuantity, effect_quantities
 
 Floats = NDArray[np.float64]
 FAILED = 1e30  # whitened squares where a simulation fails
@@ -67,7 +67,7 @@ def with_form(problem: Problem, members: Sequence[Candidate]) -> Problem:
     names = {name for c in members for name in EFFECTS[c.effect].form}
     if not names:
         return problem
-    form = tuple(q for q in quantities(problem.robot) if q.effect in names)
+    form = tuple(q for q in effect_quantities(problem.robot) if q.effect in names)
     return replace(problem, nuisances=problem.nuisances + form)
 
 
@@ -131,7 +131,7 @@ def fit_addition(problem: Problem, addition: Addition, limit: float = math.inf) 
     return None if result is None else Hypothesis(members, result)
 
 
-def best_size_nearby(problem: Problem, point: Mapping[Key, float], q: Quantity) -> dict[Key, float]:
+def best_size_nearby(problem: Problem, point: Mapping[Key, float], q: EffectQuantity) -> dict[Key, float]:
     """The size of ``q`` near ``point`` that leaves least, all else as it is.
 
     Where an effect changes a frequency, the phase error grows in time, and the columns reach a few per cent far only. Nuisances that follow

@@ -25,7 +25,7 @@ from ctr_dynamics.diagnosis.inference.gaussian_posterior import (
     variances,
     within_tolerance,
 )
-from ctr_dynamics.effects import Quantity
+from ctr_dynamics.effects import EffectQuantity
 
 Floats = NDArray[np.float64]
 
@@ -45,8 +45,8 @@ class Fit:
         inflation: of the posterior deviations, for what no model has (docs/diagnosis.md).
     """
 
-    causes: tuple[Quantity, ...]
-    active: tuple[Quantity, ...]
+    causes: tuple[EffectQuantity, ...]
+    active: tuple[EffectQuantity, ...]
     values: Floats
     covariance: Floats
     chi2: float
@@ -76,7 +76,7 @@ class Fit:
 
 def fit(
     problem: Problem,
-    causes: Sequence[Quantity],
+    causes: Sequence[EffectQuantity],
     start: Mapping[Key, float],
     known: Local | None = None,
     *,
@@ -146,7 +146,9 @@ class GaussNewton:
         unseen: causes without a column yet, as shapes of an effect that is off.
     """
 
-    def __init__(self, problem: Problem, causes: Sequence[Quantity], start: Mapping[Key, float]) -> None:
+    def __init__(
+        self, problem: Problem, causes: Sequence[EffectQuantity], start: Mapping[Key, float]
+    ) -> None:
         self.problem, self.causes = problem, tuple(causes)
         self.active, self.variance = variances(problem.nuisances, causes)
         self.off = np.array([q.off for q in self.active])
@@ -280,8 +282,8 @@ class GaussNewton:
 
 def fit_at(
     problem: Problem,
-    causes: tuple[Quantity, ...],
-    active: tuple[Quantity, ...],
+    causes: tuple[EffectQuantity, ...],
+    active: tuple[EffectQuantity, ...],
     values: Floats,
     residual: Floats,
     columns: Floats,

@@ -21,7 +21,7 @@ from ctr_dynamics.diagnosis.inference.fit_problem import Problem
 from ctr_dynamics.diagnosis.inference.gaussian_posterior import posterior, variances, within_tolerance
 from ctr_dynamics.diagnosis.inference.map_fit import Fit
 from ctr_dynamics.diagnosis.inference.sensitivities import Sensitivities, Trial
-from ctr_dynamics.effects import Quantity
+from ctr_dynamics.effects import EffectQuantity
 
 Floats = NDArray[np.float64]
 
@@ -161,7 +161,7 @@ def rank_pairs(
     return sorted(ranked, key=lambda item: -item[0])
 
 
-def _known_shapes(c: Candidate, known: dict[Key, Floats]) -> tuple[Quantity, ...]:
+def _known_shapes(c: Candidate, known: dict[Key, Floats]) -> tuple[EffectQuantity, ...]:
     """Shapes of a candidate whose columns are known: those of one that the fit holds."""
     return tuple(q for q in c.shapes if q.key in known)
 

@@ -33,7 +33,7 @@ from ctr_dynamics.diagnosis.inference.screening import Screened, one_form_each, 
 from ctr_dynamics.diagnosis.inference.sensitivities import Sensitivities, sensitivities_at, with_large_sizes
 from ctr_dynamics.diagnosis.inference.separation import separation
 from ctr_dynamics.diagnosis.run_context import RunContext
-from ctr_dynamics.effects import quantities
+from ctr_dynamics.effects import effect_quantities
 
 
 @dataclass
@@ -116,7 +116,7 @@ def try_large_sizes(
     problem = state.problem
     state.context.report("large sizes, and a contact plane")
     if not any(c.sizes for c in state.pool):
-        plane = find_contact_plane(problem, quantities(problem.robot), state.context)
+        plane = find_contact_plane(problem, effect_quantities(problem.robot), state.context)
         state.pool = [*state.pool, *([plane] if plane else [])]
     here = with_large_sizes(problem, here, state.pool, state.context)
     again = screen(problem, here, state.recalibrated, (), state.pool)

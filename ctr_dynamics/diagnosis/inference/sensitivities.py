@@ -18,7 +18,7 @@ from ctr_dynamics.diagnosis.inference.candidates import Candidate
 from ctr_dynamics.diagnosis.inference.fit_problem import Problem
 from ctr_dynamics.diagnosis.inference.map_fit import Fit
 from ctr_dynamics.diagnosis.run_context import RunContext
-from ctr_dynamics.effects import EFFECTS, Quantity
+from ctr_dynamics.effects import EFFECTS, EffectQuantity
 
 Floats = NDArray[np.float64]
 
@@ -99,7 +99,7 @@ def sensitivities_at(
     first = tuple(q for c in members for q in c.quantities)
 
     def columns(
-        at: Mapping[Key, float], wanted: Sequence[Quantity], more: Sequence[Quantity] = ()
+        at: Mapping[Key, float], wanted: Sequence[EffectQuantity], more: Sequence[EffectQuantity] = ()
     ) -> tuple[Floats, Floats] | None:
         found = problem.linearise({**at, **point}, (*wanted, *more))
         return columns({}, wanted) if found is None and more else found
@@ -166,9 +166,9 @@ def off_nominal(problem: Problem, point: Mapping[Key, float]) -> bool:
 
 def _by_kind(
     problem: Problem, pool: Sequence[Candidate]
-) -> tuple[dict[Key, Quantity], list[Candidate], list[Candidate]]:
+) -> tuple[dict[Key, EffectQuantity], list[Candidate], list[Candidate]]:
     """Quantities that one linearisation of the plain model gives; candidates that need a shape or the extended model; those of finite sizes."""
-    plain: dict[Key, Quantity] = {q.key: q for q in problem.nuisances}
+    plain: dict[Key, EffectQuantity] = {q.key: q for q in problem.nuisances}
     shaped: list[Candidate] = []
     finite: list[Candidate] = []
     for c in pool:

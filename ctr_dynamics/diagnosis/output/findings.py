@@ -18,7 +18,7 @@ from ctr_dynamics.diagnosis.output.robot_export import robot_with
 from ctr_dynamics.diagnosis.verdict.residual_tests import rms
 from ctr_dynamics.diagnosis.verdict.separability import Cause
 from ctr_dynamics.diagnosis.whitening import noise_floor
-from ctr_dynamics.effects import EFFECTS, Quantity
+from ctr_dynamics.effects import EFFECTS, EffectQuantity
 from ctr_dynamics.io.atomic_files import atomic_file
 from ctr_dynamics.robot_files import robot_to_yaml
 from ctr_dynamics.runtime.replay import plain
@@ -28,7 +28,7 @@ SCHEMA = "ctr_dynamics/findings/1"
 RECALIBRATED, EXTENDED = "recalibrated_robot.yaml", "extended_robot.yaml"
 
 
-def interval(q: Quantity, value: float, sigma: float, width: float) -> list[float | None]:
+def interval(q: EffectQuantity, value: float, sigma: float, width: float) -> list[float | None]:
     """Interval of ``width`` sigma in the contract's unit; None where it is unbounded."""
     low, high = max(value - width * sigma, q.low), min(value + width * sigma, q.high)
     ends = sorted((q.parameter.value(low), q.parameter.value(high)))

@@ -14,7 +14,7 @@ from scipy.signal import lombscargle
 
 from ctr_dynamics.diagnosis.diagnosis_options import UnexplainedForceOptions
 from ctr_dynamics.diagnosis.forward_model import ForwardModel, Point
-from ctr_dynamics.effects import quantities
+from ctr_dynamics.effects import effect_quantities
 
 Floats = NDArray[np.float64]
 
@@ -54,7 +54,7 @@ def unexplained_force(
 
     The tip's compliance is that of a constant force: right below the first resonance, and a description above it.
     """
-    pushes = [q for q in quantities(forward_model.robot) if q.effect == "tip_force"]
+    pushes = [q for q in effect_quantities(forward_model.robot) if q.effect == "tip_force"]
     prediction, jacobian = forward_model.jacobian(point, pushes)
     residual = forward_model.residual(prediction)[:, :3]
     stamps = forward_model.recording.stamps
