@@ -1,19 +1,12 @@
-"""The table of parameters. The node's declaration, replay's --set, the checks, docs/parameters.md and config/estimator.yaml come from it."""
+"""The one table of parameters: it drives declaration, replay's --set, checks, documentation and YAML."""
 
 from __future__ import annotations
 
 import math
-import re
-from collections.abc import Iterator, Mapping
 from difflib import get_close_matches
-from pathlib import Path
-from typing import Any
 
 from ctr_dynamics.errors import InputError
-from ctr_dynamics.io.yaml_files import read_yaml
-from ctr_dynamics.parameter_types import Parameter, Value, axes_mask
-
-__all__ = ["PARAMETERS", "Parameter", "Settings", "Value", "axes_mask", "parameter", "parse_assignments"]
+from ctr_dynamics.parameters.parameter_types import Parameter, axes_mask
 
 SCHEMES = ("backward_euler", "bdf2", "trapezoid", "bdf_alpha", "sdirk2", "sdirk3")
 RELIABILITY = ("best_effort", "reliable")
@@ -313,8 +306,6 @@ PARAMETERS: tuple[Parameter, ...] = (
 
 _BY_NAME = {parameter.name: parameter for parameter in PARAMETERS}
 _REMOVED = {"model.dt_s": "steps always take 3 ms: remove it"}
-# In every node's parameter file, and none of this table's business.
-_ROS_NAMES = re.compile(r"use_sim_time|start_type_description_service|qos_overrides\..*")
 
 
 def parameter(name: str) -> Parameter:
@@ -329,153 +320,3 @@ def parameter(name: str) -> Parameter:
         near = get_close_matches(name, _BY_NAME, 1)
         hint = _REMOVED.get(name) or (f"did you mean '{near[0]}'?" if near else "see docs/parameters.md")
         raise InputError(f"unknown parameter '{name}'", do=hint) from None
-
-
-class Settings(Mapping[str, Value]):
-    """Every parameter of the estimator with its checked value; an immutable mapping. docs/parameters.md lists names, units and ranges.
-
-    Args:
-        values: name to value; those not given have their default.
-
-    Raises:
-        InputError: unknown name, wrong type or out of range.
-
-    Example:
-        >>> from ctr_dynamics import Settings
-        >>> settings = Settings({"tracker.delay_s": 0.018, "output.policy": "wait"})
-        >>> settings["tracker.delay_s"], settings["model.nodes"]
-        (0.018, 12)
-    """
-
-    __slots__ = ("_values",)
-
-    def __init__(self, values: Mapping[str, Any] | None = None) -> None:
-        checked = {p.name: p.default for p in PARAMETERS}
-        for name, value in (values or {}).items():
-            checked[name] = parameter(name).check(value)
-        self._values = checked
-        least, most = self["filter.tip_force_sigma_N"], self["filter.tip_force_sigma_max_N"]
-        if least > most:
-            raise InputError(
-                f"filter.tip_force_sigma_N is {least:g} N, limit filter.tip_force_sigma_max_N, {most:g} N",
-                do="lower the one or raise the other",
-            )
-
-    @classmethod
-    def from_sources(cls, file: Path | None = None, overrides: Mapping[str, Any] | None = None) -> Settings:
-        """Defaults, then a parameter file, then overrides.
-
-        Args:
-            file: YAML, either a ROS 2 parameter file or the parameters themselves, nested or dotted.
-            overrides: name to value or to text as on the command line.
-
-        Raises:
-            InputError: unreadable file, unknown name, wrong type or out of range.
-        """
-        values = read_parameter_file(file) if file is not None else {}
-        return cls({**values, **(overrides or {})})
-
-    def replace(self, values: Mapping[str, Any]) -> Settings:
-        """A copy with some values changed; raises as the constructor does."""
-        return Settings({**self._values, **values})
-
-    def as_dict(self) -> dict[str, Any]:
-        """Plain dict for JSON and YAML; arrays are lists."""
-        return {name: list(v) if isinstance(v, tuple) else v for name, v in self._values.items()}
-
-    # Any: a value's type is known from its parameter, which the type checker cannot follow.
-    def __getitem__(self, name: str) -> Any:
-        return self._values[parameter(name).name]
-
-    def __contains__(self, name: object) -> bool:
-        return name in self._values
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._values)
-
-    def __len__(self) -> int:
-        return len(self._values)
-
-    def __repr__(self) -> str:
-        changed = {p.name: self[p.name] for p in PARAMETERS if self[p.name] != p.default}
-        return f"Settings({changed})"
-
-
-def parse_assignments(assignments: list[str]) -> dict[str, str]:
-    """`NAME=VALUE` texts of a command line by name; the values are checked later.
-
-    Raises:
-        InputError: no "=", unknown or repeated name.
-    """
-    values: dict[str, str] = {}
-    for text in assignments:
-        name, equals, value = text.partition("=")
-        name = name.strip()
-        if not equals or not name:
-            raise InputError(f"'{text}' is not NAME=VALUE", do="write for example tracker.delay_s=0.018")
-        parameter(name)
-        if name in values:
-            raise InputError(f"parameter '{name}' is given twice", do="give it once")
-        values[name] = value.strip()
-    return values
-
-
-def read_parameter_file(file: Path) -> dict[str, Value]:
-    """Values in a YAML parameter file by dotted name, checked.
-
-    Raises:
-        InputError: unreadable, no block for the estimator, unknown name, wrong type or out of range.
-    """
-    where = str(file)
-    try:
-        text = Path(file).read_text(encoding="utf-8")
-    except UnicodeDecodeError as error:
-        raise InputError(f"not UTF-8 at byte {error.start}", do="save as UTF-8 text", where=where) from None
-    except OSError as error:
-        raise InputError(f"cannot read: {error.strerror}", do="check path and rights", where=where) from None
-    data = read_yaml(text, where)
-    if data is None:
-        return {}
-    if not isinstance(data, dict):
-        raise InputError("holds no parameters", do="see config/estimator.yaml", where=where)
-    blocks = list(_ros_blocks(data, ""))
-    if blocks:
-        data = {}
-        mine = [b for node, b in blocks if node.rsplit("/", 1)[-1] in ("estimator", "*", "**")]
-        if not mine:
-            nodes = ", ".join(node for node, _ in blocks)
-            raise InputError(
-                f"holds parameters of {nodes}, none of the estimator",
-                do="name it /ctr/estimator",
-                where=where,
-            )
-        for block in mine:
-            data.update(_flat(block, ""))
-    values: dict[str, Value] = {}
-    for name, value in _flat(data, "").items():
-        if _ROS_NAMES.fullmatch(name):
-            continue
-        try:
-            values[name] = parameter(name).check(value)
-        except InputError as error:
-            raise InputError(str(error), where=where) from None
-    return values
-
-
-def _ros_blocks(data: Mapping[Any, Any], node: str) -> Iterator[tuple[str, Mapping[Any, Any]]]:
-    for key, value in data.items():
-        if key == "ros__parameters" and isinstance(value, Mapping):
-            yield node, value
-        elif isinstance(value, Mapping):
-            yield from _ros_blocks(value, f"{node}/{str(key).strip('/')}")
-
-
-def _flat(data: Mapping[Any, Any], prefix: str) -> dict[str, Any]:
-    flat: dict[str, Any] = {}
-    for key, value in data.items():
-        name = f"{prefix}{key}"
-        if isinstance(value, Mapping):
-            flat.update(_flat(value, f"{name}."))
-        else:
-            flat[name] = value
-    return flat

@@ -1,0 +1,18 @@
+"""Parameters of the node and of replay: one table, checked values, and the files that hold them."""
+
+from ctr_dynamics.parameters.parameter_files import read_parameter_file
+from ctr_dynamics.parameters.parameter_table import PARAMETERS, RELIABILITY, parameter
+from ctr_dynamics.parameters.parameter_types import Parameter, Value, axes_mask
+from ctr_dynamics.parameters.settings import Settings, parse_assignments
+
+__all__ = [
+    "PARAMETERS",
+    "RELIABILITY",
+    "Parameter",
+    "Settings",
+    "Value",
+    "axes_mask",
+    "parameter",
+    "parse_assignments",
+    "read_parameter_file",
+]

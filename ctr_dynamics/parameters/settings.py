@@ -1,0 +1,101 @@
+"""Checked values of all parameters, from defaults, a file and a command line."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from ctr_dynamics.errors import InputError
+from ctr_dynamics.parameters.parameter_files import read_parameter_file
+from ctr_dynamics.parameters.parameter_table import PARAMETERS, parameter
+from ctr_dynamics.parameters.parameter_types import Value
+
+
+class Settings(Mapping[str, Value]):
+    """Every parameter of the estimator with its checked value; an immutable mapping. docs/parameters.md lists names, units and ranges.
+
+    Args:
+        values: name to value; those not given have their default.
+
+    Raises:
+        InputError: unknown name, wrong type or out of range.
+
+    Example:
+        >>> from ctr_dynamics import Settings
+        >>> settings = Settings({"tracker.delay_s": 0.018, "output.policy": "wait"})
+        >>> settings["tracker.delay_s"], settings["model.nodes"]
+        (0.018, 12)
+    """
+
+    __slots__ = ("_values",)
+
+    def __init__(self, values: Mapping[str, Any] | None = None) -> None:
+        checked = {p.name: p.default for p in PARAMETERS}
+        for name, value in (values or {}).items():
+            checked[name] = parameter(name).check(value)
+        self._values = checked
+        least, most = self["filter.tip_force_sigma_N"], self["filter.tip_force_sigma_max_N"]
+        if least > most:
+            raise InputError(
+                f"filter.tip_force_sigma_N is {least:g} N, limit filter.tip_force_sigma_max_N, {most:g} N",
+                do="lower the one or raise the other",
+            )
+
+    @classmethod
+    def from_sources(cls, file: Path | None = None, overrides: Mapping[str, Any] | None = None) -> Settings:
+        """Defaults, then a parameter file, then overrides.
+
+        Args:
+            file: YAML, either a ROS 2 parameter file or the parameters themselves, nested or dotted.
+            overrides: name to value or to text as on the command line.
+
+        Raises:
+            InputError: unreadable file, unknown name, wrong type or out of range.
+        """
+        values = read_parameter_file(file) if file is not None else {}
+        return cls({**values, **(overrides or {})})
+
+    def replace(self, values: Mapping[str, Any]) -> Settings:
+        """A copy with some values changed; raises as the constructor does."""
+        return Settings({**self._values, **values})
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain dict for JSON and YAML; arrays are lists."""
+        return {name: list(v) if isinstance(v, tuple) else v for name, v in self._values.items()}
+
+    # Any: a value's type is known from its parameter, which the type checker cannot follow.
+    def __getitem__(self, name: str) -> Any:
+        return self._values[parameter(name).name]
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._values
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._values)
+
+    def __len__(self) -> int:
+        return len(self._values)
+
+    def __repr__(self) -> str:
+        changed = {p.name: self[p.name] for p in PARAMETERS if self[p.name] != p.default}
+        return f"Settings({changed})"
+
+
+def parse_assignments(assignments: list[str]) -> dict[str, str]:
+    """`NAME=VALUE` texts of a command line by name; the values are checked later.
+
+    Raises:
+        InputError: no "=", unknown or repeated name.
+    """
+    values: dict[str, str] = {}
+    for text in assignments:
+        name, equals, value = text.partition("=")
+        name = name.strip()
+        if not equals or not name:
+            raise InputError(f"'{text}' is not NAME=VALUE", do="write for example tracker.delay_s=0.018")
+        parameter(name)
+        if name in values:
+            raise InputError(f"parameter '{name}' is given twice", do="give it once")
+        values[name] = value.strip()
+    return values
