@@ -15,6 +15,7 @@ import math
 import os
 import tempfile
 import time
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +24,7 @@ from studies import add_truth_path
 Z95 = 1.959964
 
 
-def one(stratum: str, seed: int) -> dict[str, Any]:
+def run_case(stratum: str, seed: int) -> dict[str, Any]:
     """Make a case, diagnose it, then open the answer."""
     add_truth_path()
     from truth.cases import make_case
@@ -47,8 +48,8 @@ def one(stratum: str, seed: int) -> dict[str, Any]:
         )
         content = findings(result, "", None)
         answer = case.unseal()
-        sizes = separations(result, answer) if result.search is not None else {}
-        removable = removed(result, answer)
+        sizes = true_separations(result, answer) if result.search is not None else {}
+        removable = error_removed(result, answer)
     kept = (
         "verdict",
         "causes",
@@ -73,7 +74,7 @@ def one(stratum: str, seed: int) -> dict[str, Any]:
     }
 
 
-def separations(result: Any, answer: dict[str, Any]) -> dict[str, float]:
+def true_separations(result: Any, answer: dict[str, Any]) -> dict[str, float]:
     """d_sep of every true cause, from the true effects fitted to the data, against the nearest rival."""
     from ctr_dynamics.diagnosis.inference.hypotheses import fit_hypothesis
     from ctr_dynamics.diagnosis.inference.sensitivities import sensitivities_at
@@ -112,8 +113,8 @@ def separations(result: Any, answer: dict[str, Any]) -> dict[str, float]:
     return out
 
 
-def removed(result: Any, answer: dict[str, Any]) -> float | None:
-    """Share of the removable held-out error that the extension removes: 1 - (ext^2 - floor^2) / (rec^2 - floor^2)."""
+def error_removed(result: Any, answer: dict[str, Any]) -> float | None:
+    """Fraction of the removable held-out error that the extension removes: 1 - (ext^2 - floor^2) / (rec^2 - floor^2)."""
     from ctr_dynamics.diagnosis.whitening import noise_floor
 
     v = result.validation
@@ -125,7 +126,7 @@ def removed(result: Any, answer: dict[str, Any]) -> float | None:
 
 
 def wilson(hits: int, count: int) -> tuple[float, float]:
-    """95 % interval of a share."""
+    """95 % interval of a fraction."""
     if count == 0:
         return 0.0, 1.0
     p = hits / count
@@ -134,8 +135,9 @@ def wilson(hits: int, count: int) -> tuple[float, float]:
     return max(0.0, centre - half), min(1.0, centre + half)
 
 
-def share(hits: list[bool]) -> str:
-    """Hits of count, share and interval."""
+def fraction(outcomes: Iterable[bool]) -> str:
+    """Hits of count, fraction and interval."""
+    hits = list(outcomes)
     count, n = len(hits), sum(hits)
     if not count:
         return "no case"
@@ -143,17 +145,17 @@ def share(hits: list[bool]) -> str:
     return f"{n} of {count} = {100 * n / count:.0f} % [{100 * low:.0f}, {100 * high:.0f}]"
 
 
-def true_set(row: dict[str, Any]) -> list[str]:
+def hidden_effects(row: dict[str, Any]) -> list[str]:
     """Sorted IDs of what was hidden."""
     return sorted({h["effect"] for h in row["hidden"]})
 
 
-def named(row: dict[str, Any]) -> list[str]:
+def named_effects(row: dict[str, Any]) -> list[str]:
     """Sorted IDs of what was found."""
     return sorted({c["effect"] for c in row["causes"]})
 
 
-def coverage(rows: list[dict[str, Any]], level: str) -> list[bool]:
+def interval_hits(rows: list[dict[str, Any]], level: str) -> list[bool]:
     """Whether the intervals of rightly found causes hold the true totals."""
     from ctr_dynamics.effects import EFFECTS
 
@@ -178,29 +180,43 @@ def coverage(rows: list[dict[str, Any]], level: str) -> list[bool]:
     return hits
 
 
-def table(rows: list[dict[str, Any]]) -> list[tuple[str, str, str]]:
+def is_right(row: dict[str, Any]) -> bool:
+    """Whether the first cause is the hidden one."""
+    return bool(row["causes"]) and row["causes"][0]["effect"] == hidden_effects(row)[0]
+
+
+def in_set(row: dict[str, Any]) -> bool:
+    """Whether what was hidden is among the listed sets of causes."""
+    return hidden_effects(row) in [sorted(s) for s in row["cause_set95"]]
+
+
+def is_sure(row: dict[str, Any]) -> bool:
+    """Whether something was hidden and the likeliest hypothesis has a probability of at least 0.95."""
+    likeliest = row["probabilities"][0]["probability"] if row["probabilities"] else 0.0
+    return bool(row["cause_set95"] and row["hidden"]) and likeliest >= 0.95
+
+
+def likeliest_is_right(row: dict[str, Any]) -> bool:
+    """Whether the likeliest hypothesis, or what is named, is what was hidden."""
+    hidden = hidden_effects(row)
+    return sorted(row["probabilities"][0]["effects"]) == hidden or named_effects(row) == hidden
+
+
+def is_clear(row: dict[str, Any], count: int) -> bool:
+    """Whether the separations of ``count`` hidden causes are known, none below 8."""
+    sizes = row["separations"].values()
+    return len(sizes) >= count and min(sizes) >= 8.0
+
+
+def figures(rows: list[dict[str, Any]]) -> list[tuple[str, str, str]]:
     """(figure, aim, measured)."""
-    by = {s: [r for r in rows if r["stratum"] == s] for s in {r["stratum"] for r in rows}}
-    singles, pairs = by.get("single", []), by.get("pair", [])
-    clear = [r for r in singles if r["separations"] and min(r["separations"].values()) >= 8.0]
-    clear_pairs = [r for r in pairs if len(r["separations"]) == 2 and min(r["separations"].values()) >= 8.0]
-    sure = [
-        r
-        for r in rows
-        if r["cause_set95"]
-        and r["probabilities"]
-        and r["probabilities"][0]["probability"] >= 0.95
-        and r["hidden"]
-    ]
-    right_sure = [
-        sorted(r["probabilities"][0]["effects"]) == true_set(r) or named(r) == true_set(r)
-        for r in sure
-        if r["stratum"] != "not_excited"
-    ]
+    by: dict[str, list[dict[str, Any]]] = {s: [r for r in rows if r["stratum"] == s] for s in SEEDS}
+    clear = [r for r in by["single"] if is_clear(r, 1)]
+    clear_pairs = [r for r in by["pair"] if len(r["separations"]) == 2 and is_clear(r, 2)]
+    excited = [r for r in rows if r["stratum"] != "not_excited"]
     given = [
-        c["effect"] in true_set(r)
-        for r in rows
-        if r["stratum"] != "not_excited"
+        c["effect"] in hidden_effects(r)
+        for r in excited
         for c in r["causes"]
         if (c["probability"] or 0.0) >= 0.95
     ]
@@ -209,25 +225,17 @@ def table(rows: list[dict[str, Any]]) -> list[tuple[str, str, str]]:
     seconds = sorted(r["seconds"] for r in rows)
     median = gains[len(gains) // 2] if gains else math.nan
     return [
-        (
-            "singles with d_sep >= 8: right cause first",
-            ">= 95 %",
-            share([bool(r["causes"]) and r["causes"][0]["effect"] == true_set(r)[0] for r in clear]),
-        ),
-        (
-            "singles with d_sep >= 8: truth in the 95 % set",
-            ">= 95 %",
-            share([true_set(r) in [sorted(s) for s in r["cause_set95"]] for r in clear]),
-        ),
+        ("singles with d_sep >= 8: right cause first", ">= 95 %", fraction(map(is_right, clear))),
+        ("singles with d_sep >= 8: truth in the 95 % set", ">= 95 %", fraction(map(in_set, clear))),
         ("their mean size of the 95 % set", "<= 3", f"{sum(sizes) / max(len(sizes), 1):.2f}"),
+        ("all singles: right cause first", "-", fraction(map(is_right, by["single"]))),
+        ("clean bags named", "<= 2 %", fraction(r["verdict"] != "clean" for r in by["none"])),
         (
-            "all singles: right cause first",
-            "-",
-            share([bool(r["causes"]) and r["causes"][0]["effect"] == true_set(r)[0] for r in singles]),
+            "90 % intervals that hold the truth",
+            "84-96 %",
+            fraction(interval_hits(clear + clear_pairs, "ci90")),
         ),
-        ("clean bags named", "<= 2 %", share([r["verdict"] not in ("clean",) for r in by.get("none", [])])),
-        ("90 % intervals that hold the truth", "84-96 %", share(coverage(clear + clear_pairs, "ci90"))),
-        ("99 % intervals that hold the truth", "-", share(coverage(clear + clear_pairs, "ci99"))),
+        ("99 % intervals that hold the truth", "-", fraction(interval_hits(clear + clear_pairs, "ci99"))),
         (
             "removable held-out error removed (median)",
             ">= 85 %",
@@ -236,25 +244,21 @@ def table(rows: list[dict[str, Any]]) -> list[tuple[str, str, str]]:
         (
             "pairs with both d_sep >= 8 exactly right",
             ">= 80 %",
-            share([named(r) == true_set(r) for r in clear_pairs]),
+            fraction(named_effects(r) == hidden_effects(r) for r in clear_pairs),
         ),
         (
             "outside the catalogue called unknown",
             ">= 90 %",
-            share([r["verdict"] == "unknown" or "unknown" in named(r) for r in by.get("outside", [])]),
+            fraction(r["verdict"] == "unknown" or "unknown" in named_effects(r) for r in by["outside"]),
         ),
-        ("causes of probability >= 0.95 that are right", ">= 93 %", share(given)),
-        ("something hidden: likeliest hypothesis right where it has >= 0.95", "-", share(right_sure)),
+        ("causes of probability >= 0.95 that are right", ">= 93 %", fraction(given)),
         (
-            "not excited called so",
+            "something hidden: likeliest hypothesis right where it has >= 0.95",
             "-",
-            share([r["verdict"] == "not_excited" for r in by.get("not_excited", [])]),
+            fraction(likeliest_is_right(r) for r in excited if is_sure(r)),
         ),
-        (
-            "near ties: truth in the 95 % set",
-            "-",
-            share([true_set(r) in [sorted(s) for s in r["cause_set95"]] for r in by.get("near_tie", [])]),
-        ),
+        ("not excited called so", "-", fraction(r["verdict"] == "not_excited" for r in by["not_excited"])),
+        ("near ties: truth in the 95 % set", "-", fraction(map(in_set, by["near_tie"]))),
         (
             "time of a diagnosis on one core (median, largest)",
             "-",
@@ -263,10 +267,10 @@ def table(rows: list[dict[str, Any]]) -> list[tuple[str, str, str]]:
     ]
 
 
-def show(rows: list[dict[str, Any]], seeds: dict[str, int], wall: float | None) -> str:
+def markdown(rows: list[dict[str, Any]], seeds: dict[str, int], run_s: float | None) -> str:
     """The table as Markdown."""
     lines = ["| figure | aim | measured, Wilson 95 % interval |", "|---|---|---|"]
-    lines += [f"| {a} | {b} | {c} |" for a, b, c in table(rows)]
+    lines += [f"| {a} | {b} | {c} |" for a, b, c in figures(rows)]
     counts = {s: sum(r["stratum"] == s for r in rows) for s in seeds}
     lines.append("")
     lines.append(
@@ -275,7 +279,7 @@ def show(rows: list[dict[str, Any]], seeds: dict[str, int], wall: float | None) 
     total = sum(r["seconds"] + r["making_s"] for r in rows)
     lines.append(
         f"Work: {total / 3600:.2f} core hours"
-        + (f", {wall / 60:.0f} min of wall time in the last run." if wall else ".")
+        + (f", {run_s / 60:.0f} min in the last run." if run_s else ".")
     )
     return "\n".join(lines) + "\n"
 
@@ -330,21 +334,21 @@ def main() -> None:
                 rows.append(row)
                 stream.write(json.dumps(row) + "\n")
                 stream.flush()
-                print(
-                    f"{len(rows)}: {row['stratum']} {row['seed']}: {true_set(row)} -> {row['verdict']} {named(row)} {row.get('error', '')}",
-                    flush=True,
+                outcome = (
+                    f"{hidden_effects(row)} -> {row['verdict']} {named_effects(row)} {row.get('error', '')}"
                 )
+                print(f"{len(rows)}: {row['stratum']} {row['seed']}: {outcome}", flush=True)
     rows = [r for r in rows if "error" not in r]
-    text = show(rows, seeds, time.time() - begin if options.table is None else None)
+    text = markdown(rows, seeds, time.time() - begin if options.table is None else None)
     print(text)
     if options.table is not None:
         options.table.write_text(text)
 
 
-def guarded(stratum: str, seed: int) -> dict[str, Any]:
+def run_guarded(stratum: str, seed: int) -> dict[str, Any]:
     """A case that cannot be made or diagnosed is said, not lost."""
     try:
-        return one(stratum, seed)
+        return run_case(stratum, seed)
     except Exception as error:
         return {
             "stratum": stratum,
@@ -361,13 +365,13 @@ def _work(todo: list[tuple[str, int]], options: argparse.Namespace) -> Any:
         from dask.distributed import Client, as_completed
 
         with Client(options.cluster) as client:
-            for future in as_completed([client.submit(guarded, s, seed) for s, seed in todo]):
+            for future in as_completed([client.submit(run_guarded, s, seed) for s, seed in todo]):
                 yield future.result()
         return
     from joblib import Parallel, delayed
 
     yield from Parallel(options.workers, return_as="generator_unordered", batch_size=1)(
-        delayed(guarded)(s, seed) for s, seed in todo
+        delayed(run_guarded)(s, seed) for s, seed in todo
     )
 
 
