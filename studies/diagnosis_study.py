@@ -30,7 +30,7 @@ def run_case(stratum: str, seed: int) -> dict[str, Any]:
     from truth.cases import make_case
 
     from ctr_dynamics.diagnosis.output.findings import findings
-    from ctr_dynamics.diagnosis.pipeline import diagnose
+    from ctr_dynamics.diagnosis.pipeline import diagnose_recordings
     from ctr_dynamics.diagnosis.recording import read_recording
     from ctr_dynamics.diagnosis.run_context import RunContext
     from ctr_dynamics.robot_files import load_robot
@@ -40,7 +40,7 @@ def run_case(stratum: str, seed: int) -> dict[str, Any]:
         case = make_case(seed, stratum, folder)
         made = time.time() - begin
         robot = load_robot(case.robot)
-        result = diagnose(
+        result = diagnose_recordings(
             robot,
             [read_recording(case.protocol, robot)],
             [read_recording(case.sweep, robot)],

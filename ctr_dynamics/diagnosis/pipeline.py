@@ -31,7 +31,7 @@ from ctr_dynamics.errors import InputError
 from ctr_dynamics.robot import Robot
 
 
-def diagnose(
+def diagnose_recordings(
     robot: Robot,
     recordings: Sequence[Recording],
     validation: Sequence[Recording] = (),

@@ -9,12 +9,12 @@ from typing import Any
 import yaml
 
 from ctr_dynamics.diagnosis.kernel_warm_up import warm_up
+from ctr_dynamics.diagnosis.next_experiment import NextExperiment, next_experiment
 from ctr_dynamics.diagnosis.output.findings import findings, write
 from ctr_dynamics.diagnosis.output.findings_report import write_report
-from ctr_dynamics.diagnosis.pipeline import diagnose
+from ctr_dynamics.diagnosis.pipeline import diagnose_recordings
 from ctr_dynamics.diagnosis.recording import Recording, read_recording
 from ctr_dynamics.diagnosis.run_context import RunContext
-from ctr_dynamics.diagnosis.verdict.next_experiment import NextExperiment, next_experiment
 from ctr_dynamics.errors import InputError
 from ctr_dynamics.io.atomic_files import atomic_file, output_folder
 from ctr_dynamics.robot import Robot
@@ -51,7 +51,7 @@ def run(request: Request, context: RunContext | None = None) -> dict[str, Any]:
     _all_different([*recordings, *others])
     context.report("kernels: compiled at the first use")
     warm_up(request.robot)
-    diagnosis = diagnose(request.robot, recordings, others, context=context)
+    diagnosis = diagnose_recordings(request.robot, recordings, others, context=context)
     if not others:
         diagnosis.notes.append(
             "without a validation bag the gain is not measured, and a wrong cause that fits is not found out"

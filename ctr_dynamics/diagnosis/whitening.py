@@ -1,4 +1,7 @@
-"""Noise of the tracker as the robot file states it, and the whitening that follows."""
+"""Whitening: the noise of the tracker as the robot file states it.
+
+In: a robot and the stamps of its tracker. Out: a function from residuals to independent numbers of unit variance.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +17,10 @@ Floats = NDArray[np.float64]
 class Whitener:
     """Turns residuals (s, 6) into independent numbers of unit variance: white noise plus drift with a correlation time, per axis.
 
-    ``mask`` (6,) leaves out axes that are not measured; ``used`` (s,) leaves out samples. ``scale`` multiplies the stated noise.
+    Args:
+        stamps: (s,) s.
+        mask: (6,) axes that are measured: position, then rotation.
+        used: (s,) poses that count.
     """
 
     def __init__(

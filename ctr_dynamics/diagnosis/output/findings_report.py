@@ -218,7 +218,7 @@ def _whiteness(page: Page, d: Diagnosis, recalibrated: Fit, extended: Fit) -> No
     left, right = figure.subplots(1, 2)
     for fit, label, colour in ((recalibrated, "re-calibrated", "#0969da"), (extended, "extended", "#cf222e")):
         sequences = by_axis(d.problem, fit.whitened)
-        lags = np.arange(1, 21)
+        lags = np.arange(1, d.options.residual_tests.lags + 1)
         values = [[float(x[k:] @ x[:-k]) / max(float(x @ x), 1e-30) for k in lags] for x in sequences]
         left.plot(lags, np.mean(values, axis=0), ".-", color=colour, label=label)
         rate = 1.0 / np.median(np.diff(d.recordings[0].stamps))

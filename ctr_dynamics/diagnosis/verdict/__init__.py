@@ -1,1 +1,1 @@
-"""From hypotheses with probabilities to a verdict: tests of the residual, what is left unexplained, the next experiment."""
+"""From hypotheses with probabilities to a verdict: residual tests, validation, separability, and what is left unexplained."""
