@@ -15,7 +15,7 @@ from joblib import Parallel, delayed
 from ctr_dynamics.robot_files import load_robot
 
 ROOT = Path(__file__).parents[2]
-EXAMPLE = ROOT / "examples" / "snap_drivetrain"
+EXAMPLE = ROOT / "examples" / "06_snap_drivetrain"
 for folder in (EXAMPLE, ROOT / "test" / "diagnosis", ROOT / "test" / "snap"):
     if str(folder) not in sys.path:
         sys.path.insert(0, str(folder))

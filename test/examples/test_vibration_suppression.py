@@ -13,7 +13,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-EXAMPLE = Path(__file__).parents[2] / "examples" / "vibration_suppression"
+EXAMPLE = Path(__file__).parents[2] / "examples" / "05_vibration_suppression"
 
 
 def load(name: str):

@@ -1,6 +1,6 @@
 """Releases a weight of 60 g with and without control, over DDS on this machine, and prints how long the tip takes to settle.
 
-    python examples/vibration_suppression/run.py [--speed 0.5] [--output FOLDER]
+    python examples/05_vibration_suppression/run.py [--speed 0.5] [--output FOLDER]
 
 Estimator, simulated robot and controller are three processes on a ROS domain of their own. `--speed 0` uses the system clock instead of /clock.
 """

@@ -1,6 +1,6 @@
 """The loop without ROS and without a clock: plant, estimator and damper in one thread, every delay as it would be.
 
-    python examples/vibration_suppression/offline.py
+    python examples/05_vibration_suppression/offline.py
 
 prints the settling times with and without control. The nodes of this folder do the same over DDS.
 """
