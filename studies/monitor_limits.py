@@ -13,13 +13,13 @@ import argparse
 import numpy as np
 from numpy.typing import NDArray
 
-from ctr_dynamics.estimation.monitoring.consistency import EVERY, LAGS, MisfitLimits
+from ctr_dynamics.estimation.monitoring.consistency_monitor import LAGS, ConsistencyLimits
 
 RATE, AXES = 40.0, 6
 TEN_HOURS = 36_000.0  # s
 
 
-def peaks(hours: float, limits: MisfitLimits, seed: int) -> dict[str, NDArray[np.float64]]:
+def peaks(hours: float, limits: ConsistencyLimits, seed: int) -> dict[str, NDArray[np.float64]]:
     """Largest value of each statistic in every stretch of a window's length."""
     rng = np.random.default_rng(seed)
     window = round(limits.window * RATE)
@@ -34,7 +34,7 @@ def peaks(hours: float, limits: MisfitLimits, seed: int) -> dict[str, NDArray[np
         sum_before = float(cusum[-1])
         total = np.concatenate([[0.0], nis.cumsum()])
         mean = (total[window:] - total[:-window])[LAGS + 1 :] / (AXES * window)
-        ends = np.arange(window + LAGS + EVERY, len(white) + 1, EVERY)
+        ends = np.arange(window + LAGS + limits.every, len(white) + 1, limits.every)
         size = np.maximum(_sums(white**2, window, ends), window)
         rho = sum(
             np.square(_sums(white[lag:] * white[:-lag], window - lag, ends - lag) / size) / (window - lag)
@@ -42,7 +42,7 @@ def peaks(hours: float, limits: MisfitLimits, seed: int) -> dict[str, NDArray[np
         )
         box = window * (window + 2.0) * rho.sum(axis=1) / (LAGS * AXES)
         for name, values in (("cusum", cusum), ("nis", mean), ("whiteness", box)):
-            per = window // EVERY if name == "whiteness" else window
+            per = window // limits.every if name == "whiteness" else window
             found[name] += values[: 360 * per].reshape(360, per).max(axis=1).tolist()
     return {name: np.array(values) for name, values in found.items()}
 
@@ -61,7 +61,7 @@ def main() -> None:
     parser.add_argument("--hours", type=float, default=1000.0)
     parser.add_argument("--seed", type=int, default=1)
     options = parser.parse_args()
-    limits = MisfitLimits()
+    limits = ConsistencyLimits()
     print(f"{options.hours:g} h, seed {options.seed}")
     for name, values in peaks(options.hours, limits, options.seed).items():
         tens = len(values) * limits.window / TEN_HOURS

@@ -20,7 +20,7 @@ from ctr_dynamics.estimation.backbone import Backbone
 from ctr_dynamics.estimation.inputs.input_buffer import InputBuffer
 from ctr_dynamics.estimation.inputs.measurement_queue import tracker_of
 from ctr_dynamics.estimation.modes import ModeTracker
-from ctr_dynamics.estimation.monitoring.consistency import misfit_monitor
+from ctr_dynamics.estimation.monitoring.consistency_monitor import consistency_monitor
 from ctr_dynamics.estimation.monitoring.health import Health
 from ctr_dynamics.estimation.monitoring.innovation_log import InnovationLog
 from ctr_dynamics.estimation.out_of_sequence import OutOfSequence
@@ -94,7 +94,7 @@ class Estimator:
         self.options = EstimatorOptions()
         self.model = Model(robot, nodes=int(settings["model.nodes"]))
         self.tracker = tracker_of(self.model, settings)
-        self.health = Health(misfit=misfit_monitor(settings, robot.tracker.noise.position.value))
+        self.health = Health(consistency=consistency_monitor(settings, robot.tracker.noise.position.value))
         self.health.fusing = bool(settings["filter.enabled"])
         self.inputs = InputBuffer(self.model, self.tracker, settings, self.health)
         self.timeline = self.inputs.timeline
@@ -265,7 +265,7 @@ class Estimator:
         self.inputs.clear()
         self.runs.clear()
         self.late.clear()
-        self.health.begin_anew()
+        self.health.reinitialise()
         self.innovations.clear()
 
     def set_fusion(self, on: bool) -> None:
@@ -284,7 +284,7 @@ class Estimator:
         if newest - stamps[-2] <= largest * STEP_NS:
             return  # a long call without a gap: take every step
         self.health.note(
-            "joints", "gap", f"{seconds(behind):.1f} s without joints; the model starts anew at rest"
+            "joints", "gap", f"{seconds(behind):.1f} s without joints; the model is reinitialised at rest"
         )
         self.health.restarts += 1
         self.timeline.k = (newest - self.t0_ns) // STEP_NS - 1
@@ -343,7 +343,7 @@ class Estimator:
             self.runs.stop()
             health.failed("not finite")
             health.restarts += 1
-            return self._invalid(k, "the estimate is not finite; the model starts anew at rest")
+            return self._invalid(k, "the estimate is not finite; the model is reinitialised at rest")
         variance = tip.covariance[0, 0] + tip.covariance[1, 1] + tip.covariance[2, 2]
         if variance > options.largest_deviation**2:
             fused.reinitialise(self.runs.open_loop, k)
@@ -352,7 +352,7 @@ class Estimator:
             return self._invalid(
                 k,
                 f"the tracker has led the estimate astray: deviation of the tip {math.sqrt(variance):.2g} m, limit "
-                f"{options.largest_deviation:g} m; the filter starts anew from the model alone",
+                f"{options.largest_deviation:g} m; the filter is reinitialised from the open-loop run",
             )
         stamp = self.timeline.stamp(k)
         since = fused.measured_ns if fused.measured_ns is not None else self.t0_ns
@@ -376,7 +376,7 @@ class Estimator:
         if age > limit:
             return f"joint states are missing: the last is {age:.3f} s old, limit {limit:g} s"
         if self.health.fusing and self.health.rejecting:
-            return "the tracker contradicts the model: most of its last samples are outside the gate"
+            return "the tracker contradicts the model: most of its last measurements are outside the gate"
         return ""
 
     # -- reports --

@@ -206,7 +206,7 @@ class OutOfSequence:
             spare_s: tells the time (s) until the next step is due. With it, the correction goes on only while there is time.
 
         Returns:
-            Whether the runs were started anew at step 0.
+            Whether the runs have started again at step 0.
         """
         timeline, options = self._inputs.timeline, self.options
         if spare_s is not None and self.may_go_ahead and spare_s() < self._step_s:
@@ -244,7 +244,7 @@ class OutOfSequence:
                 self._postpone(k - 1, later, joints_only and k <= reuse_before)
                 break
             begin = time.perf_counter()
-            self._health.rolled_back += 1
+            self._health.corrected_steps += 1
             stored = later.get(k) if k < reuse_before else None
             reuse: FilterState | None = stored.fused.filter if stored is not None else None
             result = self._runs.step(k, reuse=reuse)

@@ -240,7 +240,7 @@ class EstimatorNode(Node):
         """Diagnostics, at once when validity or the warning of a snap has changed and else at 2 Hz of the wall clock."""
         monotonic_ns = time.monotonic_ns()
         if self.ring_buffer is not None:
-            self.ring_buffer.alarm(self._estimator.health.misfitting, monotonic_ns)
+            self.ring_buffer.alarm(self._estimator.health.inconsistent, monotonic_ns)
         before, now = self._shown, (self.outputs.valid, self._estimator.health.snap_ahead)
         due_ns = self._next_diagnostics_ns + (0 if idle else DIAGNOSTICS_WAIT_NS)
         if now == before and monotonic_ns < due_ns:
@@ -372,7 +372,7 @@ class EstimatorNode(Node):
         if self.recorder is not None:
             self.recorder.close()
         if self.ring_buffer is not None:
-            self.ring_buffer.close(self._estimator.health.misfitting)
+            self.ring_buffer.close(self._estimator.health.inconsistent)
         path = self.settings["timing_report"]
         try:
             if path:

@@ -426,8 +426,8 @@ def test_tracker_that_starts_after_the_joints_and_pauses():
                 seen[at] = next(s for s in made.health.statuses() if s.name == "tracker")
     assert all(out.valid for out in outputs)
     assert [seen[at].level for at in (1.8, 2.9, 4.9, 5.9)] == [1, 0, 1, 0]
-    assert "no usable sample for 1.8 s, limit 1 s" in seen[1.8].message
-    assert "no usable sample for 1.9 s, limit 1 s" in seen[4.9].message
+    assert "no usable measurement for 1.8 s, limit 1 s" in seen[1.8].message
+    assert "no usable measurement for 1.9 s, limit 1 s" in seen[4.9].message
     deviation = [float(np.sqrt(np.trace(out.tip_covariance[:3, :3]))) for out in outputs]
     assert deviation[round(2.9 / 0.003)] < 0.7 * deviation[round(1.9 / 0.003)]
     assert deviation[round(5.9 / 0.003)] < 0.9 * deviation[round(4.9 / 0.003)]

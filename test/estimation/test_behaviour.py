@@ -166,7 +166,7 @@ def test_a_contradiction_ends_with_the_samples_that_showed_it():
     assert all(out.valid for out in since), {out.reason for out in since}
     assert not run.estimator.health.rejecting
     status = next(s for s in run.estimator.health.statuses() if s.name == "tracker")
-    assert "no usable sample" in status.message
+    assert "no usable measurement" in status.message
 
 
 def test_samples_that_are_not_fused_contradict_nothing(release):

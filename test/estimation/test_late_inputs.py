@@ -66,7 +66,7 @@ def test_late_joints_under_predict_end_as_in_time_under_wait(sweep, in_time):
     run = play(late, {"output.policy": "predict"}, tick=STEP)
     check_outputs(run)
     assert [out.k for out in run.outputs] == list(range(len(run.outputs)))
-    assert run.estimator.health.rolled_back > 100
+    assert run.estimator.health.corrected_steps > 100
     assert all(out.valid for out in run.outputs)
     # a step of its own time was published on extrapolated joints, and differs
     differences = [
@@ -124,7 +124,7 @@ def test_corrections_without_time_are_put_off_and_end_the_same(sweep, in_time, s
     assert not run.estimator.correcting
     straight = play(late, {"output.policy": "predict"}, tick=STEP)
     # put-off corrections are begun anew after what came meanwhile, never left out
-    assert run.estimator.health.rolled_back != straight.estimator.health.rolled_back
+    assert run.estimator.health.corrected_steps != straight.estimator.health.corrected_steps
     for reference in (straight, in_time):
         fused, alone = corrected_apart(run, reference)
         assert fused < 1e-5  # the covariance of the first course is kept
@@ -185,7 +185,7 @@ def test_a_course_without_time_for_its_correction_is_corrected_in_the_end(sweep,
     )
     check_outputs(run)
     assert all(out.valid for out in run.outputs)
-    assert run.estimator.health.rolled_back > 100
+    assert run.estimator.health.corrected_steps > 100
     assert corrected_apart(run, in_time)[1] < 1e-6
 
 
@@ -206,7 +206,7 @@ def test_late_load_ends_as_in_time(release, policy):
     reference = play(release, settings, tick=STEP)
     run = play(late, settings, tick=STEP)
     check_outputs(run)
-    assert run.estimator.health.rolled_back > 5
+    assert run.estimator.health.corrected_steps > 5
     # the cut was noticed late
     worst = max(
         np.abs(a.tip_position - b.tip_position).max()
@@ -290,7 +290,7 @@ def test_a_way_back_begins_with_what_a_pause_has_settled(sweep):
     for policy in ("wait", "predict"):
         counts.append(0)
         run = play(late, {"output.policy": policy}, tick=STEP, prepare=with_pauses)
-    assert run.estimator.health.rolled_back > 300
+    assert run.estimator.health.corrected_steps > 300
     assert counts[0] > 15
     assert counts[1] <= counts[0] + 3
 
@@ -300,7 +300,7 @@ def test_figures_of_poses_that_are_first_fused_on_a_way_back_count_once(sweep, i
     late = [m.late(0.012) if m.kind == "joints" else m for m in sweep]
     run = play(late, {"output.policy": "predict"}, tick=STEP, spare=lambda made: 0.0)
     h, reference = run.estimator.health, in_time.estimator.health
-    assert h.rolled_back > 100
+    assert h.corrected_steps > 100
     assert (h._compared, h.nis_count) == (reference._compared, reference.nis_count)
     found, expected = h.residual_rms(), reference.residual_rms()
     assert found["predicted"] == pytest.approx(expected["predicted"], rel=1e-3)

@@ -299,7 +299,7 @@ class RodEkf:
                 return record._replace(reason="outside the gate, farther than any covariance reaches")
             self.pi = inflated
             record = record._replace(
-                reason=f"outside the gate {self.gate.rejections} times in a row: fused with a widened covariance"
+                reason=f"outside the gate {self.gate.rejections} times in a row: fused with an inflated covariance"
             )
         # 5. Gain and covariance (Joseph form).
         size = len(self.pi)
@@ -332,7 +332,7 @@ class RodEkf:
         """A measurement against the tip of its time; the record alone where there is nothing to compare it with."""
         tip = self.tracker.observed_tip(self._tip_at, stamp - self.tracker.delay - self.bias[DELAY])
         if tip is None:
-            return Update.impossible("outside the window of kept steps")
+            return Update.impossible("outside the window of stored steps")
         nu, H, S, whitened = self.tracker.innovation(self.bias, tip, self.pi, position, quaternion)
         if not math.isfinite(nu.sum() + S.sum() + whitened.sum()):
             return Update.impossible("the innovation is not finite")

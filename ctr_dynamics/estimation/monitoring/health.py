@@ -1,4 +1,4 @@
-"""Health of the estimator: counters of everything odd, turned into statuses by plain functions of numbers; no wall clock."""
+"""Health of the estimator: counters and running figures of everything odd. Their statuses for /diagnostics are in ``statuses.py``."""
 
 from __future__ import annotations
 
@@ -7,17 +7,15 @@ from collections import deque
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
-import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from ctr_dynamics.estimation.monitoring.consistency import MisfitMonitor
-from ctr_dynamics.estimation.step_output import ERROR, FUSION_OFF, OK, WARN, Innovation, Status
+from ctr_dynamics.estimation.monitoring import statuses
+from ctr_dynamics.estimation.monitoring.consistency_monitor import ConsistencyMonitor
+from ctr_dynamics.estimation.step_output import FUSION_OFF, OK, Innovation, Status
 from ctr_dynamics.model.stability import Stability
 
-Floats = NDArray[np.float64]
-SNAP_WARNING_S = 1.0  # a snap that is nearer than this is warned of
-TRACKER_LIMIT_S = 1.0  # without a usable sample for longer than this the status says so
+RECENT = 40  # measurements that the tracker is judged by: one second at 40 Hz
+FEWEST_RECENT = 20  # of them, below which nothing is said of a contradiction
 WAITING = "waiting for the first complete joint state"
 
 
@@ -52,10 +50,16 @@ class Counter:
 class Health:
     """Counters and running figures of the estimator.
 
-    ``joints``, ``tracker``, ``load``: input problems by kind. ``nis_sum``, ``nis_dof``, ``nis_count``: over all samples that reached the gate.
-    ``tracker_age_s``: since the newest sample that reached the gate, or the start.
-    ``recent``: (nis / dof, within the gate) of the last samples. ``misfit``: watches the innovations. ``stability``: of the
-    equilibrium that belongs to the present actuators.
+    Attributes:
+        joints, tracker, load: input problems by kind.
+        problem: why the last output is invalid; empty when it is valid.
+        steps, failures, restarts, substeps, sweeps: of the runs; reasons: failures by reason. corrected_steps: taken again for late inputs.
+        accepted, rejected, dropped, late: measurements. fusing: whether they are fused.
+        nis_sum, nis_dof, nis_count: over all measurements that reached the gate.
+        recent: (nis / dof, within the gate) of the last of them.
+        tracker_age_s: since the newest measurement that reached the gate, or the start.
+        force_sigma: N, deviation of the tip force in the process noise.
+        consistency: watches the innovations. stability: of the equilibrium that belongs to the present actuators.
     """
 
     joints: dict[str, Counter] = field(default_factory=dict)
@@ -73,57 +77,50 @@ class Health:
     nis_sum: float = 0.0
     nis_dof: int = 0
     nis_count: int = 0
-    recent: deque[tuple[float, bool]] = field(default_factory=lambda: deque(maxlen=40))
+    recent: deque[tuple[float, bool]] = field(default_factory=lambda: deque(maxlen=RECENT))
     sweeps: int = 0
     substeps: int = 0
-    rolled_back: int = 0
+    corrected_steps: int = 0
     fusing: bool = True
     force_sigma: float = 0.0
     tracker_age_s: float = 0.0
-    misfit: MisfitMonitor = field(default_factory=MisfitMonitor)
+    consistency: ConsistencyMonitor = field(default_factory=ConsistencyMonitor)
     stability: Stability | None = None
-    _squares: tuple[float, float] = (0.0, 0.0)  # m^2, of the model alone and fused
+    _squares: tuple[float, float] = (0.0, 0.0)  # m^2, open loop and fused
     _compared: int = 0
+
+    # -- counting --
 
     def note(self, group: str, kind: str, what: str) -> None:
         """Count an input problem of ``kind`` in ``group`` (joints, tracker or load)."""
         getattr(self, group).setdefault(kind, Counter()).add(what)
-
-    def input_problems(self) -> dict[str, dict[str, dict[str, Any]]]:
-        """What has been noted of inputs: by group and kind, how often (``count``) and what the ``last`` one was."""
-        return {
-            group: {kind: {"count": c.count, "last": c.last} for kind, c in getattr(self, group).items()}
-            for group in ("joints", "tracker", "load")
-        }
 
     def failed(self, reason: str) -> None:
         """Count a failed step."""
         self.failures += 1
         self.reasons[reason] = self.reasons.get(reason, 0) + 1
 
-    def measured(self, sample: Innovation) -> None:
-        """Count a tracker sample: how far it lies from the outputs of its time, whether it reached the gate, lay within and was fused."""
-        if sample.motion is not None and sample.fused_residual is not None:
-            alone, fused = sample.motion.residual, sample.fused_residual
-            self._squares = self._squares[0] + float(alone @ alone), self._squares[1] + float(fused @ fused)
+    def measured(self, innovation: Innovation) -> None:
+        """Count a measurement: how far it lies from the outputs of its time, whether it reached the gate, lay within and was fused."""
+        if innovation.motion is not None and innovation.fused_residual is not None:
+            open_loop, fused = innovation.motion.residual, innovation.fused_residual
+            self._squares = (
+                self._squares[0] + float(open_loop @ open_loop),
+                self._squares[1] + float(fused @ fused),
+            )
             self._compared += 1
-        if not sample.dof:
+        if not innovation.dof:
             self.dropped += 1
             return
         self.nis_count += 1
-        self.nis_sum += sample.nis
-        self.nis_dof += sample.dof
-        within = sample.reason == FUSION_OFF or (sample.accepted and not sample.reason)
-        self.recent.append((sample.nis / sample.dof, within))
-        if sample.accepted:
+        self.nis_sum += innovation.nis
+        self.nis_dof += innovation.dof
+        within = innovation.reason == FUSION_OFF or (innovation.accepted and not innovation.reason)
+        self.recent.append((innovation.nis / innovation.dof, within))
+        if innovation.accepted:
             self.accepted += 1
         elif self.fusing:
             self.rejected += 1
-
-    def residual_rms(self) -> dict[str, float | None]:
-        """m between readings and outputs: of the model alone, and fused where the filter is on."""
-        alone, fused = (math.sqrt(s / self._compared) if self._compared else None for s in self._squares)
-        return {"predicted": alone, "fused": fused if self.fusing else None}
 
     def measurement_counts(self) -> MeasurementCounts:
         """What has been counted of measurements, for :meth:`restore_counts`."""
@@ -140,29 +137,57 @@ class Health:
         self.recent.clear()
         self.recent.extend(counts.recent)
 
-    def begin_anew(self) -> None:
+    def reinitialise(self) -> None:
         """Wait for joints and watch afresh; counters of what was odd stay."""
         self.problem = WAITING
         self.recent.clear()
-        self.misfit.clear()
+        self.consistency.clear()
+
+    # -- what it comes to --
 
     @property
-    def _sampled(self) -> bool:
-        return self.tracker_age_s <= TRACKER_LIMIT_S
+    def tracker_alive(self) -> bool:
+        """Whether usable measurements come."""
+        return self.tracker_age_s <= statuses.TRACKER_LIMIT_S
 
     @property
-    def misfitting(self) -> bool:
-        """Whether the misfit monitor's alarm stands and samples still come."""
-        return self.misfit.alarm and self._sampled
+    def inconsistent(self) -> bool:
+        """Whether the consistency monitor's alarm stands and measurements still come."""
+        return self.consistency.alarm and self.tracker_alive
 
     @property
-    def _outside(self) -> int:
+    def outside(self) -> int:
+        """How many of the recent measurements lay outside the gate."""
         return sum(not within for _, within in self.recent)
 
     @property
     def rejecting(self) -> bool:
-        """Whether samples come and most of the last lay outside the gate: the tracker and the model do not describe the same robot."""
-        return self._sampled and len(self.recent) >= 20 and self._outside > 0.5 * len(self.recent)
+        """Whether measurements come and most of the last lay outside the gate: the tracker and the model do not describe the same robot."""
+        enough = len(self.recent) >= FEWEST_RECENT
+        return self.tracker_alive and enough and self.outside > 0.5 * len(self.recent)
+
+    @property
+    def snap_ahead(self) -> bool:
+        """Whether the equilibrium is lost or unstable, or its loss is foretold: news that cannot wait."""
+        return statuses.stability(self).level > OK
+
+    def statuses(self) -> list[Status]:
+        """One status a part, for /diagnostics."""
+        return statuses.all_of(self)
+
+    # -- the summary of a replay --
+
+    def input_problems(self) -> dict[str, dict[str, dict[str, Any]]]:
+        """What has been noted of inputs: by group and kind, how often (``count``) and what the ``last`` one was."""
+        return {
+            group: {kind: {"count": c.count, "last": c.last} for kind, c in getattr(self, group).items()}
+            for group in ("joints", "tracker", "load")
+        }
+
+    def residual_rms(self) -> dict[str, float | None]:
+        """m between measurements and outputs: open loop, and fused where the filter is on."""
+        open_loop, fused = (math.sqrt(s / self._compared) if self._compared else None for s in self._squares)
+        return {"predicted": open_loop, "fused": fused if self.fusing else None}
 
     def nis_summary(self) -> dict[str, float | int | bool | None]:
         """Mean NIS per degree of freedom with the 95 % band of that mean for a consistent filter."""
@@ -194,111 +219,6 @@ class Health:
                 "restarts": self.restarts,
                 "substeps": self.substeps,
                 "sweeps_per_step": self.sweeps / self.steps if self.steps else 0.0,
-                "steps_taken_again": self.rolled_back,
+                "steps_taken_again": self.corrected_steps,
             },
         }
-
-    def statuses(self) -> list[Status]:
-        """One status a part."""
-        return [
-            self._output(),
-            self._solver(),
-            self._inputs("joints"),
-            self._tracker(),
-            self._inputs("load"),
-            self._consistency(),
-            self.misfit.status(),
-            self._stability(),
-        ]
-
-    def _output(self) -> Status:
-        return Status(
-            "output", ERROR if self.problem else OK, self.problem or "valid", {"steps": str(self.steps)}
-        )
-
-    def _solver(self) -> Status:
-        values = {
-            "failures": str(self.failures),
-            "restarts": str(self.restarts),
-            "steps in substeps": str(self.substeps),
-            "steps taken again": str(self.rolled_back),
-            "sweeps per step": f"{self.sweeps / self.steps:.1f}" if self.steps else "0",
-        }
-        values.update({f"failed: {reason}": str(count) for reason, count in self.reasons.items()})
-        if self.failures:
-            return Status(
-                "solver", WARN, f"{self.failures} steps failed; the last reason is in the values", values
-            )
-        return Status("solver", OK, "ok", values)
-
-    def _inputs(self, group: str) -> Status:
-        counters: dict[str, Counter] = getattr(self, group)
-        values = {kind: f"{c.count}, last: {c.last}" for kind, c in counters.items()}
-        if counters:
-            worst = max(counters.items(), key=lambda item: item[1].count)
-            return Status(group, WARN, f"{worst[0]} ({worst[1].count}): {worst[1].last}", values)
-        return Status(group, OK, "ok", values)
-
-    def _tracker(self) -> Status:
-        status = self._inputs("tracker")
-        values = {
-            **status.values,
-            "accepted": str(self.accepted),
-            "rejected": str(self.rejected),
-            "late": str(self.late),
-            "dropped": str(self.dropped),
-            "fusion": "on" if self.fusing else "off",
-        }
-        if self.rejecting:
-            message = (
-                f"{self._outside} of the last {len(self.recent)} samples are outside the gate (limit half): "
-                "check the tracker's frame, units, stamps and the robot file"
-            )
-            return Status("tracker", ERROR, message, values)
-        if not self._sampled:
-            message = (
-                f"no usable sample for {self.tracker_age_s:.1f} s, limit {TRACKER_LIMIT_S:g} s: "
-                "the pose is the model's prediction since then"
-            )
-            return Status("tracker", WARN, message, values)
-        return Status("tracker", status.level, status.message, values)
-
-    @property
-    def snap_ahead(self) -> bool:
-        """Whether the equilibrium is lost or unstable, or its loss is foretold within SNAP_WARNING_S: news that cannot wait."""
-        return self._stability().level > OK
-
-    def _stability(self) -> Status:
-        if self.stability is None:
-            return Status("stability", OK, "not yet known", {})
-        if self.stability.lost:
-            message = "no equilibrium near the last one: the robot has snapped or is about to; the outputs follow its dynamics"
-            return Status("stability", WARN, message, {})
-        values = {"det(d alpha / d psi_L)": f"{self.stability.measure:.4g}"}
-        ahead = self.stability.time_to_snap
-        if ahead is not None:
-            values["time to snap s"] = f"{ahead:.3f}"
-        if self.stability.measure <= 0.0:
-            return Status(
-                "stability",
-                WARN,
-                f"unstable equilibrium: measure {self.stability.measure:.4g}, limit 0",
-                values,
-            )
-        if ahead is not None and ahead < SNAP_WARNING_S:
-            message = f"a snap is ahead in {ahead:.2f} s (warned of below {SNAP_WARNING_S:g} s) at the present actuator rates; stop or turn back"
-            return Status("stability", WARN, message, values)
-        return Status("stability", OK, f"stable: measure {self.stability.measure:.4g}, limit 0", values)
-
-    def _consistency(self) -> Status:
-        values = {"force deviation N": f"{self.force_sigma:.4g}"}
-        if not self.recent:
-            return Status("consistency", OK, "no samples yet", values)
-        mean = sum(ratio for ratio, _ in self.recent) / len(self.recent)
-        # the samples of one second: white for a consistent filter, 6 degrees of freedom each
-        limit = 1.0 + 4.0 * math.sqrt(2.0 / (6.0 * len(self.recent)))
-        values["nis per dof, last second"] = f"{mean:.2f}"
-        if mean > limit:
-            message = f"mean NIS {mean:.2f} per degree of freedom, limit {limit:.2f}: the model misses an effect, or the noise is larger than stated"
-            return Status("consistency", WARN, message, values)
-        return Status("consistency", OK, f"mean NIS {mean:.2f} per degree of freedom", values)

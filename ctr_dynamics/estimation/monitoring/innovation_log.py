@@ -53,7 +53,7 @@ class InnovationLog:
     def judge(self) -> None:
         """Hand what has been published to the consistency monitor."""
         while self._unjudged:
-            self._health.misfit.add(self._unjudged.popleft())
+            self._health.consistency.add(self._unjudged.popleft())
 
     # -- corrections --
 

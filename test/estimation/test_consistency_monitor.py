@@ -1,4 +1,4 @@
-"""The misfit monitor: silent on what a consistent filter leaves, loud on bias, excess and correlation, and the right cause in its list."""
+"""The consistency monitor: silent on what a consistent filter leaves, loud on bias, excess and correlation, and the right cause in its list."""
 
 import math
 
@@ -6,8 +6,12 @@ import numpy as np
 import pytest
 
 from ctr_dynamics.effects import EFFECTS
-from ctr_dynamics.estimation.monitoring.consistency import FEWEST, MisfitLimits, MisfitMonitor, ljung_box
-from ctr_dynamics.estimation.monitoring.likely_causes import SIGNATURES, Regression
+from ctr_dynamics.estimation.monitoring.consistency_monitor import (
+    ConsistencyLimits,
+    ConsistencyMonitor,
+    ljung_box,
+)
+from ctr_dynamics.estimation.monitoring.likely_causes import SENSITIVITIES, CauseRegression
 from ctr_dynamics.estimation.step_output import OK, WARN, Innovation, MotionPoint
 from ctr_dynamics.kernels.rotations import from_vector, matrix
 
@@ -15,7 +19,7 @@ INTERVAL_NS = 25_000_000
 NOISE = 0.35e-3
 
 
-def innovation(i, white, motion_point=None):
+def innovation(i, white, point=None):
     white = np.asarray(white, dtype=float)
     measured = white[np.isfinite(white)]
     return Innovation(
@@ -27,12 +31,12 @@ def innovation(i, white, motion_point=None):
         True,
         0.0,
         white=white,
-        motion=motion_point,
+        motion=point,
     )
 
 
 def fed(whites, monitor=None):
-    monitor = monitor or MisfitMonitor()
+    monitor = monitor or ConsistencyMonitor()
     for i, white in enumerate(whites):
         monitor.add(innovation(i, white))
     return monitor
@@ -119,13 +123,13 @@ def test_ljung_box_is_one_for_white_noise_and_what_its_definition_says():
 
 def test_a_consistent_filter_alarms_less_than_once_in_ten_hours():
     # the distribution of the CUSUM in closed form of its own walk, over twenty hours
-    limits = MisfitLimits()
+    limits = ConsistencyLimits()
     nis = np.random.default_rng(11).chisquare(6, 20 * 3600 * 40)
     walk = np.concatenate([[0.0], nis - 6 * (1 + limits.slack)]).cumsum()
     assert (walk - np.minimum.accumulate(walk)).max() < limits.cusum
     window = round(40 * limits.window)
     total = np.concatenate([[0.0], nis.cumsum()])
-    for size in (FEWEST, window):
+    for size in (limits.fewest, window):
         limit = max(limits.nis, 1 + 6 * math.sqrt(2 / (6 * size)))
         assert (total[size:] - total[:-size]).max() / (6 * size) < limit
 
@@ -161,11 +165,11 @@ def motion(t):
 
 def causes_of(residual_of, seconds=12.0, seed=0):
     rng = np.random.default_rng(seed)
-    regression = Regression(10.0, NOISE)
+    regression = CauseRegression(10.0, NOISE)
     for t in np.arange(0.0, seconds, 0.025):
-        moment = motion(t)
-        residual = residual_of(t, moment) + NOISE * rng.standard_normal(3)
-        regression.add(float(t), moment._replace(residual=residual))
+        point = motion(t)
+        residual = residual_of(t, point) + NOISE * rng.standard_normal(3)
+        regression.add(float(t), point._replace(residual=residual))
     return regression.causes()
 
 
@@ -204,11 +208,11 @@ def test_two_causes_are_both_listed():
 def test_noise_and_a_motion_of_its_own_have_no_cause():
     assert causes_of(lambda t, m: np.zeros(3)) == []
     assert causes_of(lambda t, m: 0.003 * np.array([0, 0, math.sin(40 * t)])) == []
-    assert Regression(10.0, NOISE).causes() == []
+    assert CauseRegression(10.0, NOISE).causes() == []
 
 
-def test_every_signature_is_an_effect_of_the_catalogue():
-    names = [signature.effect for signature in SIGNATURES]
+def test_every_sensitivity_is_an_effect_of_the_catalogue():
+    names = [sensitivity.effect for sensitivity in SENSITIVITIES]
     assert set(names) <= set(EFFECTS)
     assert len(set(names)) == len(names)
 
@@ -218,13 +222,13 @@ def test_every_signature_is_an_effect_of_the_catalogue():
 
 @pytest.mark.parametrize("name", ["clean_release", "clean_protocol", "clean_sweep"])
 def test_a_clean_bag_is_silent(replayed, name):
-    monitor = replayed(name).estimator.health.misfit
+    monitor = replayed(name).estimator.health.consistency
     assert monitor.alarms == 0
     assert monitor.status().level == OK
 
 
 def test_a_late_tracker_is_noticed_and_named(replayed):
-    monitor = replayed("clean_sweep", tracker__delay_s=0.03).estimator.health.misfit
+    monitor = replayed("clean_sweep", tracker__delay_s=0.03).estimator.health.consistency
     status = monitor.status()
     assert status.level == WARN
     assert "tracker_latency" in status.message
@@ -232,13 +236,13 @@ def test_a_late_tracker_is_noticed_and_named(replayed):
 
 
 def test_an_unknown_delay_of_the_tracker_is_noticed_and_ends_once_it_is_set(replayed):
-    status = replayed("latency_sweep").estimator.health.misfit.status()
+    status = replayed("latency_sweep").estimator.health.consistency.status()
     assert status.level == WARN
     assert "tracker_latency" in status.message
-    assert replayed("latency_sweep", tracker__delay_s=0.018).estimator.health.misfit.alarms == 0
+    assert replayed("latency_sweep", tracker__delay_s=0.018).estimator.health.consistency.alarms == 0
 
 
 def test_a_heavier_payload_is_noticed_and_listed(replayed):
-    monitor = replayed("payload_protocol").estimator.health.misfit
+    monitor = replayed("payload_protocol").estimator.health.consistency
     assert monitor.alarms > 0
     assert "payload_mass" in [cause.effect for cause in monitor.causes()]

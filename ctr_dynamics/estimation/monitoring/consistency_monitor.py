@@ -1,6 +1,7 @@
-"""Misfit monitor: does the filter's picture of the robot still hold? Windowed NIS, CUSUM and whiteness of the innovations. No clock, no ROS.
+"""The consistency monitor: do the innovations still have the size and the whiteness that the filter expects?
 
-The limits are set by simulated white innovations (studies/monitor_limits.py): a consistent filter at 40 Hz alarms less than once in ten hours.
+Three statistics over a window: mean NIS, CUSUM of the NIS, and autocorrelation. Their limits are set by simulated white innovations
+(studies/monitor_limits.py): a consistent filter at 40 Hz alarms less than once in ten hours. Its status and parameters are called `misfit`.
 """
 
 from __future__ import annotations
@@ -14,23 +15,24 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ctr_dynamics.estimation.monitoring.likely_causes import Cause, Regression
+from ctr_dynamics.estimation.monitoring.likely_causes import Cause, CauseRegression
 from ctr_dynamics.estimation.step_output import OK, WARN, Innovation, Status
 
 Floats = NDArray[np.float64]
 
-LAGS = 8  # of the autocorrelation, in samples: 0.2 s at 40 Hz
-EVERY = 20  # samples between looks at the autocorrelation
-FEWEST = 80  # samples in the window before anything but the CUSUM is judged
+LAGS = 8  # of the autocorrelation, in measurements: 0.2 s at 40 Hz, half a period of the slowest modes
 
 
 @dataclass(frozen=True)
-class MisfitLimits:
-    """When to alarm.
+class ConsistencyLimits:
+    """When to alarm, and what is judged.
 
     Attributes:
         window: s. nis: mean NIS per degree of freedom over the window. slack: excess NIS per degree of freedom that the CUSUM lets pass.
         cusum: its limit, in units of NIS. whiteness: Ljung-Box statistic over the window per degree of freedom.
+        every: measurements between looks at the autocorrelation, which takes longer than all else.
+        fewest: measurements in the window before anything but the CUSUM is judged, 2 s: fewer scatter too much.
+        largest_nis: a NIS counts as that at most, so that one wild measurement does not stay in the sums' rounding.
     """
 
     window: float = 10.0
@@ -38,13 +40,16 @@ class MisfitLimits:
     slack: float = 0.5
     cusum: float = 60.0
     whiteness: float = 2.5
+    every: int = 20
+    fewest: int = 80
+    largest_nis: float = 1e6
 
 
 def ljung_box(white: Floats, lags: int = LAGS) -> float:
     """Ljung-Box statistic of ``white`` (k, axes) over ``lags``, per degree of freedom: near 1 for white innovations.
 
-    Ljung and Box, Biometrika 65 (1978), without removing the mean, for a bias is a misfit too; and innovations smaller than predicted are
-    related to what was predicted: they are no misfit, however they are correlated.
+    Ljung and Box, Biometrika 65 (1978), without removing the mean, for a bias is inconsistent too. Innovations smaller than predicted are related
+    to what was predicted: however they are correlated, they do not alarm.
     """
     k, axes = white.shape
     size = np.maximum(np.einsum("ij,ij->j", white, white), k)
@@ -54,44 +59,48 @@ def ljung_box(white: Floats, lags: int = LAGS) -> float:
     return float(weight @ np.sum(rho**2, axis=1)) / (lags * axes)
 
 
-class MisfitMonitor:
-    """Fed once per tracker sample that reached the gate.
+class ConsistencyMonitor:
+    """Fed once for every measurement that reached the gate.
+
+    Args:
+        limits: when to alarm.
+        noise: standard deviation of the tracker's position, m per axis.
 
     Attributes:
-        nis, cusum, whiteness: present values; NaN while there are too few samples. alarm: whether one of them was beyond its limit within the
-        last window. alarms: how often it rose.
+        nis, cusum, whiteness: present values; NaN while there are too few measurements.
+        alarm: whether one of them was above its limit within the last window. alarms: how often it rose.
     """
 
-    def __init__(self, limits: MisfitLimits | None = None, noise: float = 0.0) -> None:
-        self.limits = limits or MisfitLimits()
+    def __init__(self, limits: ConsistencyLimits | None = None, noise: float = 0.0) -> None:
+        self.limits = limits or ConsistencyLimits()
         self.alarms = 0
-        self._regression = Regression(self.limits.window, noise)
+        self._regression = CauseRegression(self.limits.window, noise)
         self.clear()
 
     def clear(self) -> None:
-        """Begin anew; the count of alarms stays."""
+        """Forget all measurements; the count of alarms stays."""
         self.nis = self.whiteness = math.nan
         self.cusum = 0.0
         self.alarm = False
-        self._beyond: tuple[float, str] | None = None  # time and words of the last value beyond its limit
-        self._samples: deque[tuple[float, float, int, Floats]] = deque()  # time, NIS, dof, whitened
+        self._exceeded: tuple[float, str] | None = None  # time and words of the last value above its limit
+        self._window: deque[tuple[float, float, int, Floats]] = deque()  # time, NIS, dof, whitened
         self._nis, self._dof, self._count = 0.0, 0, 0
         self._regression.clear()
         self._causes: tuple[int, list[Cause]] | None = None
 
     def add(self, innovation: Innovation) -> None:
-        """Take in a sample; one without degrees of freedom is passed over."""
+        """Take in a measurement's innovation; one without degrees of freedom is passed over."""
         if not innovation.dof or innovation.white is None:
             return
         time = innovation.stamp_ns * 1e-9
-        if self._samples and abs(time - self._samples[-1][0]) > self.limits.window:
+        if self._window and abs(time - self._window[-1][0]) > self.limits.window:
             self.clear()  # nothing links what was before such a gap
-        nis = min(innovation.nis, 1e6)
-        self._samples.append((time, nis, innovation.dof, innovation.white))
+        nis = min(innovation.nis, self.limits.largest_nis)
+        self._window.append((time, nis, innovation.dof, innovation.white))
         self._nis += nis
         self._dof += innovation.dof
-        while time - self._samples[0][0] > self.limits.window:
-            _, old, dof, _ = self._samples.popleft()
+        while time - self._window[0][0] > self.limits.window:
+            _, old, dof, _ = self._window.popleft()
             self._nis -= old
             self._dof -= dof
         self._count += 1
@@ -106,10 +115,10 @@ class MisfitMonitor:
         words = []
         if self.cusum > limits.cusum:
             words.append(f"CUSUM of NIS {self.cusum:.0f}, limit {limits.cusum:g}")
-        if len(self._samples) >= FEWEST:
-            if self._count % EVERY == 0:
-                self._nis = sum(sample[1] for sample in self._samples)  # no rounding piles up
-                measured = np.array([sample[3] for sample in self._samples])
+        if len(self._window) >= limits.fewest:
+            if self._count % limits.every == 0:
+                self._nis = sum(nis for _, nis, _, _ in self._window)  # no rounding piles up
+                measured = np.array([white for _, _, _, white in self._window])
                 self.whiteness = ljung_box(measured[:, np.isfinite(measured).all(axis=0)])
             self.nis = self._nis / self._dof
             # a window that is not full yet scatters more
@@ -123,15 +132,15 @@ class MisfitMonitor:
                     f"autocorrelation of the innovations {self.whiteness:.1f}, limit {limits.whiteness:g}"
                 )
         if words:
-            self._beyond = (time, "; ".join(words))
+            self._exceeded = (time, "; ".join(words))
         was, self.alarm = (
             self.alarm,
-            self._beyond is not None and time - self._beyond[0] <= limits.window,
+            self._exceeded is not None and time - self._exceeded[0] <= limits.window,
         )
         self.alarms += self.alarm and not was
 
     def causes(self) -> list[Cause]:
-        """Likeliest causes of the residual that the model alone leaves at present, likeliest first."""
+        """Likeliest causes of the present open-loop residual, likeliest first."""
         if self._causes is None or self._causes[0] != self._count:
             self._causes = (self._count, self._regression.causes())
         return self._causes[1]
@@ -151,9 +160,9 @@ class MisfitMonitor:
         }
         if not self.alarm:
             return Status(
-                "misfit", OK, "innovations as expected" if self._samples else "no samples yet", values
+                "misfit", OK, "innovations as expected" if self._window else "no samples yet", values
             )
-        assert self._beyond is not None
+        assert self._exceeded is not None
         causes = self.causes()
         for number, cause in enumerate(causes, 1):
             added = ", on top of the first" if cause.added else ""
@@ -162,17 +171,16 @@ class MisfitMonitor:
             which = "likeliest causes: " + ", ".join(cause.effect for cause in causes)
         else:
             which = "no cause of the list explains it"
-        return Status("misfit", WARN, f"{self._beyond[1]}; {which}", values)
+        return Status("misfit", WARN, f"{self._exceeded[1]}; {which}", values)
 
 
-def misfit_monitor(settings: Mapping[str, Any], noise: float) -> MisfitMonitor:
-    """The monitor of the parameter table's values; ``noise`` of the tracker's position, m per axis."""
-    names = {
-        "window": "window_s",
-        "nis": "nis_limit",
-        "slack": "cusum_slack",
-        "cusum": "cusum_limit",
-        "whiteness": "whiteness_limit",
-    }
-    limits = MisfitLimits(**{field: float(settings[f"misfit.{name}"]) for field, name in names.items()})
-    return MisfitMonitor(limits, noise)
+def consistency_monitor(settings: Mapping[str, Any], noise: float) -> ConsistencyMonitor:
+    """The monitor with the parameter table's limits; ``noise``: standard deviation of the tracker's position, m per axis."""
+    limits = ConsistencyLimits(
+        window=float(settings["misfit.window_s"]),
+        nis=float(settings["misfit.nis_limit"]),
+        slack=float(settings["misfit.cusum_slack"]),
+        cusum=float(settings["misfit.cusum_limit"]),
+        whiteness=float(settings["misfit.whiteness_limit"]),
+    )
+    return ConsistencyMonitor(limits, noise)

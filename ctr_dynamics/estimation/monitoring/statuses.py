@@ -1,0 +1,124 @@
+"""Statuses of the estimator for /diagnostics: each a plain function of the health's numbers, with value, limit and what to do."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+from ctr_dynamics.estimation.step_output import ERROR, OK, WARN, Status
+
+if TYPE_CHECKING:
+    from ctr_dynamics.estimation.monitoring.health import Counter, Health
+
+TRACKER_LIMIT_S = (
+    1.0  # without a usable measurement for longer than this the status says so: 40 missing at 40 Hz
+)
+SNAP_WARNING_S = 1.0  # a snap that is nearer than this is warned of: time to stop an actuator by hand
+
+
+def all_of(health: Health) -> list[Status]:
+    """One status a part."""
+    return [
+        output(health),
+        solver(health),
+        inputs(health, "joints"),
+        tracker(health),
+        inputs(health, "load"),
+        consistency(health),
+        health.consistency.status(),
+        stability(health),
+    ]
+
+
+def output(health: Health) -> Status:
+    """Whether the last output is valid, and why not."""
+    level = ERROR if health.problem else OK
+    return Status("output", level, health.problem or "valid", {"steps": str(health.steps)})
+
+
+def solver(health: Health) -> Status:
+    """Failed steps and the work of the others."""
+    values = {
+        "failures": str(health.failures),
+        "restarts": str(health.restarts),
+        "steps in substeps": str(health.substeps),
+        "steps taken again": str(health.corrected_steps),
+        "sweeps per step": f"{health.sweeps / health.steps:.1f}" if health.steps else "0",
+    }
+    values.update({f"failed: {reason}": str(count) for reason, count in health.reasons.items()})
+    if health.failures:
+        message = f"{health.failures} steps failed; the last reason is in the values"
+        return Status("solver", WARN, message, values)
+    return Status("solver", OK, "ok", values)
+
+
+def inputs(health: Health, group: str) -> Status:
+    """Problems of the input ``group``: joints, tracker or load."""
+    counters: dict[str, Counter] = getattr(health, group)
+    values = {kind: f"{c.count}, last: {c.last}" for kind, c in counters.items()}
+    if counters:
+        worst = max(counters.items(), key=lambda item: item[1].count)
+        return Status(group, WARN, f"{worst[0]} ({worst[1].count}): {worst[1].last}", values)
+    return Status(group, OK, "ok", values)
+
+
+def tracker(health: Health) -> Status:
+    """Problems of the tracker, and what has become of its measurements."""
+    status = inputs(health, "tracker")
+    values = {
+        **status.values,
+        "accepted": str(health.accepted),
+        "rejected": str(health.rejected),
+        "late": str(health.late),
+        "dropped": str(health.dropped),
+        "fusion": "on" if health.fusing else "off",
+    }
+    if health.rejecting:
+        message = (
+            f"{health.outside} of the last {len(health.recent)} samples are outside the gate (limit half): "
+            "check the tracker's frame, units, stamps and the robot file"
+        )
+        return Status("tracker", ERROR, message, values)
+    if not health.tracker_alive:
+        message = (
+            f"no usable measurement for {health.tracker_age_s:.1f} s, limit {TRACKER_LIMIT_S:g} s: "
+            "the pose is the model's prediction since then"
+        )
+        return Status("tracker", WARN, message, values)
+    return Status("tracker", status.level, status.message, values)
+
+
+def stability(health: Health) -> Status:
+    """Elastic stability of the equilibrium that belongs to the present actuators."""
+    found = health.stability
+    if found is None:
+        return Status("stability", OK, "not yet known", {})
+    if found.lost:
+        message = "no equilibrium near the last one: the robot has snapped or is about to; the outputs follow its dynamics"
+        return Status("stability", WARN, message, {})
+    values = {"det(d alpha / d psi_L)": f"{found.measure:.4g}"}
+    ahead = found.time_to_snap
+    if ahead is not None:
+        values["time to snap s"] = f"{ahead:.3f}"
+    if found.measure <= 0.0:
+        message = f"unstable equilibrium: measure {found.measure:.4g}, limit 0"
+        return Status("stability", WARN, message, values)
+    if ahead is not None and ahead < SNAP_WARNING_S:
+        message = f"a snap is ahead in {ahead:.2f} s (warned of below {SNAP_WARNING_S:g} s) at the present actuator rates; stop or turn back"
+        return Status("stability", WARN, message, values)
+    return Status("stability", OK, f"stable: measure {found.measure:.4g}, limit 0", values)
+
+
+def consistency(health: Health) -> Status:
+    """Mean NIS of the last second, and the process noise."""
+    values = {"force deviation N": f"{health.force_sigma:.4g}"}
+    if not health.recent:
+        return Status("consistency", OK, "no samples yet", values)
+    mean = sum(ratio for ratio, _ in health.recent) / len(health.recent)
+    # the measurements of one second: white for a consistent filter, 6 degrees of freedom each
+    limit = 1.0 + 4.0 * math.sqrt(2.0 / (6.0 * len(health.recent)))
+    values["nis per dof, last second"] = f"{mean:.2f}"
+    if mean > limit:
+        message = f"mean NIS {mean:.2f} per degree of freedom, limit {limit:.2f}: the model misses an effect, or the noise is larger than stated"
+        return Status("consistency", WARN, message, values)
+    return Status("consistency", OK, f"mean NIS {mean:.2f} per degree of freedom", values)
