@@ -65,11 +65,6 @@ def conjugate(h: Floats) -> Floats:
     return np.array([h[0], -h[1], -h[2], -h[3]])
 
 
-def skew(v: Floats) -> Floats:
-    """(3, 3) with skew(v) w = v x w."""
-    return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
-
-
 def conjugate_rows(h: Floats) -> Floats:
     """Inverses of unit quaternions (k, 4)."""
     return h * np.array([1.0, -1.0, -1.0, -1.0])

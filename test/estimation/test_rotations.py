@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from ctr_dynamics.kernels.rotations import conjugate, from_vector, matrix, multiply, skew, to_vector
+from ctr_dynamics.kernels.rotations import conjugate, from_vector, matrix, multiply, to_vector
 from ctr_dynamics.sensing.interpolation import Signal, finite, joint_order
 
 RNG = np.random.default_rng(7)
@@ -34,11 +34,6 @@ def test_rotation_vectors(angle):
 
 def test_rotation_vector_beyond_half_a_turn_is_the_shorter_way():
     assert np.allclose(to_vector(from_vector(np.array([0.0, 0.0, 4.0]))), [0.0, 0.0, 4.0 - 2 * np.pi])
-
-
-def test_skew():
-    a, b = RNG.normal(size=(2, 3))
-    assert np.allclose(skew(a) @ b, np.cross(a, b))
 
 
 # -- signals --
