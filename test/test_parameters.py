@@ -162,7 +162,7 @@ def test_axes_mask(axes, mask):
 @given(
     st.sampled_from(PARAMETERS), st.one_of(st.text(), st.floats(), st.integers(), st.none(), st.booleans())
 )
-def test_any_value_is_taken_or_refused_in_one_line(p, value):
+def test_any_value_is_taken_or_rejected_in_one_line(p, value):
     try:
         checked = p.check(value)
     except InputError as error:
@@ -197,7 +197,7 @@ def test_estimator_yaml_is_read_back(tmp_path):
     assert Settings.from_sources(file) == Settings()
 
 
-def test_a_least_deviation_above_the_largest_is_refused():
+def test_a_least_deviation_above_the_largest_is_rejected():
     with pytest.raises(
         InputError, match=r"tip_force_sigma_N is 0\.3 N, limit filter\.tip_force_sigma_max_N, 0\.2 N"
     ):

@@ -210,7 +210,7 @@ def test_unknown_robot_names_the_shipped_ones():
         load_robot("till2020_tisue")
 
 
-def test_a_tube_of_300_m_is_refused_as_a_unit_error(tissue):
+def test_a_tube_of_300_m_is_rejected_as_a_unit_error(tissue):
     tissue["tubes"][0]["precurvature"][0]["length"]["value"] = 301
     message = refusal(tissue)
     assert "tubes[0].precurvature[0].length" in message
@@ -289,7 +289,7 @@ def set_path(data, path, value):
         (("friction",), 3, ["friction: 3 is not a mapping"]),
     ],
 )
-def test_refusals_say_where_what_and_what_to_do(tissue, path, value, parts):
+def test_rejections_say_where_what_and_what_to_do(tissue, path, value, parts):
     set_path(tissue, path, value)
     message = refusal(tissue)
     for part in parts:
@@ -324,7 +324,7 @@ def test_broken_files_are_one_line(tmp_path, text, part):
     assert str(file) in str(caught.value)
 
 
-def test_binary_file_is_refused(tmp_path):
+def test_binary_file_is_rejected(tmp_path):
     file = tmp_path / "robot.yaml"
     file.write_bytes(b"\x89MCAP0\r\n\xff")
     with pytest.raises(InputError, match="not UTF-8"):

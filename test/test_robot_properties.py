@@ -119,7 +119,7 @@ PLACES = places(BASE)
 
 @settings(max_examples=300, deadline=None)
 @given(st.sampled_from(PLACES), JUNK)
-def test_junk_anywhere_loads_or_is_refused_in_one_line(path, junk):
+def test_junk_anywhere_loads_or_is_rejected_in_one_line(path, junk):
     data = copy.deepcopy(BASE)
     node = data
     for key in path[:-1]:
@@ -140,7 +140,7 @@ def test_junk_anywhere_loads_or_is_refused_in_one_line(path, junk):
 
 @settings(max_examples=200, deadline=None)
 @given(st.text(max_size=60))
-def test_any_text_is_refused_in_one_line(tmp_path_factory, text):
+def test_any_text_is_rejected_in_one_line(tmp_path_factory, text):
     file = tmp_path_factory.mktemp("robot") / "robot.yaml"
     file.write_bytes(text.encode("utf-8", "surrogatepass"))
     try:

@@ -103,7 +103,7 @@ def test_no_answer_is_one_line(tmp_path, monkeypatch, capsys):
         ([INNER.replace("E=52GPa+-0.4%", "E=52GPa+--1%")], "is not 0 or more"),
     ],
 )
-def test_sheets_that_cannot_be_are_refused(tmp_path, capsys, tubes, message):
+def test_sheets_that_cannot_be_are_rejected(tmp_path, capsys, tubes, message):
     path = tmp_path / "r.yaml"
     assert new(path, *(part for text in tubes for part in ("--tube", text))) == 2
     err = capsys.readouterr().err

@@ -257,7 +257,7 @@ def test_layout_file_maps_signs_offsets_and_frames(tmp_path, inputs):
         assert angle < 1e-6
 
 
-def test_a_frame_without_registration_is_refused(logs, tmp_path, capsys):
+def test_a_frame_without_registration_is_rejected(logs, tmp_path, capsys):
     assert run(logs, tmp_path / "out.mcap", frame="camera") == 2
     assert "poses are in frame 'camera', not in ctr_base" in capsys.readouterr().err
 
@@ -284,7 +284,7 @@ def test_header_may_follow_comments_or_be_one(tmp_path, head):
     np.testing.assert_allclose(log.column("z"), 1e-3 * np.arange(9))
 
 
-def test_logs_on_different_clocks_are_refused(tmp_path, capsys):
+def test_logs_on_different_clocks_are_rejected(tmp_path, capsys):
     joints = write(
         tmp_path / "j.csv",
         ["t_s", "tube1_rotation_rad", "tube1_translation_m"],
@@ -304,7 +304,7 @@ def test_logs_on_different_clocks_are_refused(tmp_path, capsys):
         st.text(alphabet='t_sxmyz,;0123456789.eE+-#\n"[] \0', max_size=300).map(str.encode),
     )
 )
-def test_any_bytes_are_read_or_refused_in_one_line(tmp_path, data):
+def test_any_bytes_are_read_or_rejected_in_one_line(tmp_path, data):
     path = tmp_path / "any.csv"
     path.write_bytes(b"t_s,x_m,y_m,z_m\n" + data if len(data) % 2 else data)
     try:
@@ -326,6 +326,6 @@ def test_measures(text, si, value):
 
 
 @pytest.mark.parametrize(("text", "si"), [("1.5", "m"), ("1.5 kg", "m"), ("mm", "m"), ("", "1")])
-def test_measures_without_a_fitting_unit_are_refused(text, si):
+def test_measures_without_a_fitting_unit_are_rejected(text, si):
     with pytest.raises(InputError):
         measure(text, si, "x")

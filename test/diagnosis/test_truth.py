@@ -246,7 +246,7 @@ def test_tolerances_are_truncated_normals():
     assert np.std(z) == pytest.approx(0.97, abs=0.02)
 
 
-def test_unknown_names_are_refused(tmp_path):
+def test_unknown_names_are_rejected(tmp_path):
     with pytest.raises(ValueError, match="no stratum 'twin'"):
         make_case(1, "twin", tmp_path)
     with pytest.raises(ValueError, match="no effect 'magic'"):

@@ -177,7 +177,7 @@ def test_a_robot_file_is_held_to_the_names_and_bounds_of_the_effect(name):
     assert robot_with_effect(name, 0.5).extensions == {name: {parameter: 0.5}}
 
 
-def test_two_effects_of_one_name_are_refused():
+def test_two_effects_of_one_name_are_rejected():
     with pytest.raises(ValueError, match="'backlash' is registered twice"):
         register(effect("backlash", text="Another.", source="none")(lambda plant, values: None))
     assert EFFECTS["backlash"].source != "none"

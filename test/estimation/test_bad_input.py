@@ -160,7 +160,7 @@ def Run_without_restart(run):
     return type(run)(run.outputs[:end], run.estimator)
 
 
-def test_bag_that_begins_anew(sweep):
+def test_bag_that_starts_again(sweep):
     """Time runs backwards for good: the estimator starts anew with the new stamps."""
     first = [m.shifted(100.0) for m in sweep if m.stamp <= 0.6e9]
     made, outputs = estimator(), []

@@ -404,7 +404,7 @@ def test_the_lever_arm_of_a_tracker_without_orientation_is_turned_by_the_models_
         assert found["residual_rms_m"][run] == pytest.approx(plain[run], abs=1.5e-4)
 
 
-def test_reset_waits_for_joints_and_starts_anew(release):
+def test_reset_waits_for_joints_and_reinitialises(release):
     run = play([m for m in release if m.stamp < 0.3e9])
     made = run.estimator
     made.reset()
@@ -421,7 +421,7 @@ def test_reset_waits_for_joints_and_starts_anew(release):
 
 
 @pytest.mark.parametrize("again_s", [0.4, -2.0])
-def test_a_known_load_goes_on_acting_after_a_reset_unless_time_begins_anew(release, again_s):
+def test_a_known_load_goes_on_acting_after_a_reset_unless_time_starts_again(release, again_s):
     """The bag's load hangs on the tip until 1 s; no further message of it comes."""
     made = play([m for m in release if m.stamp < 0.3e9]).estimator
     made.reset()

@@ -100,7 +100,7 @@ def test_innovations_far_smaller_than_predicted_are_no_misfit():
     assert fed(smooth).alarms == 0
 
 
-def test_a_gap_begins_anew():
+def test_a_gap_starts_again():
     monitor = fed(3.0 * white_noise(5, 8))
     assert monitor.alarm
     monitor.add(innovation(10_000, np.ones(6)))

@@ -97,7 +97,7 @@ def test_inputs_take_on_the_load_and_the_parameters(parameters):
     )
 
 
-def test_a_force_fades_with_its_columns():
+def test_a_force_decays_with_its_columns():
     theta, rows = RNG.normal(size=5), RNG.normal(size=(5, 3))
     faded, columns = theta.copy(), rows.copy()
     kernels.fade(0.5, faded[1:4], columns[1:4])

@@ -178,7 +178,7 @@ def test_a_late_load_has_jumped_where_it_is_not_what_was_taken_for_its_time(rele
     assert jumped(0.13, 1.0)
 
 
-def test_a_course_without_time_for_its_correction_is_corrected_in_the_end(sweep, in_time):
+def test_a_trajectory_without_time_for_its_correction_is_corrected_in_the_end(sweep, in_time):
     """There is never any time: the correction then goes before the steps, and no further behind than it must."""
     run = play(
         sweep, {"output.policy": "predict"}, tick=STEP, spare=lambda made: math.inf if made.k > 380 else 0.0

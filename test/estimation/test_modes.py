@@ -84,7 +84,7 @@ def test_modes_at_rest_are_zero_also_where_actuators_have_moved(model):
     assert np.abs(moved.amplitude).max() < 0.1 * np.abs(still.amplitude).max()
 
 
-def test_modes_are_found_anew_only_where_the_robot_has_moved(model):
+def test_modes_are_recomputed_only_where_the_robot_has_moved(model):
     tracker = ModeTracker(model, every=0)
     simulator = Simulator(model)
 

@@ -71,7 +71,7 @@ def test_signal_extrapolates_by_its_last_rate_for_so_long_and_no_longer():
     assert single.at(10, extrapolate_ns=100)[0] == 1.0
 
 
-def test_signal_takes_late_and_refuses_known_stamps():
+def test_signal_takes_late_and_rejects_known_stamps():
     signal = ramp()
     assert signal.add(20_000_000, np.array([0.0, 0.0])) == "late"
     assert np.allclose(signal.at(25_000_000)[0], [2.5, -2.5])

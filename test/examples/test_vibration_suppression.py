@@ -125,7 +125,7 @@ def test_commands_keep_their_limits_whatever_comes(items):
         before = now
 
 
-def test_open_loop_fades_to_rest():
+def test_open_loop_decays_to_rest():
     rows = closed_loop(0.02, 4.0, valid=lambda t: t < 0.25)
     opened = rows[rows[:, 0] > 0.4]
     assert np.abs(rows[:, 2]).max() > 0.01
@@ -142,7 +142,7 @@ def test_stale_estimates_open_the_loop():
     assert not law.closed
 
 
-def test_no_authority_is_refused():
+def test_no_authority_is_rejected():
     with pytest.raises(ValueError, match="nothing to damp"):
         damper.ModalDamper(0.0, PERIOD)
 

@@ -236,7 +236,7 @@ def test_other_encapsulations_are_named():
         cdr.decode_joint_state(data)
 
 
-def test_impossible_lengths_are_refused_at_once():
+def test_impossible_lengths_are_rejected_at_once():
     huge = struct.pack("<I", 0xFFFFFFF0)
     with pytest.raises(cdr.CdrError, match="string of 4294967280"):
         cdr.decode_joint_state(cdr.ENCAPSULATION + bytes(8) + huge + bytes(20))

@@ -37,7 +37,7 @@ def command(*arguments: object) -> subprocess.CompletedProcess[str]:
         (["{bag}", "--output", "{tmp}/no/out.mcap"], "does not exist"),
     ],
 )
-def test_command_refuses_bad_input_in_one_line(bags, tmp_path, arguments, text):
+def test_command_rejects_bad_input_in_one_line(bags, tmp_path, arguments, text):
     (tmp_path / "bad.mcap").write_bytes(b"nonsense")
     (tmp_path / "empty.mcap").write_bytes(b"")
     before = sorted(tmp_path.iterdir())
@@ -103,7 +103,7 @@ def test_what_was_odd_about_the_inputs_is_said(bags, tmp_path):
     assert len(content["notes"]) == 1
 
 
-def test_joints_in_millimetres_are_refused_with_value_and_limit(bags, tmp_path):
+def test_joints_in_millimetres_are_rejected_with_value_and_limit(bags, tmp_path):
     def in_millimetres(m):
         if not isinstance(m, cdr.JointStateIn):
             return None

@@ -81,7 +81,7 @@ def test_every_step_has_its_stamp_once(start, on_grid, policy):
         assert np.all(np.isfinite(np.frombuffer(cloud.data, np.float32)))
 
 
-def test_reset_starts_anew_and_repeats_no_stamp(start):
+def test_reset_reinitialises_and_repeats_no_stamp(start):
     with start() as live:
         live.resting_robot()
         live.wait_for_more(topics.TIP_POSE, 50)
@@ -156,7 +156,7 @@ def test_parameters_are_checked_when_set(start):
         ("record.path: /no/such/folder/t.mcap", r"record\.path '/no/such.*does not exist; create it first"),
     ],
 )
-def test_parameters_of_a_file_are_refused_with_a_clear_line(tmp_path, yaml, wanted):
+def test_parameters_of_a_file_are_rejected_with_a_clear_line(tmp_path, yaml, wanted):
     file = tmp_path / "parameters.yaml"
     file.write_text(f"/ctr/estimator:\n  ros__parameters:\n    {yaml}\n")
     process = NodeProcess(ESTIMATOR, {}, 1, tmp_path / "log", ["--params-file", str(file)])

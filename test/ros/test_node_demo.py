@@ -32,7 +32,7 @@ def test_the_demo_ends_with_tables_picture_and_recorded_outputs(tmp_path, capfd)
     assert bag.topics[topics.TIP_POSE].messages > 300
 
 
-def test_an_unknown_robot_or_policy_is_refused_before_anything_starts(tmp_path, capfd):
+def test_an_unknown_robot_or_policy_is_rejected_before_anything_starts(tmp_path, capfd):
     with pytest.raises(InputError, match="nobody"):
         run(capfd, output=tmp_path, robot="nobody")
     with pytest.raises(InputError, match="maybe"):

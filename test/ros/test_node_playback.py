@@ -35,7 +35,7 @@ def test_shifting_moves_the_stamp_and_nothing_else():
     assert decode_stamp(shifted(big, 1_000_000_000)) == 6_000_000_007
 
 
-def test_a_stamp_that_cannot_be_moved_is_refused():
+def test_a_stamp_that_cannot_be_moved_is_rejected():
     with pytest.raises(CdrError):
         shifted(encode_joint_state(0, ["tube1_rotation"], [0.25])[:8], 1)
     with pytest.raises(CdrError, match="beyond 32 bits"):
@@ -67,7 +67,7 @@ def test_a_part_begins_with_the_load_that_acts_there(bags, tmp_path):
     assert sum(m.topic == topics.TIP_LOAD for m in part) == 1
 
 
-def test_a_bag_without_joints_in_that_part_is_refused(bags, tmp_path):
+def test_a_bag_without_joints_in_that_part_is_rejected(bags, tmp_path):
     with pytest.raises(InputError, match="joint_states"):
         load(bags / "clean_release.mcap", start_s=1000.0)
     with pytest.raises(InputError):
@@ -176,7 +176,7 @@ def test_a_truth_that_is_none_is_one_clear_error(tmp_path):
         (["--policy", "maybe"], "maybe"),
     ],
 )
-def test_a_demo_that_cannot_be_shown_is_refused_before_it_starts(capsys, tmp_path, arguments, words):
+def test_a_demo_that_cannot_be_shown_is_rejected_before_it_starts(capsys, tmp_path, arguments, words):
     pytest.importorskip("rclpy")
     assert main(["demo", *arguments, "--output", str(tmp_path / "out")]) == 2
     assert words in " ".join(capsys.readouterr().err.split())

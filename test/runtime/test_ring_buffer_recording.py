@@ -49,7 +49,7 @@ def test_it_keeps_the_last_seconds_and_the_load_that_stood_before_them(made):
     assert any("exit under an alarm" in line and recording.command in line for line in lines)
 
 
-def test_memory_is_bounded_and_a_clock_that_goes_back_begins_anew(made, monkeypatch):
+def test_memory_is_bounded_and_a_clock_that_goes_back_starts_again(made, monkeypatch):
     recording, _ = made
     monkeypatch.setattr(ring_buffer_recording, "LIMIT_BYTES", 1000)
     for i in range(100):
@@ -91,6 +91,6 @@ def test_what_cannot_be_written_is_said_and_the_thread_goes_on(made, tmp_path):
     assert status.values["recording"] == str(recording.path)
 
 
-def test_a_path_that_cannot_be_is_refused_at_the_start(tmp_path):
+def test_a_path_that_cannot_be_is_rejected_at_the_start(tmp_path):
     with pytest.raises(InputError, match=r"record\.rolling_path"):
         RingBufferRecording(tmp_path / "none" / "a.mcap", 2.0, "r", {}, print)

@@ -183,7 +183,7 @@ def test_pauses_are_used_after_steps_are_out_and_not_while_inputs_wait(clock):
     assert estimator.pauses == 1
 
 
-def test_a_flood_of_messages_is_refused_beyond_a_limit_and_counted(clock):
+def test_a_flood_of_messages_is_rejected_beyond_a_limit_and_counted(clock):
     loop, _, _ = make_loop(Scripted(), clock)
     taken = []
     for k in range(INBOX_LIMIT + 3):
@@ -210,7 +210,7 @@ def test_a_backlog_is_published_step_by_step_and_nothing_is_skipped(clock):
     assert all(b - a <= STEP_NS for a, b in zip(estimator.asked, estimator.asked[1:], strict=False))
 
 
-def test_a_hopeless_backlog_starts_anew(clock):
+def test_a_large_backlog_reinitialises(clock):
     estimator = Scripted(clock.now)
     loop, published, errors = make_loop(estimator, clock)
     loop._round()
@@ -231,7 +231,7 @@ def test_without_a_clock_only_covered_steps_are_asked_for(clock):
     assert published == []
 
 
-def test_a_fault_is_shown_and_the_estimator_starts_anew(clock):
+def test_a_fault_is_shown_and_the_estimator_reinitialises(clock):
     estimator = Scripted(clock.now)
     estimator.fault = ZeroDivisionError("no")
     loop, _, errors = make_loop(estimator, clock)

@@ -97,7 +97,7 @@ def test_bad_scenarios_end_with_one_line(tmp_path, capsys, change, match):
     assert not (tmp_path / "o.mcap").exists()
 
 
-def test_motions_out_of_range_are_refused_before_anything_runs():
+def test_motions_out_of_range_are_rejected_before_anything_runs():
     robot = load_robot("till2020_tissue")
     motion = {"kind": "ramp", "duration_s": 0.2, "to": 0.3}
     with pytest.raises(InputError, match="beyond tube 1"):

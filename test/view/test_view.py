@@ -57,7 +57,7 @@ def test_point_clouds_come_back(step):
 
 @settings(max_examples=300, deadline=None)
 @given(st.data())
-def test_damaged_point_clouds_are_refused_or_read(step, data):
+def test_damaged_point_clouds_are_rejected_or_read(step, data):
     good = step[1][topics.BACKBONE_STATE]
     place = data.draw(st.integers(0, 400))
     bad = bytearray(good[: data.draw(st.integers(0, len(good)))] if data.draw(st.booleans()) else good)
@@ -208,7 +208,7 @@ def test_view_of_a_bag_that_gives_no_step_says_so(capsys):
 
 
 @pytest.mark.parametrize("speed", ["-1", "nan", "inf"])
-def test_view_at_a_speed_that_is_none_is_refused(capsys, speed):
+def test_view_at_a_speed_that_is_none_is_rejected(capsys, speed):
     assert cli.main(["view", str(BAG), f"--speed={speed}", "--port", "0"]) == 2
     assert f"--speed is {speed}" in capsys.readouterr().err
 
