@@ -1,1 +1,1 @@
-"""Estimation: the filter on the model's fields, and the estimator that drives both from stamped inputs."""
+"""The estimator: filter, late inputs and monitoring of one robot. Begin with ``estimator.py``; docs/filter.md explains the method."""

@@ -8,10 +8,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ctr_dynamics.estimation.filter.ekf import FilterState, RodEkf
-from ctr_dynamics.estimation.inputs.actuation import Actuation, Signals
+from ctr_dynamics.estimation.filter.ekf import RodEkf
+from ctr_dynamics.estimation.filter.filter_records import FilterState
 from ctr_dynamics.estimation.inputs.input_buffer import InputBuffer
 from ctr_dynamics.estimation.inputs.measurement_queue import DueMeasurement
+from ctr_dynamics.estimation.inputs.run_inputs import InterpolatedInputs, RunInputs
 from ctr_dynamics.estimation.monitoring.health import Health
 from ctr_dynamics.estimation.monitoring.innovation_log import InnovationLog
 from ctr_dynamics.estimation.open_loop import OpenLoopRun
@@ -35,7 +36,7 @@ class FusedRun:
 
     Args:
         ekf: the filter, with the simulator that it corrects.
-        signals: actuators and known load.
+        interpolated: actuators and known load.
         load: (inputs,) load of the robot file.
         inputs: for the actuators at a measurement's time.
         health, innovations: where outcomes are counted and collected.
@@ -46,10 +47,10 @@ class FusedRun:
     """
 
     def __init__(
-        self, ekf: RodEkf, signals: Signals, load: Floats, inputs: InputBuffer, health: Health, innovations: InnovationLog
+        self, ekf: RodEkf, interpolated: InterpolatedInputs, load: Floats, inputs: InputBuffer, health: Health, innovations: InnovationLog
     ) -> None:  # fmt: skip
         self.ekf, self.simulator = ekf, ekf.simulator
-        self._signals, self._load, self._inputs = signals, load, inputs
+        self._interpolated, self._load, self._inputs = interpolated, load, inputs
         self._health, self._innovations = health, innovations
         model = ekf.model
         rows = [input_row(model.tubes, i) for i in range(model.input_count)]
@@ -68,9 +69,9 @@ class FusedRun:
         self.ekf.start(state, t)
 
     @property
-    def inputs_at(self) -> Actuation:
+    def inputs_at(self) -> RunInputs:
         """Actuators and load with the estimated offsets and force."""
-        return Actuation(self._signals, self._load, self._by_theta, self.ekf.theta)
+        return RunInputs(self._interpolated, self._load, self._by_theta, self.ekf.theta)
 
     def update(self, k: int, due: Sequence[DueMeasurement], open_loop: OpenLoopRun) -> None:
         """Compare the measurements that have come ``due`` after step ``k`` with the tips of their times, and fuse them."""

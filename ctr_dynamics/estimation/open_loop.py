@@ -7,9 +7,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ctr_dynamics.estimation.filter.ekf import insertion_fraction
-from ctr_dynamics.estimation.filter.tip_window import TipWindow, TipWindowState
-from ctr_dynamics.estimation.inputs.actuation import Actuation
+from ctr_dynamics.estimation.filter.tip_window import TipWindow, TipWindowState, insertion_fraction
+from ctr_dynamics.estimation.inputs.run_inputs import RunInputs
 from ctr_dynamics.estimation.timeline import DT
 from ctr_dynamics.model.simulator import Simulator, State
 from ctr_dynamics.sensing import Tip, TrackerModel
@@ -37,7 +36,7 @@ class OpenLoopRun:
         tips: of the last steps, without columns.
     """
 
-    def __init__(self, simulator: Simulator, inputs_at: Actuation, steps: int) -> None:
+    def __init__(self, simulator: Simulator, inputs_at: RunInputs, steps: int) -> None:
         self.simulator, self.inputs_at = simulator, inputs_at
         self.tips = TipWindow(steps)
         self.state: State | None = None

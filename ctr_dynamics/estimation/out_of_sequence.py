@@ -20,7 +20,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from ctr_dynamics.estimation.filter.ekf import FilterState
+from ctr_dynamics.estimation.filter.filter_records import FilterState
 from ctr_dynamics.estimation.fused_run import FusedState
 from ctr_dynamics.estimation.inputs.input_buffer import InputBuffer
 from ctr_dynamics.estimation.monitoring.health import Health

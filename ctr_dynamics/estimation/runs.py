@@ -9,11 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctr_dynamics.errors import InputError
-from ctr_dynamics.estimation.filter.ekf import FilterOptions, FilterState, RodEkf
+from ctr_dynamics.estimation.filter.ekf import RodEkf
+from ctr_dynamics.estimation.filter.filter_records import FilterOptions, FilterState
 from ctr_dynamics.estimation.filter.gating import GateOptions
 from ctr_dynamics.estimation.fused_run import FusedRun
-from ctr_dynamics.estimation.inputs.actuation import Actuation, Signals, standing
 from ctr_dynamics.estimation.inputs.input_buffer import InputBuffer
+from ctr_dynamics.estimation.inputs.run_inputs import InterpolatedInputs, RunInputs, standing
 from ctr_dynamics.estimation.monitoring.health import Health
 from ctr_dynamics.estimation.monitoring.innovation_log import InnovationLog
 from ctr_dynamics.estimation.open_loop import OpenLoopRun
@@ -52,15 +53,15 @@ class Runs:
         tolerance = float(settings["model.tolerance"])
         corrected, nominal = Simulator(model, scheme, tolerance), Simulator(model, scheme, tolerance)
         self._pair = Pair(corrected, nominal)
-        self._signals = Signals(model, inputs)
+        self._interpolated = InterpolatedInputs(model, inputs)
         load = np.zeros(model.input_count)  # of the robot file
         load[3 * model.n : 3 * model.n + 3] = model.plant.tip_force
         self.tracker = inputs.measurements.tracker
         ekf = RodEkf(corrected, self.tracker, filter_options(settings))
-        self.fused = FusedRun(ekf, self._signals, load, inputs, health, innovations)
+        self.fused = FusedRun(ekf, self._interpolated, load, inputs, health, innovations)
         no_effect = np.zeros((model.input_count, 0))
         self.open_loop = OpenLoopRun(
-            nominal, Actuation(self._signals, load, no_effect, np.zeros(0)), ekf.tips.size
+            nominal, RunInputs(self._interpolated, load, no_effect, np.zeros(0)), ekf.tips.size
         )
         self.clear()
 
@@ -68,7 +69,7 @@ class Runs:
         """Forget both runs."""
         self.fused.clear()
         self.open_loop.clear()
-        self._signals.clear()
+        self._interpolated.clear()
         self.k = -1
         self._failures = 0
 
@@ -84,7 +85,7 @@ class Runs:
     def start(self, k: int) -> str:
         """Both runs at rest at step ``k``; returns the reason when there is no equilibrium."""
         t = seconds(k)
-        self._signals.clear()
+        self._interpolated.clear()
         self.fused.ekf.forget_parameters()
         self.fused.ekf.gate.rejections = 0
         try:
@@ -157,7 +158,7 @@ class Runs:
         What the step reads and runs is in the processor's caches then. A step that the runs do not take together is not gone into.
         """
         t = seconds(k)
-        self._signals.clear()
+        self._interpolated.clear()
         both = self._together(k, self._inputs.load_discontinuities(k), record=True)
         if both is None or not (both[0].ok and both[1].ok):
             return
@@ -173,10 +174,10 @@ class Runs:
 
     def _propagate(self, k: int, extrapolated: bool, record: bool) -> tuple[StepResult, StepResult]:
         """Fields of both runs at step ``k``: together where they can be, else each by itself."""
-        self._signals.clear()
+        self._interpolated.clear()
         if extrapolated:
             assert self.open_loop.state is not None
-            self._signals.go_on_from(seconds(k - 1), self.open_loop.state.inputs)
+            self._interpolated.go_on_from(seconds(k - 1), self.open_loop.state.inputs)
         events = self._inputs.load_discontinuities(k)
         return self._together(k, events, record) or self.apart(k, events, record)
 

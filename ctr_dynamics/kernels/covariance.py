@@ -4,9 +4,11 @@ import math
 
 import numpy as np
 
-from ctr_dynamics.kernels.filter_steps import compiled
+from ctr_dynamics.kernels.compiler import njit
 from ctr_dynamics.kernels.lanes import PACK, fma
 from ctr_dynamics.kernels.lanes import rows as packs
+
+compiled = njit(cache=True, nogil=True, error_model="numpy")
 
 
 @compiled

@@ -4,7 +4,9 @@ import math
 
 import numpy as np
 
-from ctr_dynamics.kernels.filter_steps import compiled
+from ctr_dynamics.kernels.compiler import njit
+
+compiled = njit(cache=True, nogil=True, error_model="numpy")
 
 
 @compiled

@@ -1,7 +1,7 @@
 """Rotations: unit quaternions (w, x, y, z), rotation matrices and rotation vectors.
 
-Functions of one rotation are plain Python that numba compiles too (:mod:`ctr_dynamics.kernels.filter_steps`). Those whose name ends in ``_rows``
-take arrays of rotations, row by row.
+Functions of one rotation are plain Python, which numba compiles too (:mod:`ctr_dynamics.kernels.compiled_rotations`). Those whose name ends in
+``_rows`` take arrays of rotations, row by row.
 """
 
 from __future__ import annotations

@@ -4,17 +4,26 @@ import math
 
 import numpy as np
 
-from ctr_dynamics.kernels.covariance import covariance_of
-from ctr_dynamics.kernels.filter_steps import (
+from ctr_dynamics.kernels.compiled_rotations import (
     applied,
-    compiled,
     conjugate,
     from_vector,
     matrix,
     multiply,
-    registration_error,
     to_vector,
 )
+from ctr_dynamics.kernels.compiler import njit
+from ctr_dynamics.kernels.covariance import covariance_of
+
+compiled = njit(cache=True, nogil=True, error_model="numpy")
+
+
+@compiled
+def registration_error(rotation, bias):
+    """Estimated error of the registration in base axes: quaternion (4,) and shift (3,) m, from the nominal ``rotation`` (4,) and the tracker states
+    ``bias`` (13,); and the registration's inverse (3, 3)."""
+    back = matrix(conjugate(rotation))
+    return from_vector(applied(back, bias[0:3])), applied(back, bias[3:6]), back
 
 
 @compiled

@@ -5,8 +5,7 @@ import pytest
 from scipy.sparse import random_array
 
 from ctr_dynamics.kernels import covariance as variance_kernels
-from ctr_dynamics.kernels import filter_steps as kernels
-from ctr_dynamics.kernels import rotations
+from ctr_dynamics.kernels import factor_operations, output_rows, rotations, stage_inputs, tip_kinematics
 
 RNG = np.random.default_rng(3)
 
@@ -43,10 +42,10 @@ def test_position_deviations_are_those_of_the_columns():
 def test_columns_that_were_skipped_lie_between_their_neighbours():
     columns = RNG.normal(size=(5, 12, 3))
     filled = columns.copy()
-    kernels.interpolate_columns(filled[1:], 2)
-    for i, share in ((2, 1 / 3), (3, 2 / 3)):
+    tip_kinematics.interpolate_columns(filled[1:], 2)
+    for i, fraction in ((2, 1 / 3), (3, 2 / 3)):
         np.testing.assert_allclose(
-            filled[i], (1 - share) * columns[1] + share * columns[4], rtol=1e-12, atol=1e-15
+            filled[i], (1 - fraction) * columns[1] + fraction * columns[4], rtol=1e-12, atol=1e-15
         )
     for i in (0, 1, 4):
         np.testing.assert_array_equal(filled[i], columns[i])
@@ -55,21 +54,21 @@ def test_columns_that_were_skipped_lie_between_their_neighbours():
 def test_a_product_with_compressed_rows():
     matrix = random_array((7, 5), density=0.5, rng=RNG).tocsr()
     columns = RNG.normal(size=(5, 3))
-    found = kernels.sparse_product(matrix.indptr, matrix.indices, matrix.data, columns)
+    found = factor_operations.sparse_product(matrix.indptr, matrix.indices, matrix.data, columns)
     np.testing.assert_allclose(found, matrix @ columns, rtol=1e-12, atol=1e-15)
 
 
 def test_parameters_outside_their_range_are_noticed():
     theta, rows, a = np.zeros(4), RNG.normal(size=(4, 3)), RNG.normal(size=3)
     moved = rows @ a
-    assert not kernels.outside(theta, rows, a, moved - 1e-9, moved + 1e-9)
+    assert not factor_operations.leaves_range(theta, rows, a, moved - 1e-9, moved + 1e-9)
     for i in range(4):
         for side in (-1.0, 1.0):
             lowest, highest = moved - 1.0, moved + 1.0
             lowest[i] += 2.0 * (side > 0)
             highest[i] -= 2.0 * (side < 0)
-            assert kernels.outside(theta, rows, a, lowest, highest)
-    assert kernels.outside(theta, rows, a * np.nan, moved - 1.0, moved + 1.0)
+            assert factor_operations.leaves_range(theta, rows, a, lowest, highest)
+    assert factor_operations.leaves_range(theta, rows, a * np.nan, moved - 1.0, moved + 1.0)
 
 
 def test_unknowns_of_all_stages_and_steps_move_together():
@@ -80,7 +79,7 @@ def test_unknowns_of_all_stages_and_steps_move_together():
         RNG.normal(size=(4, 3, 7)),
     )
     now, before = unknowns.copy(), earlier.copy()
-    kernels.move_unknowns(dx, a, now, before)
+    factor_operations.move_unknowns(dx, a, now, before)
     np.testing.assert_allclose(now, unknowns + dx @ a, rtol=1e-12, atol=1e-14)
     np.testing.assert_allclose(before, earlier + dx @ a, rtol=1e-12, atol=1e-14)
 
@@ -90,20 +89,20 @@ def test_inputs_take_on_the_load_and_the_parameters(parameters):
     bare, load = RNG.normal(size=(3, 12)), RNG.normal(size=12)
     effect, theta = RNG.normal(size=(12, parameters)), RNG.normal(size=parameters)
     np.testing.assert_allclose(
-        kernels.corrected_rows(bare, load, effect, theta),
+        stage_inputs.corrected_rows(bare, load, effect, theta),
         bare + load + effect @ theta,
         rtol=1e-12,
         atol=1e-14,
     )
 
 
-def test_a_force_decays_with_its_columns():
+def test_a_force_decays_with_its_rows():
     theta, rows = RNG.normal(size=5), RNG.normal(size=(5, 3))
-    faded, columns = theta.copy(), rows.copy()
-    kernels.fade(0.5, faded[1:4], columns[1:4])
-    share = np.array([1.0, 0.5, 0.5, 0.5, 1.0])
-    np.testing.assert_array_equal(faded, share * theta)
-    np.testing.assert_array_equal(columns, share[:, None] * rows)
+    decayed, columns = theta.copy(), rows.copy()
+    factor_operations.decay(0.5, decayed[1:4], columns[1:4])
+    fraction = np.array([1.0, 0.5, 0.5, 0.5, 1.0])
+    np.testing.assert_array_equal(decayed, fraction * theta)
+    np.testing.assert_array_equal(columns, fraction[:, None] * rows)
 
 
 def test_backbone_rows_stand_in_the_registered_frame():
@@ -113,7 +112,7 @@ def test_backbone_rows_stand_in_the_registered_frame():
     bias = np.r_[1e-3 * RNG.normal(size=3), 1e-3 * RNG.normal(size=3), np.zeros(7)]
     s, points, deviation = np.arange(4.0), np.array([0, 1, 2, 3]), RNG.random(4)
     rows = np.empty((4, 15), np.float32)
-    kernels.backbone_rows(s, nodes, fields, points, 2, 0.02, rotation, bias, deviation, rows)
+    output_rows.backbone_rows(s, nodes, fields, points, 2, 0.02, rotation, bias, deviation, rows)
     back = rotations.matrix(rotation).T
     turn, shift = rotations.matrix(rotations.from_vector(back @ bias[:3])), back @ bias[3:6]
     for node, row, own, point in zip(nodes, rows, deviation, points, strict=True):

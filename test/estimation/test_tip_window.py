@@ -9,8 +9,9 @@ from scipy.spatial.transform import Rotation
 from tracker_twin import expected, residual
 
 from ctr_dynamics.estimation.filter.factor_reduction import through
-from ctr_dynamics.estimation.filter.tip_window import TipWindow, tip_rows
+from ctr_dynamics.estimation.filter.tip_window import TipWindow
 from ctr_dynamics.kernels.rotations import conjugate, from_vector, matrix, multiply, to_vector
+from ctr_dynamics.kernels.tip_kinematics import tip_from_node
 from ctr_dynamics.kernels.tracker_measurement import fused_tip
 from ctr_dynamics.sensing import Tip
 from ctr_dynamics.sensing.tracker import DELAY, STATES, TrackerModel
@@ -65,12 +66,12 @@ def bias_of(scale):
     return bias
 
 
-def test_tip_rows_are_the_kinematics_and_their_derivative():
+def test_a_tip_from_the_last_node_is_the_kinematics_and_their_derivative():
     node, change = RNG.normal(size=22), RNG.normal(size=(22, COLUMNS))
 
     def rows(at):
         mean, columns = np.empty(13), np.empty((12, COLUMNS))
-        tip_rows(at, change, 0.05, mean, columns)
+        tip_from_node(at, change, 0.05, mean, columns)
         return mean, columns
 
     mean, columns = rows(node)

@@ -17,7 +17,7 @@ from ctr_dynamics.estimation.filter.energy_norm import EnergyNorm
 from ctr_dynamics.estimation.filter.factor_reduction import BasisChange
 from ctr_dynamics.estimation.filter.parameter_priors import ModelUncertainty
 from ctr_dynamics.kernels.covariance import position_deviations
-from ctr_dynamics.kernels.filter_steps import sparse_product
+from ctr_dynamics.kernels.factor_operations import sparse_product
 from ctr_dynamics.kernels.shooting import lanes_for, lanes_free
 from ctr_dynamics.kernels.tangent import linearise, theta_tangent
 from ctr_dynamics.model.mesh import Key, Mesh, build_mesh

@@ -7,23 +7,28 @@ Pi = cov(a, b). Three files beside this one hold the process noise, the gate and
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
-from typing import NamedTuple
 
 import numpy as np
 from filterpy.kalman import ExtendedKalmanFilter
 from numpy.typing import NDArray
 
-from ctr_dynamics.estimation.filter.covariance_factor import CovarianceFactor, FactorState
+from ctr_dynamics.estimation.filter.covariance_factor import CovarianceFactor
 from ctr_dynamics.estimation.filter.factor_reduction import reduced
-from ctr_dynamics.estimation.filter.factor_schedule import FactorSchedule, ScheduleState
-from ctr_dynamics.estimation.filter.force_variance import ForceVariance, ForceVarianceState
-from ctr_dynamics.estimation.filter.gating import Gate, GateOptions
+from ctr_dynamics.estimation.filter.factor_schedule import FactorSchedule
+from ctr_dynamics.estimation.filter.filter_records import (
+    Comparison,
+    FilterOptions,
+    FilterState,
+    TipEstimate,
+    Update,
+)
+from ctr_dynamics.estimation.filter.force_variance import ForceVariance
+from ctr_dynamics.estimation.filter.gating import Gate
 from ctr_dynamics.estimation.filter.parameter_priors import model_uncertainty
 from ctr_dynamics.estimation.filter.process_noise import ProcessNoise
-from ctr_dynamics.estimation.filter.tip_window import TipWindow, TipWindowState
+from ctr_dynamics.estimation.filter.tip_window import TipWindow, insertion_fraction
 from ctr_dynamics.estimation.step_output import FUSION_OFF
-from ctr_dynamics.kernels.filter_steps import move_unknowns
+from ctr_dynamics.kernels.factor_operations import move_unknowns
 from ctr_dynamics.kernels.tracker_measurement import fused_tip
 from ctr_dynamics.model.model import Model
 from ctr_dynamics.model.simulator import Inputs, Simulator, State, StepResult
@@ -31,83 +36,6 @@ from ctr_dynamics.sensing import Tip, TrackerModel
 from ctr_dynamics.sensing.tracker import DELAY, STATES
 
 Floats = NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class FilterOptions:
-    """Tuning of the filter; the parameter table says what each means.
-
-    ``parameter_energy`` is the weight of the parameters in the energy norm, in units of their priors, by the fields' mean. It is small,
-    so that a reduction is decided by what moves the robot.
-    """
-
-    rank: int = 24
-    force_sigma: float = 0.00005
-    force_sigma_max: float = 0.2
-    force_change: float = 20.0
-    force_time: float = 0.3
-    window: float = 0.2
-    gate: GateOptions = field(default_factory=GateOptions)
-    parameter_energy: float = 0.1
-
-
-class Update(NamedTuple):
-    """The outcome of one tracker measurement.
-
-    Attributes:
-        residual: (6,) measured minus expected, position m in the tracker's axes, rotation rad in the sensor's.
-        variance: (6,) its predicted variance. nis, dof: normalised innovation squared and its degrees of freedom.
-        accepted: whether it was fused. reason: why not, or how.
-        white: (6,) residual by the inverse root of its covariance. NaN on axes that are not measured, here and in the others.
-    """
-
-    residual: Floats
-    variance: Floats
-    nis: float
-    dof: int
-    accepted: bool
-    reason: str
-    white: Floats
-
-    @classmethod
-    def impossible(cls, reason: str) -> Update:
-        """A measurement that cannot be compared with anything."""
-        unknown = np.full(6, np.nan)
-        return cls(unknown, unknown, math.nan, 0, False, reason, unknown)
-
-
-class Comparison(NamedTuple):
-    """A measurement against the tip of its time: innovation ``nu`` (k,), ``H`` (k, r + 13), ``S`` (k, k), and the record of it."""
-
-    nu: Floats
-    H: Floats
-    S: Floats
-    record: Update
-
-
-class TipEstimate(NamedTuple):
-    """Fused tip: position (3,) m, quaternion (4,) wxyz, twist (6,), covariance (12, 12) of pose and twist (base axes); deviation (3,) of the
-    estimated tip force, N; and whether all is finite."""
-
-    position: Floats
-    quaternion: Floats
-    twist: Floats
-    covariance: Floats
-    force_sigma: Floats
-    finite: bool
-
-
-class FilterState(NamedTuple):
-    """What a checkpoint stores of a :class:`RodEkf`, part by part."""
-
-    theta: Floats
-    bias: Floats
-    pi: Floats
-    force_variance: ForceVarianceState
-    rejections: int
-    schedule: ScheduleState
-    factor: FactorState
-    tips: TipWindowState
 
 
 class RodEkf:
@@ -418,8 +346,3 @@ class RodEkf:
         self.schedule.restore(state.schedule)
         self.factor.restore(state.factor)
         self._apply_theta()
-
-
-def insertion_fraction(model: Model) -> float:
-    """Of d beta_1 / dt, what the velocities of ``model`` hold already: 0 without the extension `insertion_velocity`."""
-    return float(model.plant.block[model.layout["insertion"]][0]) if model.extended else 0.0

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ctr_dynamics.kernels.filter_steps import outside
+from ctr_dynamics.kernels.factor_operations import leaves_range
 from ctr_dynamics.model.model import Model
 from ctr_dynamics.robot import Robot
 
@@ -55,7 +55,7 @@ class ModelUncertainty:
             pi: (r + 13, r + 13) covariance of what ``x`` corrects.
         """
         r = rows.shape[1]
-        if not outside(theta, rows, x[:r], self.lowest, self.highest):
+        if not leaves_range(theta, rows, x[:r], self.lowest, self.highest):
             return x
         for _ in range(len(self.names)):
             moved = theta + rows @ x[:r]

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from ctr_dynamics.estimation.filter.covariance_factor import CovarianceFactor
 from ctr_dynamics.estimation.filter.factor_reduction import APPENDED
 from ctr_dynamics.estimation.filter.force_variance import ForceVariance
-from ctr_dynamics.kernels.filter_steps import fade
+from ctr_dynamics.kernels.factor_operations import decay
 from ctr_dynamics.robot import Robot
 from ctr_dynamics.sensing.tracker import DRIFT, STATES
 
@@ -43,7 +43,7 @@ class ProcessNoise:
 
     def decay_force(self, theta: Floats, factor: CovarianceFactor) -> None:
         """The tip force of the parameters ``theta`` (p,) and its rows of the factor decay over one step, in place."""
-        fade(self._decay, theta[self._rows], factor.theta[self._rows])
+        decay(self._decay, theta[self._rows], factor.theta[self._rows])
 
     def add(self, steps: int, pi: Floats, bias: Floats, factor: CovarianceFactor) -> Floats:
         """Process noise of the last ``steps`` steps.
@@ -55,18 +55,18 @@ class ProcessNoise:
         return self._force(steps, pi, factor)
 
     def _drift(self, steps: int, pi: Floats, bias: Floats, factor: CovarianceFactor) -> None:
-        decay = math.exp(-steps * self.dt / self._noise.drift_time.value)
+        remains = math.exp(-steps * self.dt / self._noise.drift_time.value)
         r = factor.theta.shape[1]
         rows = slice(r + DRIFT.start, r + DRIFT.stop)
-        bias[DRIFT] *= decay
-        pi[rows, :] *= decay
-        pi[:, rows] *= decay
-        pi[rows, rows] += np.eye(3) * ((1 - decay**2) * self._noise.drift.value**2)
-        self.force_variance.decay(rows, decay)
+        bias[DRIFT] *= remains
+        pi[rows, :] *= remains
+        pi[:, rows] *= remains
+        pi[rows, rows] += np.eye(3) * ((1 - remains**2) * self._noise.drift.value**2)
+        self.force_variance.decay(rows, remains)
 
     def _force(self, steps: int, pi: Floats, factor: CovarianceFactor) -> Floats:
         """The new columns move nothing but the force so far; their coefficients have the variance 1 - d^2."""
-        decay2 = math.exp(-2 * steps * self.dt / self._time)
+        remains2 = math.exp(-2 * steps * self.dt / self._time)
         r = factor.theta.shape[1]
         wide = r + APPENDED
         theta = np.zeros((len(factor.theta), wide))
@@ -76,6 +76,6 @@ class ProcessNoise:
         wider = np.zeros((wide + STATES, wide + STATES))
         wider[:r, :r], wider[:r, wide:] = pi[:r, :r], pi[:r, r:]
         wider[wide:, :r], wider[wide:, wide:] = pi[r:, :r], pi[r:, r:]
-        np.fill_diagonal(wider[r:wide, r:wide], 1.0 - decay2)
-        self.force_variance.append(r, APPENDED, 1.0 - decay2)
+        np.fill_diagonal(wider[r:wide, r:wide], 1.0 - remains2)
+        self.force_variance.append(r, APPENDED, 1.0 - remains2)
         return wider

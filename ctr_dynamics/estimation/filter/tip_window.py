@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctr_dynamics.estimation.filter.factor_reduction import BasisChange
-from ctr_dynamics.kernels.filter_steps import interpolate_columns, shift_tips, tip_between, tip_rows
+from ctr_dynamics.kernels.tip_kinematics import interpolate_columns, shift_tips, tip_between, tip_from_node
+from ctr_dynamics.model.model import Model
 from ctr_dynamics.sensing import Tip
 
 Floats = NDArray[np.float64]
@@ -78,7 +79,7 @@ class TipWindow:
             self.stamps[: self.end], self.means[: self.end], self.columns[: self.end] = old
         i = self.end
         self.stamps[i] = stamp
-        tip_rows(node, dnode, insertion_rate, self.means[i], self.columns[i])
+        tip_from_node(node, dnode, insertion_rate, self.means[i], self.columns[i])
         self.end += 1
 
     @property
@@ -149,4 +150,9 @@ class TipWindow:
         count = min(len(own), i - self.begin)
         if count:
             self.means[i - count : i] = own[-count:]
-        tip_rows(node, np.zeros((len(node), 1)), insertion_rate, self.means[i], np.empty((12, 1)))
+        tip_from_node(node, np.zeros((len(node), 1)), insertion_rate, self.means[i], np.empty((12, 1)))
+
+
+def insertion_fraction(model: Model) -> float:
+    """Of d beta_1 / dt, what the velocities of ``model`` hold already: 0 without the extension `insertion_velocity`."""
+    return float(model.plant.block[model.layout["insertion"]][0]) if model.extended else 0.0

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ctr_dynamics.estimation.step_output import MotionPoint
-from ctr_dynamics.kernels.filter_steps import matrix
+from ctr_dynamics.kernels.compiled_rotations import matrix
 
 Floats = NDArray[np.float64]
 

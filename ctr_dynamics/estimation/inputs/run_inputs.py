@@ -1,4 +1,4 @@
-"""What the simulator is driven by: input signals with one run's corrections."""
+"""What drives a run at the stages of a step: interpolated joints and load, with the run's corrections."""
 
 from __future__ import annotations
 
@@ -6,18 +6,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctr_dynamics.estimation.inputs.input_buffer import InputBuffer
-from ctr_dynamics.kernels.filter_steps import corrected_rows, stage_rows
+from ctr_dynamics.kernels.stage_inputs import corrected_rows, stage_rows
 from ctr_dynamics.model.model import Model
 from ctr_dynamics.model.simulator import Inputs
 from ctr_dynamics.sensing.interpolation import ThreePoints
 
 Floats = NDArray[np.float64]
+# Time constant with which actuators that differ from what is known of them join it: a few steps, so that their rates stay those of a motion.
 REJOIN_S = 0.01
-"""Time constant with which actuators that differ from what is known of them join it: a few steps, so that their rates stay those of a motion."""
 
 
-class Signals:
-    """Actuators and known load at the stages of a step; those of one step are remembered, as both runs ask for them."""
+class InterpolatedInputs:
+    """Actuators and known load at the stages of a step, interpolated between their stamps. Those of one step are remembered, as both runs ask.
+
+    Args:
+        model: the robot.
+        inputs: joints and loads by stamp.
+    """
 
     def __init__(self, model: Model, inputs: InputBuffer) -> None:
         self.n, self.count, self.inputs = model.n, model.input_count, inputs
@@ -67,16 +72,17 @@ class Signals:
         beta_rate += rate[-1, n:]
 
     def _at(self, times: Floats) -> tuple[Floats, Floats]:
+        """Rows and beta's rate; in one compiled call where three values of joints and load hold all times."""
         n, t0_ns, joints, load = self.n, self.inputs.t0_ns, self.inputs.joints, self.inputs.load
         assert t0_ns is not None
         ahead_ns = self.inputs.timeout_ns if self.inputs.extrapolating else 0
         first_ns, last_ns = t0_ns + round(float(times[0]) * 1e9), t0_ns + round(float(times[-1]) * 1e9)
-        drives = joints.around(first_ns, last_ns, ahead_ns)
+        actuators = joints.around(first_ns, last_ns, ahead_ns)
         wrench = load.around(first_ns, last_ns) if load.stamps else self._no_load
         rows = np.empty((len(times), self.count))
-        if drives is not None and wrench is not None:
+        if actuators is not None and wrench is not None:
             beta_rate = np.empty(n)
-            stage_rows(times, t0_ns, drives, wrench, rows, beta_rate)
+            stage_rows(times, t0_ns, actuators, wrench, rows, beta_rate)
             return rows, beta_rate
         stamps = [t0_ns + round(t * 1e9) for t in times.tolist()]
         value, rate = joints.rows(stamps, ahead_ns)
@@ -86,22 +92,28 @@ class Signals:
         return rows, rate[-1, n:]
 
 
-class Actuation:
-    """The ``signals`` with the ``load`` (inputs,) of the robot file and what a run's parameters ``theta`` (p,) add by their ``effect``
-    (inputs, p), for the simulator."""
+class RunInputs:
+    """Inputs of one run, as its simulator asks for them.
 
-    def __init__(self, signals: Signals, load: Floats, effect: Floats, theta: Floats) -> None:
-        self.signals, self.load, self.effect, self.theta = signals, load, effect, theta
+    Args:
+        interpolated: joints and known load.
+        load: (inputs,) load of the robot file.
+        effect: (inputs, p) what a change of the run's parameters adds.
+        theta: (p,) the run's parameters.
+    """
+
+    def __init__(self, interpolated: InterpolatedInputs, load: Floats, effect: Floats, theta: Floats) -> None:
+        self.interpolated, self.load, self.effect, self.theta = interpolated, load, effect, theta
 
     def __call__(self, t: float) -> Inputs:
         return self.stages(np.array([t]))[1]
 
     def stages(self, times: Floats) -> tuple[Floats, Inputs]:
         """Inputs at all stages of a step; see :func:`ctr_dynamics.model.simulator.stage_inputs`."""
-        bare, beta_rate = self.signals.rows(times)
-        rows = corrected_rows(bare, self.load, self.effect, self.theta)
-        n, last = self.signals.n, rows[-1]
-        return rows, Inputs(
+        rows, beta_rate = self.interpolated.rows(times)
+        corrected = corrected_rows(rows, self.load, self.effect, self.theta)
+        n, last = self.interpolated.n, corrected[-1]
+        return corrected, Inputs(
             last[:n],
             last[n : 2 * n],
             last[2 * n : 3 * n],

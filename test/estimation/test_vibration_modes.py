@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from scipy.optimize import curve_fit
 
-from ctr_dynamics.estimation.modes import MOST_KEPT, ModeTracker, modal_basis
+from ctr_dynamics.estimation.mode_tracker import ModeTracker, RefreshOptions
+from ctr_dynamics.estimation.vibration_modes import modal_basis
 from ctr_dynamics.model.model import Model
 from ctr_dynamics.model.simulator import Inputs, Simulator
 from ctr_dynamics.model.statics import Statics
@@ -93,7 +94,7 @@ def test_modes_are_recomputed_only_where_the_robot_has_moved(model):
         state = simulator.rest(Inputs(alpha, ZERO, BETA, ZERO))
         tracker.measure(state)
         parts = 0
-        while not parts or tracker._pending is not None:
+        while not parts or tracker.refreshing:
             tracker.refresh(state, simulator.parameters)
             parts += 1
         found = tracker.measure(state)
@@ -102,7 +103,7 @@ def test_modes_are_recomputed_only_where_the_robot_has_moved(model):
     frequency, amplitude, found = refreshed(ALPHA)
     assert found
     assert np.abs(amplitude).max() < 1e-8
-    for k in range(1, MOST_KEPT + 1):
+    for k in range(1, RefreshOptions().most_reused + 1):
         same, amplitude, found = refreshed(ALPHA + k * 1e-4)
         assert not found
         assert np.array_equal(same, frequency)

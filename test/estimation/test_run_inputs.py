@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from ctr_dynamics.estimation.inputs.actuation import Signals
+from ctr_dynamics.estimation.inputs.run_inputs import InterpolatedInputs
 from ctr_dynamics.sensing import ActuatorModel, ActuatorSignal
 from ctr_dynamics.sensing.interpolation import Signal
 
@@ -68,7 +68,7 @@ def test_stages_together_are_the_stages_alone(sampled, first, extrapolate, load)
     inputs = SimpleNamespace(
         t0_ns=t0_ns, joints=sampled, load=wrench, timeout_ns=extrapolate * MS, extrapolating=extrapolate > 0
     )
-    signals = Signals(SimpleNamespace(n=2, input_count=14), inputs)
+    signals = InterpolatedInputs(SimpleNamespace(n=2, input_count=14), inputs)
     stamps = [round((first + part) * MS) for part in (0.4359, 0.718, 1.0)]
     rows, beta_rate = signals.rows(np.array([(stamp - t0_ns) * 1e-9 for stamp in stamps]))
     assert rows.shape == (3, 14)

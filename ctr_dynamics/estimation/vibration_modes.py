@@ -1,0 +1,294 @@
+"""Slowest vibration modes about an equilibrium, and how much of each is in given fields.
+
+One backward Euler step of size h maps a perturbation of the fields by (1 - h A)^-1, with A the linearised dynamics. So block Arnoldi on the tangent
+of that step is shift-invert Arnoldi with the shift 1/h: the slowest modes come out first. An eigenvalue lambda of the step belongs to
+mu = (1 - 1/lambda) / h.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg.lapack import dgeev
+
+from ctr_dynamics.estimation.filter.energy_norm import field_weights
+from ctr_dynamics.estimation.step_output import Modes
+from ctr_dynamics.kernels.output_rows import modal_coordinates
+from ctr_dynamics.kernels.rotations import matrix
+from ctr_dynamics.kernels.shooting import lanes_for
+from ctr_dynamics.kernels.tangent import linearise
+from ctr_dynamics.model.model import Model
+from ctr_dynamics.model.simulator import Inputs
+from ctr_dynamics.model.statics import Equilibrium
+
+Floats = NDArray[np.float64]
+SHIFT_STEP = 0.02  # s: the shift 50 / s lies among the slow bending modes
+BLOCK = 8  # columns that are swept together: as many lanes as one vector has
+ROUNDS = 4  # blocks of the Krylov space: the four slowest modes then hold to a percent
+MAX_DAMPING = 0.7  # damping ratio; more is no vibration
+SMALLEST = 1e-9  # of a block's largest direction; smaller ones are rounding
+
+
+@dataclass(frozen=True)
+class ModalBasis:
+    """Modes about one equilibrium.
+
+    Attributes:
+        frequency_hz, damping: (m,). exponent: (m,) complex mu in 1/s.
+        readout: (2m, fields) real, then imaginary parts of the modal coordinate z = readout (y - rest). The tip's displacement along the mode's
+            main direction is 2 Re z, and its speed 2 Re(mu z).
+        rest: (fields,) fields of the equilibrium; inputs (2N + 6,): alpha, beta, force and torque there.
+        by_inputs: (2m, 2N + 6) modal coordinates of the equilibrium that moves with alpha, beta, force and torque.
+        direction: (m, 3) unit, main direction of the tip's motion in ``ctr_base``; zero where a mode does not move it.
+    """
+
+    frequency_hz: Floats
+    damping: Floats
+    exponent: NDArray[np.complex128]
+    readout: Floats
+    rest: Floats
+    direction: Floats
+    inputs: Floats
+    by_inputs: Floats
+
+    def measure(self, fields: Floats, now: Inputs) -> Modes:
+        """Amplitude and rate of each mode in ``fields`` (fields,) at the actuators and load ``now``."""
+        by_fields, by_inputs, at_rest = self._rows
+        m = len(self.damping)
+        values = modal_coordinates(
+            by_fields, fields, by_inputs, now.alpha, now.beta, now.force, now.torque, at_rest
+        )
+        return Modes(self.frequency_hz, self.damping, values[:m], values[m:])
+
+    @cached_property
+    def _rows(self) -> tuple[Floats, Floats, Floats]:
+        """Amplitudes and rates (2m,) by fields (2m, fields), by inputs (2m, 2N + 6), and in the fields and inputs of the equilibrium (2m,)."""
+        m = len(self.damping)
+        turn = 2.0 * np.block(
+            [[np.eye(m), np.zeros((m, m))], [np.diag(self.exponent.real), np.diag(-self.exponent.imag)]]
+        )
+        by_fields, by_inputs = turn @ self.readout, turn @ self.by_inputs
+        return by_fields, by_inputs, by_fields @ self.rest - by_inputs @ self.inputs
+
+
+def lanes_of(model: Model) -> tuple[int, ...]:
+    """Lane tuple of the tangents: the base case and the unknowns, and as many columns as a block has."""
+    return lanes_for(6 + model.n + BLOCK)
+
+
+def equilibrium_slope(
+    model: Model, equilibrium: Equilibrium, par: Floats, big: tuple[Floats, ...]
+) -> Floats | None:
+    """d(equilibrium's fields)/d(alpha, beta, force, torque), (fields, 2N + 6); ``big``: buffers of :func:`lanes_of` lanes."""
+    n, layout = model.n, model.layout
+    rows = np.concatenate([layout.rows(name) for name in ("alpha", "beta", "force", "torque")])
+    m, count = 5 + n, len(rows)
+    lanes = lanes_of(model)
+    L = 8 * len(lanes)
+    main, base = len(big[4]) // L, len(big[5]) // L
+    scale = np.array([1e-2] * n + [1e-4] * n + [1e-4] * 3 + [1e-6] * 3)
+    dpar = np.zeros((layout.size, count))
+    dpar[rows, range(count)] = scale
+    fields, nodes = np.zeros((main + base, count)), np.zeros((equilibrium.nodes.size, count))
+    ok = linearise(
+        model.tubes, lanes, equilibrium.mesh, 0.0, par, dpar, equilibrium.x, np.zeros(main), np.zeros(base),
+        np.zeros((main + base, count)), 1e-3, model.tangent_step, big, np.zeros((m, m)), np.zeros((m, count)), fields, nodes,
+    )  # fmt: skip
+    return fields / scale if ok else None
+
+
+class _InverseStep:
+    """(1 - h A)^-1 about an equilibrium: the tangent of one backward Euler step.
+
+    ``big``: buffers of :func:`lanes_of` lanes, in use while this is.
+    """
+
+    def __init__(self, model: Model, equilibrium: Equilibrium, par: Floats, big: tuple[Floats, ...]) -> None:
+        self.model, self.equilibrium, self.par, self.big = model, equilibrium, par, big
+        self.lanes = lanes_of(model)
+        L = 8 * len(self.lanes)
+        self.main, base = len(big[4]) // L, len(big[5]) // L
+        self.size, m = self.main + base, 5 + model.n
+        self.c0 = 1.0 / SHIFT_STEP
+        self.history = -self.c0 * equilibrium.fields
+        self._work = np.zeros((m, m)), np.zeros((m, BLOCK)), np.zeros((self.size, BLOCK))
+        self._nodes = np.zeros((equilibrium.nodes.size, BLOCK))
+
+    def apply(self, columns: Floats, dpar: Floats) -> Floats | None:
+        """Fields (fields, 8) after the step from perturbations ``columns`` (fields, 8) with changes ``dpar`` (NP, 8) of the parameters.
+
+        None where the equilibrium cannot be linearised.
+        """
+        scale, main, equilibrium = 1e-4, self.main, self.equilibrium
+        inverse, dx, dfields = self._work
+        ok = linearise(
+            self.model.tubes, self.lanes, equilibrium.mesh, self.c0, self.par, dpar, equilibrium.x, self.history[:main], self.history[main:],
+            -self.c0 * scale * columns, 1e-3, self.model.tangent_step, self.big, inverse, dx, dfields, self._nodes,
+        )  # fmt: skip
+        return dfields / scale if ok else None
+
+    def first_loads(self) -> Floats:
+        """(NP, 8) parameter changes whose responses begin the Krylov space: a force and a moment on the tip, softer tubes in torsion."""
+        layout, n = self.model.layout, self.model.n
+        dpar = np.zeros((layout.size, BLOCK))
+        for i in range(3):
+            dpar[layout["force"].start + i, i] = 1e-6
+            dpar[layout["torque"].start + i, 3 + i] = 1e-8
+        for i in range(min(n, BLOCK - 6)):
+            row = layout["torsional_stiffness"].start + i
+            dpar[row, 6 + i] = 1e-4 * self.par[row]
+        return dpar
+
+
+def modal_basis(
+    model: Model,
+    equilibrium: Equilibrium,
+    par: Floats,
+    beta: Floats,
+    count: int = 4,
+) -> ModalBasis | None:
+    """The ``count`` slowest modes about ``equilibrium``; None if there are none. Friction enters as its slope at rest.
+
+    Args:
+        model: the robot.
+        equilibrium: of the actuators and load in ``par``.
+        par: (NP,) parameter block.
+        beta: (N,) m, translations.
+        count: modes at most.
+    """
+    found = None
+    big = model.buffers(equilibrium.mesh, 8 * len(lanes_of(model)))
+    for part in modal_parts(model, equilibrium, par, beta, big, count):
+        found = part
+    return found
+
+
+def modal_parts(
+    model: Model, equilibrium: Equilibrium, par: Floats, beta: Floats, big: tuple[Floats, ...], count: int = 4
+) -> Iterator[ModalBasis | None]:
+    """The work of :func:`modal_basis` in parts of about equal cost, each ended by a None; the last item is the result.
+
+    ``big``: buffers of :func:`lanes_of` lanes, in use until then.
+    """
+    # 1. How the equilibrium moves with actuators and load.
+    slope = equilibrium_slope(model, equilibrium, par, big)
+    if slope is None:
+        return
+    yield None
+    # 2. Block Arnoldi.
+    step = _InverseStep(model, equilibrium, par, big)
+    dpar = step.first_loads()
+    block = step.apply(np.zeros((step.size, BLOCK)), dpar)
+    if block is None:
+        return
+    yield None
+    dpar[:] = 0.0
+    weights = np.sqrt(field_weights(model, equilibrium.mesh, beta))
+    basis: list[Floats] = []
+    whole: list[Floats] = []
+    images: list[Floats] = []
+    for _ in range(ROUNDS):
+        q, v = _orthonormal(block, weights, basis, whole)
+        image = step.apply(v, dpar)
+        if image is None:
+            return
+        basis.append(q)
+        whole.append(v)
+        images.append(image)
+        block = image
+        yield None
+    Q, image = np.concatenate(basis, axis=1), np.concatenate(images, axis=1)
+    # 3. Eigenvalues and eigenvectors of the reduced step.
+    pairs = _slow_pairs(Q.T @ (weights[:, None] * image), count)
+    if pairs is None:
+        return
+    # 4. Readout by the left eigenvectors, along the main direction of the tip's motion.
+    coordinates = (
+        (pairs.left.real @ Q.T) + 1j * (pairs.left.imag @ Q.T)
+    ) * weights  # of the modes, in any fields
+    main = step.main - (7 + 2 * model.n)
+    tip = matrix(equilibrium.tip_quaternion) @ image[main:][:3]  # velocity of the images
+    moved = (tip @ (pairs.right / (pairs.factor * pairs.exponent))).T  # displacement: an ellipse
+    axis = _main_axes(moved)
+    readout = coordinates * (axis * moved).sum(1)[:, None]
+    rows = np.concatenate([readout.real, readout.imag])
+    layout = model.layout
+    yield ModalBasis(
+        np.abs(pairs.exponent.imag) / (2 * np.pi),
+        -pairs.exponent.real / np.abs(pairs.exponent),
+        pairs.exponent,
+        rows,
+        equilibrium.fields,
+        axis,
+        np.concatenate([par[layout["alpha"]], beta, par[layout["force"]], par[layout["torque"]]]),
+        rows @ slope,
+    )
+
+
+def _orthonormal(
+    block: Floats, weights: Floats, basis: list[Floats], whole: list[Floats]
+) -> tuple[Floats, Floats]:
+    """The columns of ``block`` (fields, 8), orthonormal in the energy norm among themselves and to all before: weighted, and whole.
+
+    Gram-Schmidt works on whole vectors: the points at section ends have no energy of their own, but their history carries the bodies' inertia.
+    """
+    block = block / np.maximum(np.linalg.norm(weights[:, None] * block, axis=0), 1e-300)
+    for _ in range(2):
+        for q, v in zip(basis, whole, strict=True):
+            block = block - v @ (q.T @ (weights[:, None] * block))
+    left_vectors, sizes, turn = np.linalg.svd(weights[:, None] * block, full_matrices=False)
+    regular = sizes > SMALLEST * sizes.max()
+    q = np.where(regular, left_vectors, 0.0)
+    v = np.where(regular, block @ turn.T / np.where(regular, sizes, 1.0), 0.0)
+    return q, v
+
+
+@dataclass(frozen=True)
+class _Pairs:
+    """Slow eigenpairs: ``left`` (m, k), ``right`` (k, m), eigenvalues of the step ``factor`` (m,) and of the dynamics ``exponent`` (m,)."""
+
+    left: NDArray[np.complex128]
+    right: NDArray[np.complex128]
+    factor: NDArray[np.complex128]
+    exponent: NDArray[np.complex128]
+
+
+def _slow_pairs(reduced: Floats, count: int) -> _Pairs | None:
+    """The ``count`` slowest vibrations of the ``reduced`` step (k, k); None where there are none."""
+    if not np.isfinite(reduced).all():
+        return None
+    real, imaginary, left, right, failed = dgeev(reduced)
+    if failed:
+        return None
+    values = real + 1j * imaginary
+    with np.errstate(divide="ignore", invalid="ignore"):
+        mu = (1.0 - 1.0 / values) / SHIFT_STEP
+    # of each pair the first, whose vectors LAPACK keeps in two columns: real part, imaginary part
+    wanted = (
+        (imaginary > 0.0)
+        & np.isfinite(mu)
+        & (mu.imag > 1.0)
+        & (-mu.real < MAX_DAMPING * np.abs(mu))
+        & (mu.real < 0.05 * np.abs(mu))
+    )
+    order = np.flatnonzero(wanted)[np.argsort(np.abs(mu[wanted]))]
+    left, right = left[:, order] - 1j * left[:, order + 1], right[:, order] + 1j * right[:, order + 1]
+    overlap = np.einsum("ji,ji->i", left, right)
+    slowest = np.flatnonzero(np.abs(overlap) > 1e-8)[:count]  # else defective
+    if not len(slowest):
+        return None
+    left, right = (left[:, slowest] / overlap[slowest]).T, right[:, slowest]
+    return _Pairs(left, right, values[order[slowest]], mu[order[slowest]])
+
+
+def _main_axes(moved: NDArray[np.complex128]) -> Floats:
+    """(m, 3) unit, main axis of the ellipse that each row of ``moved`` (m, 3) describes; zero where it is none."""
+    # the real part at the phase that makes real and imaginary part perpendicular
+    axis = (moved * np.exp(-0.5j * np.angle((moved**2).sum(1)))[:, None]).real
+    axis /= np.maximum(np.linalg.norm(axis, axis=1), 1e-300)[:, None]
+    axis *= np.where(axis[range(len(axis)), np.abs(axis).argmax(1)] < 0.0, -1.0, 1.0)[:, None]
+    return axis
