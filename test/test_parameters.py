@@ -10,7 +10,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ctr_dynamics.errors import InputError
-from ctr_dynamics.parameters import PARAMETERS, Settings, axes_mask, parameter, parse_assignments
+from ctr_dynamics.parameters import (
+    PARAMETERS,
+    Settings,
+    axes_mask,
+    parameter,
+    parse_assignments,
+    read_parameter_file,
+)
 from tools import tables
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -32,7 +39,9 @@ def test_names_that_callers_rely_on(name):
 def test_settings_are_defaults_then_file_then_overrides(tmp_path):
     file = tmp_path / "p.yaml"
     file.write_text("model: {nodes: 100}\nfilter.rank: 12\n")
-    values = Settings.from_sources(file, {"filter.rank": "10", "tracker.lever_arm_m": "[0, 0, 2.5e-3]"})
+    values = Settings(
+        read_parameter_file(file) | {"filter.rank": "10", "tracker.lever_arm_m": "[0, 0, 2.5e-3]"}
+    )
     assert values["model.nodes"] == 100
     assert values["filter.rank"] == 10
     assert values["tracker.lever_arm_m"] == (0.0, 0.0, 0.0025)
@@ -60,7 +69,7 @@ def test_settings_cannot_be_changed():
 def test_ros_parameter_files(tmp_path, text):
     file = tmp_path / "p.yaml"
     file.write_text(text)
-    assert Settings.from_sources(file)["model.nodes"] == 64
+    assert Settings(read_parameter_file(file))["model.nodes"] == 64
 
 
 @pytest.mark.parametrize(
@@ -78,7 +87,7 @@ def test_bad_parameter_files_are_one_line(tmp_path, text, part):
     file = tmp_path / "p.yaml"
     file.write_text(text)
     with pytest.raises(InputError) as caught:
-        Settings.from_sources(file)
+        Settings(read_parameter_file(file))
     assert part in str(caught.value)
     assert str(file) in str(caught.value)
     assert "\n" not in str(caught.value)
@@ -86,7 +95,7 @@ def test_bad_parameter_files_are_one_line(tmp_path, text, part):
 
 def test_missing_parameter_file(tmp_path):
     with pytest.raises(InputError, match="cannot read: No such file"):
-        Settings.from_sources(tmp_path / "none.yaml")
+        Settings(read_parameter_file(tmp_path / "none.yaml"))
 
 
 @pytest.mark.parametrize(
@@ -194,7 +203,7 @@ def test_estimator_yaml_holds_every_default_in_its_ros_type():
 def test_estimator_yaml_is_read_back(tmp_path):
     file = tmp_path / "estimator.yaml"
     file.write_text(tables.estimator_yaml())
-    assert Settings.from_sources(file) == Settings()
+    assert Settings(read_parameter_file(file)) == Settings()
 
 
 def test_a_least_deviation_above_the_largest_is_rejected():

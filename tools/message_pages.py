@@ -5,12 +5,32 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
+from typing import Any
 
 from ctr_dynamics.errors import InputError
-from ctr_dynamics.io.messages.schemas import leaf_fields, schema
+from ctr_dynamics.io.messages.schemas import schema, typestore
 from ctr_dynamics.io.messages.topics import INPUTS, OUTPUTS, TOPICS, Topic
 
 INDEX = "README.md"
+
+
+def leaf_fields(ros_type: str) -> list[str]:
+    """Paths of every primitive field of a type, sequences marked with ``[]``: ``header.stamp.sec``, ..."""
+    store = typestore()
+    _, fields = store.fielddefs[ros_type]
+    paths: list[str] = []
+    description: Any  # a nested tuple whose form depends on its kind
+    for name, description in fields:
+        kind, detail = description
+        mark = ""
+        if kind.name in ("ARRAY", "SEQUENCE"):
+            kind, detail = detail[0]
+            mark = "[]"
+        if kind.name == "NAME":
+            paths += [f"{name}{mark}.{inner}" for inner in leaf_fields(str(detail))]
+        else:
+            paths.append(name + mark)
+    return paths
 
 
 def undocumented(topic: Topic) -> list[str]:

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from pathlib import Path
 from typing import Any
 
 from ctr_dynamics.errors import InputError
-from ctr_dynamics.parameters.parameter_files import read_parameter_file
 from ctr_dynamics.parameters.parameter_table import PARAMETERS, parameter
 from ctr_dynamics.parameters.parameter_types import Value
 
@@ -41,20 +39,6 @@ class Settings(Mapping[str, Value]):
                 f"filter.tip_force_sigma_N is {least:g} N, limit filter.tip_force_sigma_max_N, {most:g} N",
                 do="lower the one or raise the other",
             )
-
-    @classmethod
-    def from_sources(cls, file: Path | None = None, overrides: Mapping[str, Any] | None = None) -> Settings:
-        """Defaults, then a parameter file, then overrides.
-
-        Args:
-            file: YAML, either a ROS 2 parameter file or the parameters themselves, nested or dotted.
-            overrides: name to value or to text as on the command line.
-
-        Raises:
-            InputError: unreadable file, unknown name, wrong type or out of range.
-        """
-        values = read_parameter_file(file) if file is not None else {}
-        return cls({**values, **(overrides or {})})
 
     def replace(self, values: Mapping[str, Any]) -> Settings:
         """A copy with some values changed; raises as the constructor does."""

@@ -138,10 +138,3 @@ class Page:
 def _data_cell(item: Any, aligned: bool) -> str:
     number = aligned and isinstance(item, (int, float)) and not isinstance(item, bool)
     return f"<td{' class=number' if number else ''}>{cell(item)}</td>"
-
-
-def png(data: bytes, alternative: str) -> Markup:
-    """A PNG as an embedded image with its alternative text."""
-    return Markup(
-        f'<img alt="{escape(alternative)}" src="data:image/png;base64,{base64.b64encode(data).decode()}">'
-    )

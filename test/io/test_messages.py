@@ -11,9 +11,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ctr_dynamics.io.messages import cdr, encode, topics
-from ctr_dynamics.io.messages.schemas import leaf_fields, schema, typestore
+from ctr_dynamics.io.messages.schemas import schema, typestore
 from ctr_dynamics.io.messages.templates import NotFiniteError
 from ctr_dynamics.runtime import step_encoder
+from tools.message_pages import leaf_fields
 
 STORE = typestore()
 OUTPUT_TOPICS = [topic.name for topic in topics.OUTPUTS if topic.name != topics.DIAGNOSTICS]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.store import Typestore
@@ -34,22 +34,3 @@ def schema(ros_type: str) -> Schema:
         raise KeyError(f"{ros_type} is not a standard message type")
     text, _ = store.generate_msgdef(ros_type, ros_version=2)
     return Schema(text, store.hash_rihs01(ros_type))
-
-
-def leaf_fields(ros_type: str) -> list[str]:
-    """Paths of every primitive field of a type, sequences marked with ``[]``: ``header.stamp.sec``, ..."""
-    store = typestore()
-    _, fields = store.fielddefs[ros_type]
-    paths: list[str] = []
-    description: Any  # a nested tuple whose form depends on its kind
-    for name, description in fields:
-        kind, detail = description
-        mark = ""
-        if kind.name in ("ARRAY", "SEQUENCE"):
-            kind, detail = detail[0]
-            mark = "[]"
-        if kind.name == "NAME":
-            paths += [f"{name}{mark}.{inner}" for inner in leaf_fields(str(detail))]
-        else:
-            paths.append(name + mark)
-    return paths
