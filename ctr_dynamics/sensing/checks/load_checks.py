@@ -1,0 +1,119 @@
+"""Checks of the known load on the tip: numbers, frame, stamps, and forces that no such robot can carry."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import TYPE_CHECKING, NamedTuple
+
+from ctr_dynamics.io.messages.topics import accepts_frame
+from ctr_dynamics.sensing.checks.check_limits import CheckOptions
+from ctr_dynamics.sensing.checks.verdicts import ACCEPT, Findings, Kind, Verdict
+
+if TYPE_CHECKING:
+    from ctr_dynamics.robot import Robot
+
+
+class TipCompliance(NamedTuple):
+    """Turn of the tip by a load on it, linear beam theory: rad/N of a force across the robot, rad/(N m) of a moment; and its length, m."""
+
+    force: float
+    moment: float
+    length: float
+
+
+def tip_compliance(robot: Robot, translations: Sequence[float]) -> TipCompliance:
+    """Compliance of the straight robot with its tubes at ``translations``: (N,) m.
+
+    A cantilever of piecewise constant stiffness: the tip turns by the integral of moment over E I along the exposed length; all tubes that
+    are there share the moment.
+    """
+    ends = [max(tube.length + beta, 0.0) for tube, beta in zip(robot.tubes, translations, strict=True)]
+    stiffness = [
+        tube.youngs_modulus.value * 0.25 * math.pi * (tube.outer_radius.value**4 - tube.inner_radius.value**4)
+        for tube in robot.tubes
+    ]
+    length = max(ends)
+    force = moment = 0.0
+    for start, end in pairwise(sorted({0.0, *ends})):
+        bending = sum(k for k, reach in zip(stiffness, ends, strict=True) if reach >= end)
+        force += 0.5 * ((length - start) ** 2 - (length - end) ** 2) / bending
+        moment += (end - start) / bending
+    return TipCompliance(force, moment, length)
+
+
+class LoadChecks:
+    """Known loads on the tip, in the order of arrival.
+
+    Args:
+        robot: for its stiffness; None: only the largest force on any robot is a limit.
+    """
+
+    def __init__(self, robot: Robot | None = None, options: CheckOptions | None = None) -> None:
+        self.robot, self.options = robot, options or CheckOptions()
+        self.limits = self.options.limits
+        self.findings = Findings("load")
+        self._compliance: TipCompliance | None = None
+        if robot is not None:
+            self.follow_translations(robot.rest.beta.value)
+        self.forget()
+
+    def forget(self) -> None:
+        """Begin anew, as after a reset; findings stay."""
+        self._newest_ns: int | None = None
+
+    def follow_translations(self, translations: Sequence[float]) -> None:
+        """Tell where the tubes are: (N,) m."""
+        if self.robot is not None:
+            self._compliance = tip_compliance(self.robot, translations)
+
+    def check(
+        self,
+        stamp_ns: int,
+        arrival_ns: int | None,
+        force: Sequence[float],
+        torque: Sequence[float],
+        frame_id: str = "",
+    ) -> Verdict:
+        """Verdict on a load: ``force`` (3,) N and ``torque`` (3,) N m on the tip, in base axes."""
+        at = stamp_ns if arrival_ns is None else arrival_ns
+        if not accepts_frame(frame_id, self.options.frame_id):
+            text = f"load in frame '{frame_id}', expected '{self.options.frame_id}'; send it in base axes"
+            return self._drop(Kind.OTHER_FRAME, at, 0.0, "", text)
+        if not all(map(math.isfinite, (*force, *torque))):
+            text = f"load at {stamp_ns} ns holds a value that is not finite; it was left out"
+            return self._drop(Kind.NOT_FINITE, at, 0.0, "", text)
+        if stamp_ns == 0 and self._newest_ns is not None:
+            text = "stamp of the load is zero; fill in header.stamp; the load was left out"
+            return self._drop(Kind.STAMP_ZERO, at, 0.0, "s", text)
+        if arrival_ns is not None and 0 < stamp_ns - arrival_ns <= self.limits.same_clock_s * 1e9:
+            ahead_s = (stamp_ns - arrival_ns) * 1e-9
+            if ahead_s > self.limits.other_clock_s:
+                text = f"stamp of the load is {ahead_s:.3f} s after its arrival, limit {self.limits.other_clock_s:g} s; synchronise the clocks"
+                return self._drop(Kind.STAMP_AHEAD, at, ahead_s, "s", text)
+        size, moment = math.hypot(*force), math.hypot(*torque)
+        if size or moment:
+            wrong = self._beyond_reason(at, size, moment)
+            if wrong is not None:
+                return wrong
+        self._newest_ns = stamp_ns
+        return ACCEPT
+
+    def _beyond_reason(self, at: int, size: float, moment: float) -> Verdict | None:
+        """A load that would bend the robot beyond anything it bears."""
+        limits, compliance = self.limits, self._compliance
+        force_limit, moment_limit = limits.force, math.inf
+        if compliance is not None:
+            force_limit = min(force_limit, limits.bending_rad / compliance.force)
+            moment_limit = min(limits.bending_rad / compliance.moment, limits.force * compliance.length)
+        if size <= force_limit and moment <= moment_limit:
+            return None
+        wrong, limit, unit = (size, force_limit, "N") if size > force_limit else (moment, moment_limit, "N m")
+        why = f"it would turn this robot's tip by {limits.bending_rad:g} rad, or no such robot bears it"
+        text = f"load of {wrong:.4g} {unit}, limit {limit:.3g} {unit} ({why}): other units, or a sensor fault? left out"
+        return self._drop(Kind.BEYOND_REASON, at, wrong, unit, text)
+
+    def _drop(self, kind: Kind, at: int, worst: float, unit: str, text: str) -> Verdict:
+        self.findings.add(kind, at, worst, unit, text)
+        return Verdict("drop", kind, text)

@@ -1,0 +1,194 @@
+"""Stamps of one stream: zero, ahead, set back, in bursts, rounded; lost, late and jittering messages are none of these."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from stream_cases import T0
+
+from ctr_dynamics.sensing.checks.check_limits import CheckLimits
+from ctr_dynamics.sensing.checks.stamp_checks import StampChecks, known_shift
+from ctr_dynamics.sensing.checks.verdicts import Findings, Kind, Verdict
+
+PERIOD = 25_000_000
+
+
+@pytest.fixture
+def stamps() -> StampChecks:
+    return StampChecks("pose", Findings("tracker"), CheckLimits(), 0.025)
+
+
+def feed(stamps: StampChecks, messages: list[tuple[int, int | None]]) -> list[Verdict]:
+    verdicts = []
+    for stamp, arrival in messages:
+        verdict = stamps.check(stamp, arrival)
+        if verdict.use != "drop":
+            taken = stamps.take(stamp, arrival)
+            verdict = verdict if taken.kind is None else taken
+        verdicts.append(verdict)
+    return verdicts
+
+
+def even(count: int, delay: int = 2_000_000) -> list[tuple[int, int | None]]:
+    return [(T0 + k * PERIOD, T0 + k * PERIOD + delay) for k in range(count)]
+
+
+def test_even_stamps_are_believed(stamps):
+    assert {v.use for v in feed(stamps, even(200))} == {"accept"}
+    assert stamps.period_s == pytest.approx(0.025)
+    assert stamps.clock_offset_ns == 2_000_000
+    assert not list(stamps.findings)
+
+
+@pytest.mark.parametrize("case", ["jitter", "network", "lost", "late", "no arrival", "coarse clock", "drift"])
+def test_ordinary_trouble_on_the_way_is_not_a_fault(stamps, case):
+    rng = np.random.default_rng(3)
+    messages = even(400)
+    if case == "jitter":
+        messages = [
+            (s + d, a + d)
+            for (s, a), d in zip(messages, rng.integers(-5_000_000, 5_000_000, 400).tolist(), strict=True)
+        ]
+    elif case == "network":
+        messages = [
+            (s, a + d)
+            for (s, a), d in zip(messages, rng.exponential(8e6, 400).astype(int).tolist(), strict=True)
+        ]
+    elif case == "lost":
+        messages = [m for m in messages if rng.random() > 0.5]
+    elif case == "late":
+        messages = sorted(
+            (
+                (s, a + d)
+                for (s, a), d in zip(messages, rng.integers(0, 150_000_000, 400).tolist(), strict=True)
+            ),
+            key=lambda m: m[1],
+        )
+    elif case == "no arrival":
+        messages = [(s, None) for s, _ in messages if rng.random() > 0.2]
+    elif case == "coarse clock":
+        messages = [(s, a // 33_000_000 * 33_000_000) for s, a in messages]
+    else:
+        messages = [(s, T0 + round((a - T0) * 1.0005)) for s, a in messages]
+    assert {v.use for v in feed(stamps, messages)} == {"accept"}
+    assert not list(stamps.findings)
+
+
+def test_stamps_of_zero_are_dropped_and_counted_from_the_first(stamps):
+    verdicts = feed(stamps, [(0, T0 + k * PERIOD) for k in range(20)])
+    assert [v.use for v in verdicts] == ["accept"] + ["drop"] * 19
+    assert stamps.findings.count(Kind.STAMP_ZERO) == 20
+    assert not stamps.believed
+
+
+def test_a_simulation_may_begin_at_zero(stamps):
+    assert {v.use for v in feed(stamps, [(k * PERIOD, T0 + k * PERIOD) for k in range(100)])} == {"accept"}
+    assert not list(stamps.findings)
+
+
+@pytest.mark.parametrize("ahead", [0.03, 0.4, 0.9, 3600.0])
+def test_one_stamp_ahead_of_its_arrival_is_dropped(stamps, ahead):
+    messages = even(100)
+    messages[60] = (messages[60][0] + round(ahead * 1e9), messages[60][1])
+    verdicts = feed(stamps, messages)
+    assert [i for i, v in enumerate(verdicts) if v.use == "drop"] == [60]
+    assert stamps.findings.count(Kind.STAMP_AHEAD) == 1
+
+
+def test_a_stamp_ahead_is_taken_back_where_arrivals_are_unknown(stamps):
+    messages: list[tuple[int, int | None]] = [(s, None) for s, _ in even(100)]
+    wrong = messages[60][0] + 900_000_000
+    messages[60] = (wrong, None)
+    verdicts = feed(stamps, messages)
+    assert verdicts[61].retract_ns == wrong
+    assert {v.use for v in verdicts} == {"accept"}
+
+
+def test_a_clock_that_is_set_ahead_is_followed_after_two_messages(stamps):
+    messages = even(100)
+    messages[50:] = [(s + 3600 * 10**9, a) for s, a in messages[50:]]
+    verdicts = feed(stamps, messages)
+    assert [i for i, v in enumerate(verdicts) if v.use == "drop"] == [50, 51]
+    assert "1 h" in known_shift(3600.0)
+    assert stamps.findings.count(Kind.CLOCK_AHEAD) == 1
+
+
+def test_a_clock_that_is_set_back_is_named_with_a_hint(stamps):
+    messages = even(100)
+    messages[50:] = [(s - 86_400 * 10**9, a) for s, a in messages[50:]]
+    verdicts = feed(stamps, messages)
+    assert {v.use for v in verdicts[50:]} == {"drop"}
+    assert stamps.findings.count(Kind.CLOCK_BACK) == 50
+    assert "midnight" in stamps.findings[Kind.CLOCK_BACK].text
+
+
+def test_a_recording_that_is_played_again_stays_dropped_to_its_end(stamps):
+    again = [(s, a + 5 * 10**9) for s, a in even(100)]
+    verdicts = feed(stamps, even(100) + again)
+    assert {v.use for v in verdicts[100:199]} == {"drop"}
+
+
+@pytest.mark.parametrize("size", [2, 4, 10])
+@pytest.mark.parametrize("spacing", [0, 100_000])
+def test_stamps_of_arrival_in_bursts_are_spaced_evenly(stamps, size, spacing):
+    messages = []
+    for k in range(400):
+        last = (k // size * size + size - 1) * PERIOD
+        stamp = T0 + last + k % size * spacing
+        messages.append((stamp, stamp + k % size * 20_000 + 1_000_000))
+    verdicts = feed(stamps, messages)
+    assert stamps.mode == "bursts"
+    named = next(i for i, v in enumerate(verdicts) if v.kind is Kind.BURSTS)
+    assert named <= 3 * size + 4
+    errors = [
+        v.stamp_ns - (T0 + i * PERIOD) for i, v in enumerate(verdicts) if i > named + 2 * size and v.stamp_ns
+    ]
+    assert len(errors) > 300
+    assert max(abs(e) for e in errors) < 1_500_000
+
+
+def test_bursts_with_a_lost_message_recover(stamps):
+    messages = []
+    for k in range(800):
+        if k == 400:
+            continue
+        last = (k // 4 * 4 + 3) * PERIOD
+        stamp = T0 + last + k % 4 * 100_000
+        messages.append((stamp, stamp))
+    verdicts = feed(stamps, messages)
+    late = [v.stamp_ns - (T0 + (i + 1) * PERIOD) for i, v in enumerate(verdicts) if i > 700 and v.stamp_ns]
+    assert max(abs(e) for e in late) < 8_000_000
+
+
+@pytest.mark.parametrize(
+    ("grid", "arrives"),
+    [(10_000_000, True), (7_000_000, True), (16_000_000, True), (10_000_000, False), (7_000_000, False)],
+)
+def test_rounded_stamps_are_named_and_mended(stamps, grid, arrives):
+    messages = []
+    for k in range(400):
+        true = T0 + 3_000_000 + k * PERIOD
+        messages.append((true // grid * grid, true + 4_000_000 if arrives else None))
+    verdicts = feed(stamps, messages)
+    assert Kind.ROUNDED in stamps.findings
+    errors = [
+        v.stamp_ns - (T0 + 3_000_000 + k * PERIOD) for k, v in enumerate(verdicts) if v.stamp_ns and k > 100
+    ]
+    assert len(errors) == 299
+    raw = [m[0] - (T0 + 3_000_000 + k * PERIOD) for k, m in enumerate(messages) if k > 100]
+    assert np.std(errors) < 0.5 * np.std(raw)
+    assert stamps.error_s > 0.0
+
+
+def test_stamps_that_stand_for_a_second_cannot_be_used(stamps):
+    messages = [((T0 + k * PERIOD) // 10**9 * 10**9, T0 + k * PERIOD) for k in range(400)]
+    verdicts = feed(stamps, messages)
+    assert stamps.mode == "unusable"
+    assert {v.use for v in verdicts[20:]} == {"drop"}
+
+
+def test_messages_lost_from_even_stamps_are_no_coarse_stamps(stamps):
+    rng = np.random.default_rng(0)
+    messages = [(T0 + k * 10_000_000, None) for k in range(600) if rng.random() > 0.3]
+    feed(stamps, messages)
+    assert not list(stamps.findings)
