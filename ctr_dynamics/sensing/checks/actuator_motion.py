@@ -62,7 +62,7 @@ class ActuatorMotion:
                 continue
             if not math.isfinite(value):
                 text = f"{self.names[i]} is not finite; the joint state was left out; look at the driver"
-                return Kind.NOT_FINITE, 0.0, text
+                return Kind.NOT_FINITE, math.inf, text
             hint = "degrees? give radians" if i < self.n else "millimetres? give metres"
             unit = self.unit(i)
             text = f"{self.names[i]} is {value:.4g} {unit}, limit {most:.3g} {unit}: {hint}; left out"

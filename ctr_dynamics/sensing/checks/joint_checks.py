@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
 BASELINE_S = 0.05  # rates are taken over this long, so that noise does not look like motion
 POLLED_LIMIT_S = 0.05  # a driver that repeats its reading for longer is at rest, not polled too fast
+ABSURD = 1e6  # rad or m; beyond it nothing is compared
 RUNS = 8  # runs of equal readings that tell how often a driver repeats them
 
 
@@ -96,7 +97,7 @@ class JointChecks:
         at = stamp_ns if arrival_ns is None else arrival_ns
         raw: Values = (*rotations, *translations)
         bad = self.motion.bad_value(raw)
-        if bad is not None:
+        if bad is not None and (self._train is None or not bad[1] < ABSURD):
             kind, size, text = bad
             return self._drop(kind, at, size, "", text)
         last, self._last = self._last, (stamp_ns, raw)
@@ -285,7 +286,7 @@ class JointChecks:
 
     def _confirmed(self, train: Train, other: Train) -> bool:
         """Whether a position is believed though no actuator can have reached it from the last one."""
-        if not any(other.values):
+        if not any(other.values) or self.motion.bad_value(other.values) is not None:
             return False
         if not any(train.values):
             return other.count >= 2

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import Enum
@@ -146,6 +147,7 @@ class Findings:
 
     def add(self, kind: Kind, at_ns: int, worst: float, unit: str, text: str, count: int = 1) -> None:
         """Count a fault; its text is kept where it is the worst of its kind."""
+        worst = min(worst, sys.float_info.max)
         found = self._found.get(kind)
         if found is None:
             self._found[kind] = Finding(self.stream, kind, count, at_ns, at_ns, worst, unit, text)
