@@ -249,6 +249,20 @@ def test_of_two_trackers_the_first_is_used(checks, phase):
     assert kinds(checks).keys() == {Kind.TWO_PUBLISHERS}
 
 
+def test_two_trackers_that_nearly_agree_are_both_left_out(checks):
+    mixed = []
+    second = PoseStream(seed=9)
+    for k, pose in enumerate(stream(300)):
+        mixed.append(pose)
+        if k >= 100:
+            stamp = pose[0] + round(0.4 * POSE_PERIOD)
+            p, q = second.pose((stamp - T0) * 1e-9)
+            mixed.append((stamp, (p[0] + 0.005, *p[1:]), q))
+    verdicts = feed(checks, mixed)
+    assert sum(v.use != "drop" for v in verdicts[110:]) < 20
+    assert "neither" in checks.findings[Kind.TWO_PUBLISHERS].text
+
+
 def test_outliers_in_place_of_poses_are_no_second_tracker(checks):
     rng = np.random.default_rng(2)
     poses = [

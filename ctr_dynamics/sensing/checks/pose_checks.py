@@ -22,6 +22,9 @@ if TYPE_CHECKING:
     from ctr_dynamics.robot import Robot
 
 POSE_PERIOD_S = 0.025  # assumed until it is known
+CLEARLY_APART = (
+    5.0  # smallest steps that count, by which two trains of poses must differ for one of them to be used
+)
 RECALLED = 8  # distinct poses among which a repeated one is looked for
 COMEBACKS = (
     3  # times that a pose may come back among others; a driver that polls too fast interleaves no more
@@ -282,18 +285,21 @@ class PoseChecks:
         if self._two is None:
             return None
         mine = self._two.mine
+        clear = self._two.apart(stamp_ns) >= CLEARLY_APART
         place = self._two.place(stamp_ns, position)
         if place == "mine":
             mine.extend(stamp_ns, position)
         elif place != "other":
             self._two = None
-        if place != "other":
+        if place != "other" and (place != "mine" or clear):
             return None
-        size = distance(position, mine.values, (1.0,) * 3)
-        text = (
-            f"two publishers on one topic, poses {size:.3g} m apart, limit {self._scale[0]:.3g} m; the train that was there first is used, "
-            "the other left out; stop one of them"
+        size = distance(self._two.other.values, mine.values, (1.0,) * 3) if self._two is not None else 0.0
+        fate = (
+            "the train that was there first is used, the other left out"
+            if clear
+            else "they are too close to be told apart, and neither is used"
         )
+        text = f"two publishers on one topic, poses {size:.3g} m apart, limit {self._scale[0]:.3g} m; {fate}; stop one of them"
         return self._drop(Kind.TWO_PUBLISHERS, at, size, "m", text)
 
     def _drop(self, kind: Kind, at: int, worst: float, unit: str, text: str, count: int = 1) -> Verdict:

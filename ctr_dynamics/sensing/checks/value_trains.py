@@ -81,6 +81,12 @@ class TwoTrains:
         between = other.stamp_ns - other.first_ns
         self._other_ns = min(self._mine_ns, float(between)) if between > 0 else self._mine_ns
 
+    def apart(self, stamp_ns: int) -> float:
+        """How far apart both trains are at a stamp, in scales; infinite where the other is silent."""
+        if stamp_ns - self.other.stamp_ns > SILENT_S * 1e9:
+            return math.inf
+        return distance(self.mine.at(stamp_ns), self.other.at(stamp_ns), self.scale)
+
     def place(self, stamp_ns: int, values: Values) -> Literal["mine", "other", "gone", "taken over"]:
         """Which train a message continues; "gone": the other one has ended; "taken over": it goes on where mine has stopped.
 
