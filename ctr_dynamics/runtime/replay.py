@@ -32,6 +32,7 @@ from ctr_dynamics.robot import Robot
 from ctr_dynamics.robot_files import load_robot
 from ctr_dynamics.runtime.clock_offset import EachOnce, StampClock
 from ctr_dynamics.runtime.garbage_collection import seldom_collected
+from ctr_dynamics.runtime.input_gate import InputGate
 from ctr_dynamics.runtime.step_encoder import StepEncoder
 
 if TYPE_CHECKING:
@@ -94,6 +95,7 @@ class Player:
         self._now_ns: int | None = None
         self._last_ns = 0  # the last joint stamp
         self._call_times_s = array("d")
+        self._gate = InputGate(estimator)
 
     def times_s(self) -> Sequence[float]:
         """Time spent on each step, in s, roll-back included.
@@ -124,16 +126,21 @@ class Player:
         if isinstance(message, JointStateIn):
             if len(self.joint_names) < 100:
                 self.joint_names.update(message.names[:100])
-            if self._clock.sample(message.stamp_ns, item.log_ns):
-                self.estimator.add_joint_state(message.stamp_ns, message.names, message.positions)
+            given = self._gate.joint_state(message, item.log_ns)
+            if given is None:
+                return
+            if self._clock.sample(given.stamp_ns, item.log_ns):
+                self.estimator.add_joint_state(given.stamp_ns, given.names, given.positions)
             else:
-                rejection = self._clock.rejection(message.stamp_ns, item.log_ns)
+                rejection = self._clock.rejection(given.stamp_ns, item.log_ns)
                 self.estimator.health.note("joints", "far ahead", rejection)
         elif isinstance(message, PoseIn):
-            self.estimator.add_tracker_pose(
-                message.stamp_ns, message.position, message.quaternion_xyzw, message.frame_id
-            )
-        else:
+            pose = self._gate.pose(message, item.log_ns)
+            if pose is not None:
+                self.estimator.add_tracker_pose(
+                    pose.stamp_ns, pose.position, pose.quaternion_xyzw, pose.frame_id
+                )
+        elif self._gate.load(message, item.log_ns):
             self.estimator.add_tip_load(message.stamp_ns, message.force, message.torque, message.frame_id)
 
     def _advance(self, log_ns: int) -> Iterator[StepOutput]:
