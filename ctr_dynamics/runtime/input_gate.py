@@ -1,38 +1,70 @@
-"""Messages on their way to an estimator, through the checks of its inputs."""
+"""Messages on their way to an estimator, through the checks of its inputs: the same for the node and for replay."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from ctr_dynamics.io.messages.cdr import JointStateIn, PoseIn, WrenchIn
-from ctr_dynamics.sensing.checks import CheckOptions, InputChecks, Verdict
+from ctr_dynamics.sensing.checks import CheckLimits, CheckOptions, Findings, InputChecks, Kind, Verdict
 from ctr_dynamics.sensing.interpolation import joint_order
 
 if TYPE_CHECKING:
     from ctr_dynamics.estimation.estimator import Estimator
+    from ctr_dynamics.estimation.monitoring.health import Health
+
+LEFT_TO_THE_ESTIMATOR = {
+    Kind.NOT_FINITE, Kind.OTHER_FRAME, Kind.QUATERNION, Kind.DUPLICATE, Kind.LATE, Kind.CLOCK_BACK, Kind.GAP,
+}  # fmt: skip
+"""The estimator refuses and counts these itself, by its parameters; it reinitialises where the clock of the joints was set back."""
 
 
 class InputGate:
-    """Lets messages through as the checks want them, and notes in the estimator's health what was found.
+    """Lets messages through as the checks want them, and counts what they find in the estimator's health.
 
-    A pose of which only the position counts is left out: the estimator cannot use one yet.
+    The estimator takes what comes out here. A pose of which only the position counts is left out, as the estimator cannot use one.
+    Once the estimator has been reset, the checks begin anew with the next message.
+
+    Args:
+        estimator: what the messages are for; the checks go by its robot, its settings and its tracker model.
     """
 
     def __init__(self, estimator: Estimator) -> None:
-        self.health, robot = estimator.health, estimator.robot
-        options = CheckOptions(frame_id=str(estimator.settings["output.frame_id"]))
-        self.n = robot.n_tubes
-        self.checks = InputChecks(self.n, robot, options)
+        self._estimator = estimator
+        robot, settings, tracker = estimator.robot, estimator.settings, estimator.tracker
+        self._n = robot.n_tubes
+        limits = CheckLimits()
+        x, y, z = tracker.translation.tolist()
+        options = CheckOptions(
+            frame_id=str(settings["output.frame_id"]),
+            translation=(x, y, z),
+            lever=tuple(tracker.lever.tolist()),
+            scale=float(tracker.scale),
+            orientation=bool(tracker.mask[3:].any()),
+            limits=replace(limits, late_s=max(limits.late_s, float(settings["filter.window_s"]))),
+        )
+        self.checks = InputChecks(self._n, robot, options)
+        self._started = False
+        self._told: dict[tuple[str, Kind], int] = {}  # messages that the health knows of
 
     def joint_state(self, message: JointStateIn, arrival_ns: int) -> JointStateIn | None:
-        """The joint state to use; None where it is left out."""
-        order = joint_order(tuple(message.names), self.n)
+        """The joint state to use, with its time and its angles as the checks want them; None where it is left out.
+
+        Args:
+            arrival_ns: time of arrival on one clock for all messages; 0 where there is none.
+        """
+        self._follow_resets()
+        order = joint_order(tuple(message.names), self._n)
         if isinstance(order, str) or len(message.positions) < len(message.names):
             return message  # the estimator says what is missing
         values = [message.positions[i] for i in order]
-        verdict = self.checks.joint_state(message.stamp_ns, arrival_ns, values[: self.n], values[self.n :])
-        if self._left_out("joints", verdict):
+        verdict = self.checks.joint_state(message.stamp_ns, arrival_ns, values[: self._n], values[self._n :])
+        if verdict.kind is Kind.REPEATED:  # the same stamp as well
+            return message
+        if self._left_out(self.checks.joints.findings, verdict):
             return None
+        if verdict.stamp_ns is None and verdict.rotations is None:
+            return message
         positions = list(message.positions)
         for i, rotation in zip(order, verdict.rotations or (), strict=False):
             positions[i] = rotation
@@ -40,25 +72,50 @@ class InputGate:
         return message._replace(stamp_ns=stamp_ns, positions=tuple(positions))
 
     def pose(self, message: PoseIn, arrival_ns: int) -> PoseIn | None:
-        """The pose to use; None where it is left out."""
+        """The pose to use, with its time as the checks want it; None where it is left out. ``arrival_ns``: see :meth:`joint_state`."""
+        self._follow_resets()
         verdict = self.checks.pose(
             message.stamp_ns, arrival_ns, message.position, message.quaternion_xyzw, message.frame_id
         )
-        if self._left_out("tracker", verdict):
-            self.health.dropped += 1
-            return None
-        if not verdict.orientation:
+        if self._left_out(self.checks.poses.findings, verdict) or not verdict.orientation:
+            self._health.dropped += 1
             return None
         return message if verdict.stamp_ns is None else message._replace(stamp_ns=verdict.stamp_ns)
 
-    def load(self, message: WrenchIn, arrival_ns: int) -> bool:
-        """Whether a load is to be used."""
+    def load(self, message: WrenchIn, arrival_ns: int) -> WrenchIn | None:
+        """The load to use; None where it is left out. ``arrival_ns``: see :meth:`joint_state`."""
         verdict = self.checks.load(
             message.stamp_ns, arrival_ns, message.force, message.torque, message.frame_id
         )
-        return not self._left_out("load", verdict)
+        return None if self._left_out(self.checks.loads.findings, verdict) else message
 
-    def _left_out(self, group: str, verdict: Verdict) -> bool:
-        if verdict.kind is not None:
-            self.health.note(group, verdict.kind.value, verdict.text)
-        return verdict.use == "drop"
+    @property
+    def _health(self) -> Health:
+        return self._estimator.health
+
+    def _follow_resets(self) -> None:
+        """Forget what came before a reset of the estimator."""
+        started = self._estimator.t0_ns is not None
+        if self._started and not started:
+            self.checks.forget()
+        self._started = started
+
+    def _left_out(self, findings: Findings, verdict: Verdict) -> bool:
+        """Whether a message is left out here; what was found is counted."""
+        if verdict.kind is None:
+            return False
+        self._tell(findings, verdict)
+        return verdict.use == "drop" and verdict.kind not in LEFT_TO_THE_ESTIMATOR
+
+    def _tell(self, findings: Findings, verdict: Verdict) -> None:
+        """Have the health count as many messages of each kind as the checks do, which may put earlier ones down to another kind."""
+        stream, note = findings.stream, self._health.note
+        found = {(stream, f.kind): f for f in findings if f.kind not in LEFT_TO_THE_ESTIMATOR}
+        for key in [key for key in self._told if key[0] == stream and key not in found]:
+            note(stream, key[1].value, "", -self._told.pop(key))
+        for key, finding in found.items():
+            more = finding.count - self._told.get(key, 0)
+            if more:
+                text = verdict.text if key[1] is verdict.kind else finding.text
+                note(stream, key[1].value, text, more)
+                self._told[key] = finding.count

@@ -84,10 +84,11 @@ def arrivals(messages: Iterator[InputMessage]) -> Iterator[list[InputMessage]]:
 
 
 class Player:
-    """Feeds an estimator from a bag and yields its steps."""
+    """Feeds an estimator from a bag, through the checks of its inputs, and yields its steps."""
 
     def __init__(self, estimator: Estimator) -> None:
         self.estimator = estimator
+        self._gate = InputGate(estimator)
         estimator.step_times_s = array("d")
         self.joint_names: set[str] = set()
         self.unused = 0  # messages that came too long after the last joints
@@ -95,7 +96,6 @@ class Player:
         self._now_ns: int | None = None
         self._last_ns = 0  # the last joint stamp
         self._call_times_s = array("d")
-        self._gate = InputGate(estimator)
 
     def times_s(self) -> Sequence[float]:
         """Time spent on each step, in s, roll-back included.
@@ -140,8 +140,10 @@ class Player:
                 self.estimator.add_tracker_pose(
                     pose.stamp_ns, pose.position, pose.quaternion_xyzw, pose.frame_id
                 )
-        elif self._gate.load(message, item.log_ns):
-            self.estimator.add_tip_load(message.stamp_ns, message.force, message.torque, message.frame_id)
+        else:
+            load = self._gate.load(message, item.log_ns)
+            if load is not None:
+                self.estimator.add_tip_load(load.stamp_ns, load.force, load.torque, load.frame_id)
 
     def _advance(self, log_ns: int) -> Iterator[StepOutput]:
         """Take what is due at that log time; the stamps' time goes back only where their clock has been set back."""

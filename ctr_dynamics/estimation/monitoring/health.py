@@ -40,9 +40,9 @@ class Counter:
     count: int = 0
     last: str = ""
 
-    def add(self, what: str) -> None:
-        """Count one."""
-        self.count += 1
+    def add(self, what: str, count: int = 1) -> None:
+        """Count one, or as many as ``count`` says."""
+        self.count += count
         self.last = what
 
 
@@ -91,9 +91,13 @@ class Health:
 
     # -- counting --
 
-    def note(self, group: str, kind: str, what: str) -> None:
-        """Count an input problem of ``kind`` in ``group`` (joints, tracker or load)."""
-        getattr(self, group).setdefault(kind, Counter()).add(what)
+    def note(self, group: str, kind: str, what: str, count: int = 1) -> None:
+        """Count an input problem of ``kind`` in ``group`` (joints, tracker or load); a negative ``count`` takes some back."""
+        counters = getattr(self, group)
+        counter = counters.setdefault(kind, Counter())
+        counter.add(what or counter.last, count)
+        if counter.count <= 0:
+            del counters[kind]
 
     def failed(self, reason: str) -> None:
         """Count a failed step."""
