@@ -16,14 +16,14 @@ if TYPE_CHECKING:
 LEFT_TO_THE_ESTIMATOR = {
     Kind.NOT_FINITE, Kind.OTHER_FRAME, Kind.QUATERNION, Kind.DUPLICATE, Kind.LATE, Kind.CLOCK_BACK, Kind.GAP,
 }  # fmt: skip
-"""The estimator refuses and counts these itself, by its parameters; it reinitialises where the clock of the joints was set back."""
+"""The estimator rejects and counts these itself, by its parameters; it reinitialises where the clock of the joints was set back."""
 
 
 class InputGate:
     """Lets messages through as the checks want them, and counts what they find in the estimator's health.
 
     The estimator takes what comes out here. A pose of which only the position counts is left out, as the estimator cannot use one.
-    Once the estimator has been reset, the checks begin anew with the next message.
+    Once the estimator has been reset, the checks start again with the next message.
 
     Args:
         estimator: what the messages are for; the checks go by its robot, its settings and its tracker model.

@@ -37,7 +37,7 @@ class InputChecks:
         self._translations: tuple[float, ...] = ()
 
     def forget(self) -> None:
-        """Begin anew, as after a reset; findings stay."""
+        """Start again, as after a reset; findings stay."""
         for stream in (self.joints, self.poses, self.loads):
             stream.forget()
         self._translations = ()

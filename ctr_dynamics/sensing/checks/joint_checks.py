@@ -59,7 +59,7 @@ class JointChecks:
         self.forget()
 
     def forget(self) -> None:
-        """Begin anew, as after a reset; findings stay."""
+        """Start again, as after a reset; findings stay."""
         self.stamps.forget()
         self._watch.forget()
         self.rates = self.motion.still

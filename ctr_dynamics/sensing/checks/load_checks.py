@@ -60,7 +60,7 @@ class LoadChecks:
         self.forget()
 
     def forget(self) -> None:
-        """Begin anew, as after a reset; findings stay."""
+        """Start again, as after a reset; findings stay."""
         self._newest_ns: int | None = None
 
     def follow_translations(self, translations: Sequence[float]) -> None:

@@ -27,7 +27,7 @@ class OrientationChecks:
         self.forget()
 
     def forget(self) -> None:
-        """Begin anew; findings stay."""
+        """Start again; findings stay."""
         self.measured, self.scalar_first = True, False
         self._equal = 0  # different positions in a row with one orientation
         self._first: int | None = None

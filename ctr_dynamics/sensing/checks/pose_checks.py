@@ -80,7 +80,7 @@ class PoseChecks:
         self.follow_translations((0.0,) * robot.n_tubes)
 
     def forget(self) -> None:
-        """Begin anew, as after a reset; findings stay."""
+        """Start again, as after a reset; findings stay."""
         self.stamps.forget()
         self.orientation.forget()
         self._watch.forget()

@@ -45,7 +45,7 @@ class StampChecks:
         self.forget()
 
     def forget(self) -> None:
-        """Begin anew, as after a reset; findings stay."""
+        """Start again, as after a reset; findings stay."""
         self.newest_ns: int | None = None
         self.mode: Mode = ""
         self.retiming: Retiming | None = None
@@ -381,7 +381,7 @@ def _scatter(values: list[int]) -> float:
 def known_shift(shift_s: float) -> str:
     """A hint where a shift of a clock is that of a day or of a time zone."""
     if abs(shift_s - 86400.0) < 60.0:
-        return " (a day: the time of day began anew at midnight?)"
+        return " (a day: the time of day began again at midnight?)"
     halves = shift_s / 1800.0
     if round(halves) and abs(halves - round(halves)) * 1800.0 < 60.0:
         return f" (about {round(halves) / 2:g} h: another time zone?)"

@@ -20,7 +20,7 @@ UNEVEN = 0.15  # of the time between two messages of one publisher: how far the 
 DENSE = 4  # messages within which returns must follow each other where their stamps say nothing
 SMOOTH = 4.0  # a value off by more than this times what the values around it are off is off alone
 OFF_BEAT = 0.05  # of a period, by which a message may miss a rhythm that it keeps
-BEATS_LOST = 50  # periods after which a rhythm is taken up anew
+BEATS_LOST = 50  # periods after which a rhythm is taken up again
 BEATS_KNOWN = 20  # messages after which a rhythm is known
 
 
@@ -169,7 +169,7 @@ class ReturnWatch:
         self.forget()
 
     def forget(self) -> None:
-        """Begin anew."""
+        """Start again."""
         self._last: list[_Message] = []  # three messages, the oldest first
         self._step: Values = ()  # the last change, in scales
         self._foreign: _Foreign | None = None
@@ -184,7 +184,7 @@ class ReturnWatch:
         )
 
     def add(self, stamp_ns: int, values: Values, rhythm_s: float, least_s: float, sure: bool = False) -> None:
-        """Take in a message of the stream in arrival order. Sets ``two`` and ``glitch`` anew.
+        """Take in a message of the stream in arrival order. Sets ``two`` and ``glitch`` again.
 
         Args:
             rhythm_s: shortest usual time between its messages, s. least_s: time that at least passes between two measurements, s.
