@@ -9,8 +9,19 @@ from typing import Annotated
 
 import typer
 
+from ctr_dynamics.io.bag_checks import Finding
 from ctr_dynamics.io.bag_info import BagReport, TopicReport, inspect
+from ctr_dynamics.io.bag_reader import open_bag
+from ctr_dynamics.io.messages.topics import JOINT_STATES, TIP_LOAD, TRACKER_TIP
 from ctr_dynamics.runtime.replay import plain
+from ctr_dynamics.sensing.checks import Kind
+from ctr_dynamics.sensing.checks.input_checks import check_messages
+
+STREAMS = {"joints": JOINT_STATES, "tracker": TRACKER_TIP, "load": TIP_LOAD}
+# The report of the bag has a line on these already.
+REPORTED = {
+    Kind.NOT_FINITE, Kind.OTHER_FRAME, Kind.DUPLICATE, Kind.LATE, Kind.GAP, Kind.CLOCK_OFFSET, Kind.QUATERNION, Kind.OUT_OF_RANGE,
+}  # fmt: skip
 
 
 def _cell(value: float | None, form: str) -> str:
@@ -77,6 +88,15 @@ def _text(report: BagReport) -> str:
     return "\n".join(lines)
 
 
+def _input_faults(bag: Path, start_ns: int) -> list[Finding]:
+    """Faults of the inputs that node and replay leave out or mend, one line each, with times in s after ``start_ns``."""
+    return [
+        Finding(found.level, STREAMS[found.stream], found.line(start_ns))
+        for found in check_messages(open_bag(bag).inputs())
+        if found.kind not in REPORTED
+    ]
+
+
 def info(
     bag: Annotated[Path, typer.Argument(metavar="BAG", help="An .mcap file, or a folder with one.")],
     as_json: Annotated[bool, typer.Option("--json", help="Print the report as JSON.")] = False,
@@ -86,6 +106,7 @@ def info(
     Exit code 0 whatever is found, 2 when the file is not a bag.
     """
     report = inspect(bag)
+    report.problems += _input_faults(bag, report.start_ns)
     if as_json:
         print(json.dumps(plain(report.to_dict()), indent=1, allow_nan=False, ensure_ascii=False))
     else:

@@ -110,7 +110,11 @@ class InputGate:
     def _tell(self, findings: Findings, verdict: Verdict) -> None:
         """Have the health count as many messages of each kind as the checks do, which may put earlier ones down to another kind."""
         stream, note = findings.stream, self._health.note
-        found = {(stream, f.kind): f for f in findings if f.kind not in LEFT_TO_THE_ESTIMATOR}
+        found = {
+            (stream, f.kind): f
+            for f in findings
+            if f.kind not in LEFT_TO_THE_ESTIMATOR and (stream, f.kind) != ("joints", Kind.REPEATED)
+        }
         for key in [key for key in self._told if key[0] == stream and key not in found]:
             note(stream, key[1].value, "", -self._told.pop(key))
         for key, finding in found.items():

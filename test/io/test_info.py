@@ -10,6 +10,7 @@ from collections.abc import Callable
 
 import pytest
 
+from ctr_dynamics.cli.main import main
 from ctr_dynamics.io.bag_info import BagReport, inspect
 from ctr_dynamics.io.bag_writer import write_bag
 from ctr_dynamics.io.messages import topics
@@ -235,3 +236,12 @@ def test_command_on_a_cut_and_on_a_bad_file(bags, tmp_path):
         assert done.stdout == ""
         assert len(done.stderr.splitlines()) == 1
         assert "Traceback" not in done.stderr
+
+
+def test_faults_that_a_replay_leaves_out_are_listed(tmp_path, capsys):
+    """A tracker that sends one pose for two seconds: one line, with times from the start of the bag."""
+    Scenario().inspect(tmp_path / "in.mcap")
+    assert main(["info", str(tmp_path / "in.mcap")]) == 0
+    lines = [line for line in capsys.readouterr().out.splitlines() if "frozen" in line]
+    assert len(lines) == 1
+    assert lines[0].startswith("error: /ctr/tracker/tip: frozen (79 from 0.")
