@@ -19,7 +19,7 @@ MANY = {
     "ctr_dynamics/model/trajectory.py: run",
 }
 # Files that are longer: this list only gets shorter.
-LONG = {"ctr_dynamics/kernels/rod.py", "test/diagnosis/truth/kernels.py"}
+LONG = {"test/diagnosis/truth/kernels.py"}
 # File names that come twice: likewise.
 TWICE: set[str] = set()
 # Compiled functions outside of kernels/: a variant for one figure of the bench, and the tests' own simulators.

@@ -13,6 +13,7 @@ from ctr_dynamics.benchmarks.sweeps import sweep_cost
 from ctr_dynamics.estimation.estimator import Estimator
 from ctr_dynamics.io.bag_reader import open_bag
 from ctr_dynamics.io.messages.topics import STEP_NS
+from ctr_dynamics.kernels.kinds import ONE_LANE
 from ctr_dynamics.model.model import Model
 from ctr_dynamics.parameters import Settings
 from ctr_dynamics.robot_files import load_robot
@@ -59,7 +60,7 @@ def fused_replay(
         if spent < wall:
             wall, ticks = spent, 1e3 * np.array(player.times_s())[:steps]
     model = Model(robot, nodes=int(settings["model.nodes"]))
-    plain = 1e3 * sweep_cost(model, (), max(3, 4000 // model.nodes))
+    plain = 1e3 * sweep_cost(model, ONE_LANE, max(3, 4000 // model.nodes))
     counts, _ = np.histogram(np.clip(ticks, EDGES_MS[0], EDGES_MS[-1]), EDGES_MS)
     p50, p99, p999, worst = np.percentile(ticks, (50, 99, 99.9, 100))
     return {

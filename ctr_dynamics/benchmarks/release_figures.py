@@ -18,6 +18,7 @@ from ctr_dynamics.benchmarks.release import (
     tip_length,
 )
 from ctr_dynamics.benchmarks.sweeps import sweep_cost
+from ctr_dynamics.kernels.kinds import ONE_LANE
 from ctr_dynamics.model.model import Model
 
 SCHEMES = ("backward_euler", "bdf2", "bdf_alpha", "trapezoid", "sdirk2", "sdirk3")
@@ -33,7 +34,7 @@ def work(
         path = min(
             (run(test, "sdirk3", DT, nodes, duration, tolerance) for _ in range(ROUNDS)), key=lambda p: p.wall
         )
-        plain = sweep_cost(Model(release_robot(), nodes=nodes), (), max(3, 4000 // nodes))
+        plain = sweep_cost(Model(release_robot(), nodes=nodes), ONE_LANE, max(3, 4000 // nodes))
         step = path.wall / path.steps
         compiled_ratio, _ = compiled(test, nodes, duration, tolerance)
         rows.append(

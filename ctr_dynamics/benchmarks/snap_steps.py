@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 
 from ctr_dynamics.benchmarks.machine_info import best_of
-from ctr_dynamics.kernels.snap_newton import back_solve, factorise, residual
+from ctr_dynamics.kernels.snap_jacobian import back_solve, factorise
+from ctr_dynamics.kernels.snap_residual import residual
 from ctr_dynamics.robot_files import load_robot
 from ctr_dynamics.snap.experiment import Plan, run
 from ctr_dynamics.snap.solver import SnapSolver

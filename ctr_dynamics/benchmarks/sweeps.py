@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 
 from ctr_dynamics.benchmarks.machine_info import best_of
+from ctr_dynamics.kernels.kinds import ONE_LANE, Lanes, lanes_for
 from ctr_dynamics.kernels.paired_time_step import PAIR_LANES
-from ctr_dynamics.kernels.rod import sweep
 from ctr_dynamics.kernels.sections import section_lengths
 from ctr_dynamics.kernels.shooting import broadcast
-from ctr_dynamics.kernels.workspace import lane_count
+from ctr_dynamics.kernels.sweep import sweep
 from ctr_dynamics.model.mesh import node_count
 from ctr_dynamics.model.model import Model
 from ctr_dynamics.model.statics import Statics
@@ -19,37 +19,34 @@ from ctr_dynamics.model.time_scheme import make_scheme
 from ctr_dynamics.robot import Robot
 from ctr_dynamics.robot_files import load_robot, robot_from_dict, robot_to_dict
 
-# one lane; those of two runs at once; packs of eight
-LANES: tuple[tuple[int, ...], ...] = ((), PAIR_LANES, (0,), (0,) * 2, (0,) * 4)
+# one lane; those of two runs at once; batches of eight
+LANES = (ONE_LANE, PAIR_LANES, lanes_for(8), lanes_for(16), lanes_for(32))
 
 
-def sweep_cost(model: Model, lanes: tuple[int, ...], repeats: int) -> float:
+def sweep_cost(model: Model, lanes: Lanes, repeats: int) -> float:
     """Time of one sweep in s with the history of a robot at rest, all lanes together."""
     robot = model.robot
     beta, alpha = np.array(robot.rest.beta.value), np.array(robot.rest.alpha.value)
     equilibrium = Statics(model, 1e-8).solve(beta, alpha, np.zeros(3), np.zeros(3))
-    mesh, L = equilibrium.mesh, lane_count(lanes)
-    W, par, seclen, x, hist, histb, out, outb, nodes, res = model.buffers(mesh, L)
+    mesh = equilibrium.mesh
+    b = model.sweep_buffers(mesh, lanes.count)
     c0 = float(make_scheme("sdirk3", 0.003).c0[-1])
     block = model.parameters.copy()
     block[model.layout["alpha"]], block[model.layout["beta"]] = alpha, beta
     lengths = np.zeros(len(mesh.sec_cells))
     section_lengths(mesh.bp_tube, mesh.bp_offset, beta, lengths)
-    main = len(hist) // L
+    main = len(b.history) // lanes.count
     for source, target in (
-        (block, par),
-        (lengths, seclen),
-        (equilibrium.x, x),
-        (-c0 * equilibrium.fields[:main], hist),
-        (-c0 * equilibrium.fields[main:], histb),
+        (block, b.parameters),
+        (lengths, b.section_lengths),
+        (equilibrium.x, b.unknowns),
+        (-c0 * equilibrium.fields[:main], b.history),
+        (-c0 * equilibrium.fields[main:], b.base_history),
     ):
         broadcast(lanes, np.ascontiguousarray(source), target)
 
     def once() -> None:
-        sweep(
-            model.tubes, lanes, W, c0, mesh,
-            par, seclen, x, hist, histb, out, outb, nodes, res,
-        )  # fmt: skip
+        sweep(model.kind, lanes, c0, mesh, b)
 
     return best_of(once, repeats)
 
@@ -76,19 +73,23 @@ def sweeps(quick: bool) -> list[dict[str, Any]]:
         for nodes in (12, 100) if quick else (12, 16, 24, 50, 100, 200, 400):
             model = Model(robot, nodes=nodes)
             repeats = max(3, (2000 if quick else 20000) // nodes)
-            plain = sweep_cost(model, (), repeats)
+            plain = sweep_cost(model, ONE_LANE, repeats)
             for lanes in LANES if tubes == 2 else (LANES[0], *LANES[2:4]):
-                cost = sweep_cost(model, lanes, max(3, repeats // lane_count(lanes))) if lanes else plain
+                cost = (
+                    sweep_cost(model, lanes, max(3, repeats // lanes.count))
+                    if lanes is not ONE_LANE
+                    else plain
+                )
                 rows.append(
                     {
                         "tubes": tubes,
                         "nodes": nodes,
                         "mesh_nodes": node_count(model.mesh(np.array(robot.rest.beta.value))[1]),
-                        "lanes": lane_count(lanes),
+                        "lanes": lanes.count,
                         "sweep_us": 1e6 * cost,
-                        "lane_us": 1e6 * cost / lane_count(lanes),
+                        "lane_us": 1e6 * cost / lanes.count,
                         "ratio_to_plain_sweep": cost / plain,
-                        "lane_ratio_to_plain_sweep": cost / lane_count(lanes) / plain,
+                        "lane_ratio_to_plain_sweep": cost / lanes.count / plain,
                     }
                 )
     return rows

@@ -17,7 +17,7 @@ from ctr_dynamics.diagnosis.diagnosis_options import ForwardModelOptions
 from ctr_dynamics.diagnosis.recording import Recording
 from ctr_dynamics.effects import EFFECTS, EffectQuantity, Plant, apply_effects, make_plant
 from ctr_dynamics.errors import InputError
-from ctr_dynamics.kernels.lanes import PACK
+from ctr_dynamics.kernels.kinds import SIMD_WIDTH
 from ctr_dynamics.kernels.rotations import conjugate_rows, multiply_rows, to_vector_rows
 from ctr_dynamics.model.model import Model
 from ctr_dynamics.model.time_scheme import make_scheme
@@ -184,7 +184,7 @@ class ForwardModel:
             needs = model and (plant.extended or other.extended)
             kinds.append("tracker" if not model else "extended" if needs else "plain")
         numbers = {kind: [i for i, k in enumerate(kinds) if k == kind] for kind in ("plain", "extended")}
-        if numbers["extended"] and len(numbers["plain"]) <= -len(numbers["extended"]) % PACK:
+        if numbers["extended"] and len(numbers["plain"]) <= -len(numbers["extended"]) % SIMD_WIDTH:
             # the extended model has the same derivatives, and room left in its last batch of columns
             numbers["extended"] += numbers["plain"]
             numbers["plain"] = []

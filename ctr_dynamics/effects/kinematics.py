@@ -15,7 +15,7 @@ from ctr_dynamics.effects.registry import EffectParameter, Values, effect
 )
 def insertion_velocity(plant: Plant, values: Values) -> None:
     if values["scale"] != 0.0:
-        plant.extend("insertion", values["scale"])
+        plant.extend("insertion_velocity", values["scale"])
 
 
 @effect(
@@ -37,7 +37,7 @@ def insertion_velocity(plant: Plant, values: Values) -> None:
 )
 def clearance(plant: Plant, values: Values) -> None:
     if values["play_rad"] != 0.0:
-        plant.extend("play", values["play_rad"])
+        plant.extend("clearance", values["play_rad"])
 
 
 @effect(
@@ -56,4 +56,4 @@ def clearance(plant: Plant, values: Values) -> None:
     nuisance=True,
 )
 def clearance_kinematics(plant: Plant, values: Values) -> None:
-    plant.put("play_share", values["share"])
+    plant.put("clearance_kinematics", values["share"])

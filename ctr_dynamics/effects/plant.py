@@ -12,7 +12,7 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from ctr_dynamics.kernels.layout import Layout
+from ctr_dynamics.kernels.layout import RowNumbers, parameter_rows
 from ctr_dynamics.robot import Robot
 from ctr_dynamics.sensing import (
     SENSORS,
@@ -42,7 +42,7 @@ class Plant:
     """
 
     robot: Robot
-    layout: Layout
+    layout: RowNumbers
     block: Floats
     actuators: ActuatorModel
     sensors: dict[str, Measurement]
@@ -53,7 +53,7 @@ class Plant:
     @classmethod
     def of_robot(cls, robot: Robot) -> Plant:
         """Plant of a robot file without its extensions."""
-        layout = Layout(robot.n_tubes)
+        layout = parameter_rows(robot.n_tubes)
         return cls(
             robot=robot,
             layout=layout,
@@ -134,7 +134,7 @@ def same(a: Any, b: Any) -> bool:
     return bool(a == b)
 
 
-def plain_block(robot: Robot, layout: Layout) -> Floats:
+def plain_block(robot: Robot, layout: RowNumbers) -> Floats:
     """Parameter block of a robot file without its extensions; actuators and tip wrench are 0."""
     bodies = [tube.end_body for tube in robot.tubes]
     inertia = np.array([body.inertia.value if body else (0.0, 0.0, 0.0) for body in bodies])
@@ -156,6 +156,6 @@ def plain_block(robot: Robot, layout: Layout) -> Floats:
         epsilon=robot.friction.epsilon.value,
         base_coulomb=robot.friction.base.coulomb.value,
         base_viscous=robot.friction.base.viscous.value,
-        play_moment=CLEARANCE_MOMENT,
-        play_share=1.0,
+        clearance_moment=CLEARANCE_MOMENT,
+        clearance_kinematics=1.0,
     )

@@ -18,7 +18,7 @@ from ctr_dynamics.estimation.monitoring.innovation_log import InnovationLog
 from ctr_dynamics.estimation.open_loop import OpenLoopRun
 from ctr_dynamics.estimation.step_output import Innovation, MotionPoint
 from ctr_dynamics.estimation.timeline import DT, seconds
-from ctr_dynamics.kernels.workspace import input_row
+from ctr_dynamics.kernels.layout import parameters_of_inputs
 from ctr_dynamics.model.simulator import State
 
 Floats = NDArray[np.float64]
@@ -53,7 +53,7 @@ class FusedRun:
         self._interpolated, self._load, self._inputs = interpolated, load, inputs
         self._health, self._innovations = health, innovations
         model = ekf.model
-        rows = [input_row(model.tubes, i) for i in range(model.input_count)]
+        rows = parameters_of_inputs(model.n)[: model.input_count]
         self._by_theta = ekf.uncertainty.effect[rows]  # encoder offsets and tip force
         self.state: State | None = None
         self.measured_ns: int | None = None

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from ctr_dynamics.estimation.step_output import Modes
 from ctr_dynamics.estimation.vibration_modes import ModalBasis, lanes_of, modal_parts
+from ctr_dynamics.kernels.structures import SweepBuffers
 from ctr_dynamics.model.mesh import Key
 from ctr_dynamics.model.mesh_interpolation import Transfer, transfer
 from ctr_dynamics.model.model import Model
@@ -54,7 +55,7 @@ class ModeTracker:
         nodes = self.options.nodes
         self.coarse = model if model.nodes <= nodes else Model(model.robot, nodes, model.base_cells)
         self._interpolations: dict[tuple[Key, Key], Transfer] = {}
-        self._buffers: dict[Key, tuple[Floats, ...]] = {}
+        self._buffers: dict[Key, SweepBuffers] = {}
         self.clear()
 
     def clear(self) -> None:
@@ -137,7 +138,7 @@ class ModeTracker:
             self._interpolation = self._interpolations[pair]
         self._own, self._alpha, self._reused = equilibrium, now.alpha, self.options.most_reused
         if on.key not in self._buffers:
-            self._buffers[on.key] = self.coarse.buffers(on.mesh, 8 * len(lanes_of(self.coarse)))
+            self._buffers[on.key] = self.coarse.sweep_buffers(on.mesh, lanes_of(self.coarse).count)
         self._pending = modal_parts(self.coarse, on, par, now.beta.copy(), self._buffers[on.key])
 
     def _moved(self, equilibrium: Equilibrium, alpha: Floats) -> bool:

@@ -20,7 +20,7 @@ from ctr_dynamics.estimation.monitoring.innovation_log import InnovationLog
 from ctr_dynamics.estimation.open_loop import OpenLoopRun
 from ctr_dynamics.estimation.timeline import DT, seconds
 from ctr_dynamics.model.model import Model
-from ctr_dynamics.model.paired_steps import Pair
+from ctr_dynamics.model.paired_steps import PairedSteps
 from ctr_dynamics.model.simulator import Simulator, StepResult
 from ctr_dynamics.model.time_scheme import make_scheme
 from ctr_dynamics.parameters import Settings
@@ -52,7 +52,7 @@ class Runs:
         scheme = make_scheme(str(settings["model.scheme"]), DT, float(settings["model.alpha"]))
         tolerance = float(settings["model.tolerance"])
         corrected, nominal = Simulator(model, scheme, tolerance), Simulator(model, scheme, tolerance)
-        self._pair = Pair(corrected, nominal)
+        self._pair = PairedSteps(corrected, nominal)
         self._interpolated = InterpolatedInputs(model, inputs)
         load = np.zeros(model.input_count)  # of the robot file
         load[3 * model.n : 3 * model.n + 3] = model.plant.tip_force

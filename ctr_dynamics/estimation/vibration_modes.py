@@ -17,10 +17,11 @@ from scipy.linalg.lapack import dgeev
 
 from ctr_dynamics.estimation.filter.energy_norm import field_weights
 from ctr_dynamics.estimation.step_output import Modes
+from ctr_dynamics.kernels.kinds import Lanes, lanes_for
+from ctr_dynamics.kernels.linearise import linearise
 from ctr_dynamics.kernels.output_rows import modal_coordinates
 from ctr_dynamics.kernels.rotations import matrix
-from ctr_dynamics.kernels.shooting import lanes_for
-from ctr_dynamics.kernels.tangent import linearise
+from ctr_dynamics.kernels.structures import Derivatives, FiniteDifferences, Solution, SweepBuffers
 from ctr_dynamics.model.model import Model
 from ctr_dynamics.model.simulator import Inputs
 from ctr_dynamics.model.statics import Equilibrium
@@ -75,28 +76,28 @@ class ModalBasis:
         return by_fields, by_inputs, by_fields @ self.rest - by_inputs @ self.inputs
 
 
-def lanes_of(model: Model) -> tuple[int, ...]:
-    """Lane tuple of the tangents: the base case and the unknowns, and as many columns as a block has."""
-    return lanes_for(6 + model.n + BLOCK)
+def lanes_of(model: Model) -> Lanes:
+    """Lanes of the tangents: the base case and the unknowns, and as many columns as a block has."""
+    return lanes_for(1 + model.unknown_count + BLOCK)
 
 
 def equilibrium_slope(
-    model: Model, equilibrium: Equilibrium, par: Floats, big: tuple[Floats, ...]
+    model: Model, equilibrium: Equilibrium, par: Floats, buffers: SweepBuffers
 ) -> Floats | None:
-    """d(equilibrium's fields)/d(alpha, beta, force, torque), (fields, 2N + 6); ``big``: buffers of :func:`lanes_of` lanes."""
+    """d(equilibrium's fields)/d(alpha, beta, force, torque), (fields, 2N + 6); ``buffers``: of :func:`lanes_of` lanes."""
     n, layout = model.n, model.layout
     rows = np.concatenate([layout.rows(name) for name in ("alpha", "beta", "force", "torque")])
-    m, count = 5 + n, len(rows)
+    m, count = model.unknown_count, len(rows)
     lanes = lanes_of(model)
-    L = 8 * len(lanes)
-    main, base = len(big[4]) // L, len(big[5]) // L
+    main, base = len(buffers.history) // lanes.count, len(buffers.base_history) // lanes.count
     scale = np.array([1e-2] * n + [1e-4] * n + [1e-4] * 3 + [1e-6] * 3)
     dpar = np.zeros((layout.size, count))
     dpar[rows, range(count)] = scale
     fields, nodes = np.zeros((main + base, count)), np.zeros((equilibrium.nodes.size, count))
     ok = linearise(
-        model.tubes, lanes, equilibrium.mesh, 0.0, par, dpar, equilibrium.x, np.zeros(main), np.zeros(base),
-        np.zeros((main + base, count)), 1e-3, model.tangent_step, big, np.zeros((m, m)), np.zeros((m, count)), fields, nodes,
+        model.kind, lanes, 0.0, equilibrium.mesh, Solution(par, equilibrium.x, np.zeros(main), np.zeros(base)), dpar,
+        np.zeros((main + base, count)), FiniteDifferences(1e-3, model.tangent_perturbation), buffers,
+        Derivatives(np.zeros((m, m)), np.zeros((m, count)), fields, nodes),
     )  # fmt: skip
     return fields / scale if ok else None
 
@@ -104,19 +105,26 @@ def equilibrium_slope(
 class _InverseStep:
     """(1 - h A)^-1 about an equilibrium: the tangent of one backward Euler step.
 
-    ``big``: buffers of :func:`lanes_of` lanes, in use while this is.
+    ``buffers``: of :func:`lanes_of` lanes, in use while this is.
     """
 
-    def __init__(self, model: Model, equilibrium: Equilibrium, par: Floats, big: tuple[Floats, ...]) -> None:
-        self.model, self.equilibrium, self.par, self.big = model, equilibrium, par, big
+    def __init__(self, model: Model, equilibrium: Equilibrium, par: Floats, buffers: SweepBuffers) -> None:
+        self.model, self.equilibrium, self.par, self.buffers = model, equilibrium, par, buffers
         self.lanes = lanes_of(model)
-        L = 8 * len(self.lanes)
-        self.main, base = len(big[4]) // L, len(big[5]) // L
-        self.size, m = self.main + base, 5 + model.n
+        self.main, base = (
+            len(buffers.history) // self.lanes.count,
+            len(buffers.base_history) // self.lanes.count,
+        )
+        self.size, m = self.main + base, model.unknown_count
         self.c0 = 1.0 / SHIFT_STEP
         self.history = -self.c0 * equilibrium.fields
-        self._work = np.zeros((m, m)), np.zeros((m, BLOCK)), np.zeros((self.size, BLOCK))
-        self._nodes = np.zeros((equilibrium.nodes.size, BLOCK))
+        self._differences = FiniteDifferences(1e-3, model.tangent_perturbation)
+        self._found = Derivatives(
+            np.zeros((m, m)),
+            np.zeros((m, BLOCK)),
+            np.zeros((self.size, BLOCK)),
+            np.zeros((equilibrium.nodes.size, BLOCK)),
+        )
 
     def apply(self, columns: Floats, dpar: Floats) -> Floats | None:
         """Fields (fields, 8) after the step from perturbations ``columns`` (fields, 8) with changes ``dpar`` (NP, 8) of the parameters.
@@ -124,12 +132,12 @@ class _InverseStep:
         None where the equilibrium cannot be linearised.
         """
         scale, main, equilibrium = 1e-4, self.main, self.equilibrium
-        inverse, dx, dfields = self._work
+        solution = Solution(self.par, equilibrium.x, self.history[:main], self.history[main:])
         ok = linearise(
-            self.model.tubes, self.lanes, equilibrium.mesh, self.c0, self.par, dpar, equilibrium.x, self.history[:main], self.history[main:],
-            -self.c0 * scale * columns, 1e-3, self.model.tangent_step, self.big, inverse, dx, dfields, self._nodes,
+            self.model.kind, self.lanes, self.c0, equilibrium.mesh, solution, dpar, -self.c0 * scale * columns, self._differences,
+            self.buffers, self._found,
         )  # fmt: skip
-        return dfields / scale if ok else None
+        return self._found.fields / scale if ok else None
 
     def first_loads(self) -> Floats:
         """(NP, 8) parameter changes whose responses begin the Krylov space: a force and a moment on the tip, softer tubes in torsion."""
@@ -161,26 +169,26 @@ def modal_basis(
         count: modes at most.
     """
     found = None
-    big = model.buffers(equilibrium.mesh, 8 * len(lanes_of(model)))
-    for part in modal_parts(model, equilibrium, par, beta, big, count):
+    buffers = model.sweep_buffers(equilibrium.mesh, lanes_of(model).count)
+    for part in modal_parts(model, equilibrium, par, beta, buffers, count):
         found = part
     return found
 
 
 def modal_parts(
-    model: Model, equilibrium: Equilibrium, par: Floats, beta: Floats, big: tuple[Floats, ...], count: int = 4
+    model: Model, equilibrium: Equilibrium, par: Floats, beta: Floats, buffers: SweepBuffers, count: int = 4
 ) -> Iterator[ModalBasis | None]:
     """The work of :func:`modal_basis` in parts of about equal cost, each ended by a None; the last item is the result.
 
-    ``big``: buffers of :func:`lanes_of` lanes, in use until then.
+    ``buffers``: of :func:`lanes_of` lanes, in use until then.
     """
     # 1. How the equilibrium moves with actuators and load.
-    slope = equilibrium_slope(model, equilibrium, par, big)
+    slope = equilibrium_slope(model, equilibrium, par, buffers)
     if slope is None:
         return
     yield None
     # 2. Block Arnoldi.
-    step = _InverseStep(model, equilibrium, par, big)
+    step = _InverseStep(model, equilibrium, par, buffers)
     dpar = step.first_loads()
     block = step.apply(np.zeros((step.size, BLOCK)), dpar)
     if block is None:

@@ -1,31 +1,31 @@
-"""Numba kernels of variances: quadratic forms of rows under the covariance of the coefficients, eight rows side by side in one pack."""
+"""Numba kernels of variances: quadratic forms of rows under the covariance of the coefficients, eight rows side by side in one batch."""
 
 import math
 
 import numpy as np
 
 from ctr_dynamics.kernels.compiler import njit
-from ctr_dynamics.kernels.lanes import PACK, fma
-from ctr_dynamics.kernels.lanes import rows as packs
+from ctr_dynamics.kernels.kinds import ONE_BATCH, SIMD_WIDTH
+from ctr_dynamics.kernels.simd import fma, view
 
 compiled = njit(cache=True, nogil=True, error_model="numpy")
 
 
 @compiled
 def side_by_side(rows, first, lanes):
-    """Fill ``lanes`` (s * 8,) with rows ``first`` to ``first`` + 7 of ``rows`` (k, s), zero where there are none: element p of each in one pack."""
-    count = min(PACK, len(rows) - first)
+    """Fill ``lanes`` (s * 8,) with rows ``first`` to ``first`` + 7 of ``rows`` (k, s), zero where there are none: element p of each in one batch."""
+    count = min(SIMD_WIDTH, len(rows) - first)
     for p in range(rows.shape[1]):
         for lane in range(count):
-            lanes[p * PACK + lane] = rows[first + lane, p]
-        for lane in range(count, PACK):
-            lanes[p * PACK + lane] = 0.0
+            lanes[p * SIMD_WIDTH + lane] = rows[first + lane, p]
+        for lane in range(count, SIMD_WIDTH):
+            lanes[p * SIMD_WIDTH + lane] = 0.0
 
 
 @compiled
 def products(pi, lanes, result):
     """``result`` (s * 8,) = pi times eight rows laid side by side by :func:`side_by_side`, of ``pi`` (at least s, s)."""
-    row, product = packs((0,), lanes, 0, PACK), packs((0,), result, 0, PACK)
+    row, product = view(ONE_BATCH, lanes, 0, SIMD_WIDTH), view(ONE_BATCH, result, 0, SIMD_WIDTH)
     size = len(row)
     whole = size - size % 4
     for p in range(0, whole, 4):  # four sums that do not wait for each other
@@ -47,17 +47,21 @@ def products(pi, lanes, result):
 def variances(rows, pi):
     """(k,) diagonal of rows pi rows^T of ``rows`` (k, s) under ``pi`` (at least s, s)."""
     count, size = rows.shape
-    result, sums = np.zeros(count), np.empty(PACK)
-    lanes, half = np.empty(size * PACK), np.empty(size * PACK)
-    row, product, total = packs((0,), lanes, 0, PACK), packs((0,), half, 0, PACK), packs((0,), sums, 0, PACK)
-    for first in range(0, count if size else 0, PACK):
+    result, sums = np.zeros(count), np.empty(SIMD_WIDTH)
+    lanes, half = np.empty(size * SIMD_WIDTH), np.empty(size * SIMD_WIDTH)
+    row, product, total = (
+        view(ONE_BATCH, lanes, 0, SIMD_WIDTH),
+        view(ONE_BATCH, half, 0, SIMD_WIDTH),
+        view(ONE_BATCH, sums, 0, SIMD_WIDTH),
+    )
+    for first in range(0, count if size else 0, SIMD_WIDTH):
         side_by_side(rows, first, lanes)
         products(pi, lanes, half)
         form = row[0] * product[0]
         for p in range(1, size):
             form = fma(row[p], product[p], form)
         total[0] = form
-        for lane in range(min(PACK, count - first)):
+        for lane in range(min(SIMD_WIDTH, count - first)):
             result[first + lane] = sums[lane]
     return result
 
@@ -66,12 +70,12 @@ def variances(rows, pi):
 def covariance_of(rows, pi, covariance):
     """``covariance`` (k, k) = rows pi rows^T of ``rows`` (k, s), s at least 1, under ``pi`` (at least s, s)."""
     count, size = rows.shape
-    sums, lanes, half = np.empty(PACK), np.empty(size * PACK), np.empty(size * PACK)
-    product, total = packs((0,), half, 0, PACK), packs((0,), sums, 0, PACK)
-    for first in range(0, count, PACK):
+    sums, lanes, half = np.empty(SIMD_WIDTH), np.empty(size * SIMD_WIDTH), np.empty(size * SIMD_WIDTH)
+    product, total = view(ONE_BATCH, half, 0, SIMD_WIDTH), view(ONE_BATCH, sums, 0, SIMD_WIDTH)
+    for first in range(0, count, SIMD_WIDTH):
         side_by_side(rows, first, lanes)
         products(pi, lanes, half)
-        last = min(first + PACK, count)
+        last = min(first + SIMD_WIDTH, count)
         for i in range(last):
             form = product[0] * rows[i, 0]
             for p in range(1, size):

@@ -6,6 +6,7 @@ import numpy as np
 
 from ctr_dynamics.kernels.compiled_rotations import matrix
 from ctr_dynamics.kernels.compiler import njit
+from ctr_dynamics.kernels.layout import field_rows
 from ctr_dynamics.kernels.tracker_measurement import registration_error
 
 compiled = njit(cache=True, nogil=True, error_model="numpy")
@@ -37,7 +38,7 @@ def backbone_rows(s, nodes, fields, points, n, insertion_rate, rotation, bias, d
     ``nodes`` (P, S) states; ``fields`` (fields,) with ``points`` (P,) the point of each node; ``rotation`` (4,) nominal registration, ``bias``
     (13,) tracker states; ``deviation`` (P,) m, the position's per axis (root of the third of its covariance's trace).
     """
-    F = 7 + 2 * n
+    F = field_rows(n).size
     quaternion, shift, _ = registration_error(rotation, bias)
     turn = matrix(quaternion)
     for i in range(len(nodes)):

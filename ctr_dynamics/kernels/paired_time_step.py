@@ -1,115 +1,127 @@
-"""One time step of two simulations in the same sweeps."""
+"""One time step of two runs in the same sweeps."""
 
 import math
 
 import numpy as np
 
-from ctr_dynamics.kernels.batched_shooting import solve_lanes
+from ctr_dynamics.kernels.batched_shooting import solve_cases
 from ctr_dynamics.kernels.compiler import njit
-from ctr_dynamics.kernels.layout import RATE_NOW, RATES, Y_BEFORE, Y_NOW
+from ctr_dynamics.kernels.kinds import Lanes
+from ctr_dynamics.kernels.layout import (
+    RATE_NOW,
+    RATES,
+    Y_BEFORE,
+    Y_NOW,
+    input_row,
+    input_rows,
+    unknown_rows,
+)
 from ctr_dynamics.kernels.sections import section_lengths
-from ctr_dynamics.kernels.time_step import extrapolate, history, remember
-from ctr_dynamics.kernels.workspace import input_row
+from ctr_dynamics.kernels.structures import Cases
+from ctr_dynamics.kernels.time_step import extrapolate, fill_history, remember
 
-PAIR_LANES = (False,) * 4  # lane tuple of a pair: both cases, and a probe of each
+PAIR_LANES = Lanes(4, 4)  # both runs, and a perturbed unknown of each
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def _spread(first, second, target):
-    """The numbers (rows,) of both cases to their lanes of ``target`` (rows, 4), flat."""
+    """The numbers (rows,) of both runs to their lanes of ``target`` (rows, 4), flat."""
     for i in range(len(first)):
         target[4 * i] = target[4 * i + 2] = first[i]
         target[4 * i + 1] = target[4 * i + 3] = second[i]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def _gather(values, first, second):
     """The opposite of :func:`_spread`."""
     for i in range(len(first)):
         first[i], second[i] = values[4 * i], values[4 * i + 1]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def _rates(c0, out, j, hist, rate):
-    """``rate`` (rows,) of the fields of case ``j`` after a stage, c0 out + hist, from its lane of ``out`` (rows, 4), flat."""
+@njit(nogil=True, error_model="numpy")
+def _rates(c0, fields, j, history, rate):
+    """``rate`` (rows,) of the fields of run ``j`` after a stage, c0 y + h, from its lane of ``fields`` (rows, 4), flat."""
     for i in range(len(rate)):
-        rate[i] = c0 * out[4 * i + j] + hist[i]
+        rate[i] = c0 * fields[4 * i + j] + history[i]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def _together(first, second, n):
-    """Whether all inputs (stages, inputs) of both cases are finite, and their translations the same."""
+@njit(nogil=True, error_model="numpy")
+def _compatible(kind, first, second):
+    """Whether all inputs (stages, inputs) of both runs are finite, and their translations the same."""
+    beta = input_rows(kind.tubes).beta
     total = 0.0
     for stage in range(len(first)):
         for i in range(first.shape[1]):
             total += abs(first[stage, i]) + abs(second[stage, i])
-        for i in range(2 * n, 3 * n):
+        for i in range(beta, beta + kind.tubes):
             if first[stage, i] != second[stage, i]:
                 return False
     return math.isfinite(total)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def step_both(tubes, few, mesh, c0, weights, pars, inputs, banks, unknowns, earlier, founds, inverses, usable, work, scale, perturb, tolerance, limit,
-          column, nodes, alive):  # fmt: skip
-    """A step of both cases, as :func:`ctr_dynamics.kernels.time_step.step` for one; returns sweeps, 0 where they cannot go together, and new
+@njit(nogil=True, error_model="numpy")
+def advance_both(kind, mesh, scheme, buffers, runs, inputs, found, usable, column, alive):
+    """A step of both runs, as :func:`ctr_dynamics.kernels.time_step.advance_step` for one; returns sweeps, 0 where they cannot go together, and new
     Jacobians.
 
-    ``work``: buffers of the four lanes, of one for a Jacobian, of the Jacobian's lanes, and (2, fields) for histories. ``column``: the unknown to
-    probe first. ``nodes``: states at the nodes (nodes, S) of both. ``alive`` (2,): set; False where a case does not converge, and then
-    nothing else has changed."""
+    ``buffers``: :class:`~ctr_dynamics.kernels.structures.PairBuffers`; ``runs``: two :class:`~ctr_dynamics.kernels.structures.RunArrays`;
+    ``inputs``: two arrays (stages, inputs); ``found`` (2, stages, 5 + N): unknowns at the stages; ``usable``: whether each inverse Jacobian is.
+    ``column``: the unknown to perturb first. ``alive`` (2,): set; False where a run does not converge, and then nothing else has changed.
+    """
     alive[:] = True
     first, second = inputs
-    if not _together(first, second, len(tubes)):
+    if not _compatible(kind, first, second):
         return 0, 0
-    big, one, eight, h = work
-    par, seclen, hist, histb, out, outb = big[1], big[2], big[4], big[5], big[6], big[7]
-    n, stages, m, main = len(tubes), len(c0), len(scale), len(big[4]) // 4
-    x, sweeps, jacobians, spent = np.empty(2 * m), 0, 0, np.zeros(2, np.int64)
-    guess, inverse = np.empty((2, stages, m)), np.empty((2, m, m))
+    c0, weights = scheme
+    batch, solver, h = buffers.batch, buffers.solver, buffers.histories
+    n, stages, m, main = kind.tubes, len(c0), unknown_rows(kind.tubes).size, len(batch.history) // 4
+    beta = input_rows(n).beta
+    sweeps, jacobians = 0, 0
+    guess = np.empty((2, stages, m))
     lengths = np.empty(len(mesh.sec_cells))
-    fresh = np.empty(2, np.bool_)
-    _spread(pars[0], pars[1], par)
+    cases = Cases(np.empty(2 * m), np.empty((2, m, m)), np.empty(2, np.bool_), alive, np.zeros(2, np.int64))
+    x = cases.unknowns
+    par = batch.parameters
+    _spread(runs[0].parameters, runs[1].parameters, par)
     for j in range(2):
-        inverse[j], fresh[j] = inverses[j], not usable[j]
-        extrapolate(unknowns[j], earlier[j], perturb, guess[j])
+        cases.inverse[j], cases.fresh[j] = runs[j].inverse, not usable[j]
+        extrapolate(runs[j].unknowns, runs[j].earlier, solver.options.perturbation, guess[j])
     for stage in range(stages):
         for j in range(2):
-            history(weights[stage], banks[j], h[j, :main], h[j, main:])
-        _spread(h[0, :main], h[1, :main], hist)
-        _spread(h[0, main:], h[1, main:], histb)
+            fill_history(weights[stage], runs[j].bank, h[j, :main], h[j, main:])
+        _spread(h[0, :main], h[1, :main], batch.history)
+        _spread(h[0, main:], h[1, main:], batch.base_history)
         for i in range(first.shape[1]):
-            row = 4 * input_row(tubes, i)
+            row = 4 * input_row(n, i)
             par[row] = par[row + 2] = first[stage, i]
             par[row + 1] = par[row + 3] = second[stage, i]
-        section_lengths(mesh.bp_tube, mesh.bp_offset, first[stage, 2 * n : 3 * n], lengths)
-        _spread(lengths, lengths, seclen)
+        section_lengths(mesh.bp_tube, mesh.bp_offset, first[stage, beta : beta + n], lengths)
+        _spread(lengths, lengths, batch.section_lengths)
         for j in range(2):
             for i in range(m):
                 # what the guess missed at the stage before, it misses here too
                 x[2 * i + j] = guess[j, stage, i] + (
-                    founds[j, stage - 1, i] - guess[j, stage - 1, i] if stage else 0.0
+                    found[j, stage - 1, i] - guess[j, stage - 1, i] if stage else 0.0
                 )
-        plain, renewed, column = solve_lanes(tubes, PAIR_LANES, few, mesh, c0[stage], big, one, eight, x, inverse, fresh, alive, scale, perturb,
-                                             tolerance, limit, spent, column)  # fmt: skip
+        plain, renewed, column = solve_cases(kind, PAIR_LANES, c0[stage], mesh, batch, solver, cases, column)
         sweeps += plain
         jacobians += renewed
         if not (alive[0] and alive[1]):
             return sweeps, jacobians
         for j in range(2):
-            _rates(c0[stage], out, j, h[j, :main], banks[j][RATES + stage, :main])
-            _rates(c0[stage], outb, j, h[j, main:], banks[j][RATES + stage, main:])
+            _rates(c0[stage], batch.fields, j, h[j, :main], runs[j].bank[RATES + stage, :main])
+            _rates(c0[stage], batch.base_fields, j, h[j, main:], runs[j].bank[RATES + stage, main:])
             for i in range(m):
-                founds[j, stage, i] = x[2 * i + j]
+                found[j, stage, i] = x[2 * i + j]
     for j in range(2):
-        inverses[j][:] = inverse[j]
+        runs[j].inverse[:] = cases.inverse[j]
         for i in range(inputs[j].shape[1]):
-            pars[j][input_row(tubes, i)] = inputs[j][stages - 1, i]
-        banks[j][Y_BEFORE] = banks[j][Y_NOW]
-        remember(unknowns[j], earlier[j], founds[j])
-    _gather(out, banks[0][Y_NOW, :main], banks[1][Y_NOW, :main])
-    _gather(outb, banks[0][Y_NOW, main:], banks[1][Y_NOW, main:])
+            runs[j].parameters[input_row(n, i)] = inputs[j][stages - 1, i]
+        runs[j].bank[Y_BEFORE] = runs[j].bank[Y_NOW]
+        remember(runs[j].unknowns, runs[j].earlier, found[j])
+    _gather(batch.fields, runs[0].bank[Y_NOW, :main], runs[1].bank[Y_NOW, :main])
+    _gather(batch.base_fields, runs[0].bank[Y_NOW, main:], runs[1].bank[Y_NOW, main:])
     for j in range(2):
-        banks[j][RATE_NOW] = banks[j][RATES + stages - 1]
-    _gather(big[8], nodes[0].reshape(-1), nodes[1].reshape(-1))
+        runs[j].bank[RATE_NOW] = runs[j].bank[RATES + stages - 1]
+    _gather(batch.nodes, runs[0].nodes.reshape(-1), runs[1].nodes.reshape(-1))
     return sweeps, jacobians

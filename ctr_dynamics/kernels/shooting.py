@@ -1,82 +1,93 @@
-"""Shooting: Newton's method on the tip's imbalance, with the Jacobian from perturbed lanes of one sweep and Broyden updates between."""
+"""Shooting: Newton's method on the residual of a sweep, with the Jacobian from perturbed lanes of one sweep and Broyden updates between."""
 
 import math
 
 import numpy as np
 
 from ctr_dynamics.kernels.compiler import njit
-from ctr_dynamics.kernels.lanes import PACK
-from ctr_dynamics.kernels.rod import sweep
+from ctr_dynamics.kernels.kinds import ONE_LANE, SIMD_WIDTH, unknown_lanes
+from ctr_dynamics.kernels.layout import (
+    base_field_count,
+    field_rows,
+    parameter_rows,
+    state_rows,
+    unknown_rows,
+    workspace_rows,
+)
 from ctr_dynamics.kernels.sections import section_lengths
-from ctr_dynamics.kernels.workspace import base_rows, field_rows, lane_count, parameter_rows, state_rows
+from ctr_dynamics.kernels.structures import SweepBuffers
+from ctr_dynamics.kernels.sweep import sweep
 
 CONVERGED, STALLED, NOT_FINITE = 0, 1, 2
 
 
-@njit(cache=True, nogil=True)
-def scaled_norm(res, scale):
-    """Largest scaled imbalance; infinity where anything is not finite."""
+@njit(nogil=True)
+def scaled_norm(residual, scale):
+    """Largest scaled residual; infinity where anything is not finite."""
     worst = 0.0
     for i in range(len(scale)):
-        value = abs(res[i]) / scale[i]
+        value = abs(residual[i]) / scale[i]
         if not math.isfinite(value):
             return math.inf
         worst = max(worst, value)
     return worst
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def broadcast(lanes, source, target):
     """Copy every number of ``source`` (rows,) to all lanes of ``target`` (rows, L), both flat."""
-    L = np.uint64(lane_count(lanes))
+    L = np.uint64(lanes.count)
     for r in range(np.uint64(len(source))):
         value, start = source[r], r * L
         for j in range(L):
             target[start + j] = value
 
 
-@njit(cache=True, nogil=True)
-def lane_lengths(tubes, lanes, mesh, par, seclen):
-    """Section lengths of every lane at the translations in its parameters ``par`` (rows * L,), into ``seclen`` (sections * L,)."""
-    n, L = len(tubes), lane_count(lanes)
+@njit(nogil=True)
+def lane_lengths(kind, lanes, mesh, parameters, lengths):
+    """Section lengths of every lane at the translations in its ``parameters`` (NP, L), into ``lengths`` (sections, L), both flat."""
+    n, L, beta = kind.tubes, lanes.count, parameter_rows(kind.tubes).beta
     sections = len(mesh.sec_cells)
-    beta, lengths = np.empty(n), np.empty(sections)
+    given, found = np.empty(n), np.empty(sections)
     for j in range(L):
         for i in range(n):
-            beta[i] = par[(13 * n + i) * L + j]
-        section_lengths(mesh.bp_tube, mesh.bp_offset, beta, lengths)
+            given[i] = parameters[(beta + i) * L + j]
+        section_lengths(mesh.bp_tube, mesh.bp_offset, given, found)
         for k in range(sections):
-            seclen[k * L + j] = lengths[k]
+            lengths[k * L + j] = found[k]
 
 
-@njit(cache=True, nogil=True)
-def jacobian(tubes, lanes, mesh, c0, par, seclen, x, hist, histb, big, step, inverse):
-    """Inverse of d(imbalance)/dx at ``x`` by one sweep of perturbed lanes into ``inverse`` (m, m); False if it is singular or not finite.
+@njit(nogil=True)
+def jacobian(kind, c0, mesh, single, x, b, perturbation, inverse):
+    """Inverse of d(residual)/dx at ``x`` by one sweep of perturbed lanes into ``inverse`` (m, m); False if it is singular or not finite.
 
-    The imbalance at ``x`` itself stays in the first lane of the last buffer of ``big``.
+    ``single``: buffers of one lane with parameters, lengths and histories. ``b``: those of the perturbed lanes; the residual at ``x`` itself stays in
+    the first lane of theirs.
     """
-    L = lane_count(lanes)
-    m = len(x)
-    W, parL, seclenL, xL, _, histbL, outL, outbL, nodesL, resL = big
-    broadcast(lanes, par, parL)
-    broadcast(lanes, seclen, seclenL)
-    broadcast(lanes, x, xL)
-    broadcast(lanes, histb, histbL)
+    lanes = unknown_lanes(kind)
+    L, m = lanes.count, len(x)
+    broadcast(lanes, single.parameters, b.parameters)
+    broadcast(lanes, single.section_lengths, b.section_lengths)
+    broadcast(lanes, x, b.unknowns)
+    broadcast(lanes, single.base_history, b.base_history)
     for i in range(m):
-        xL[i * L + i + 1] += step[i]
-    sweep(tubes, lanes, W, c0, mesh,
-          parL, seclenL, xL, hist, histbL, outL[:0], outbL, nodesL[:0], resL)  # fmt: skip
+        b.unknowns[i * L + i + 1] += perturbation[i]
+    shared = SweepBuffers(
+        b.workspace, b.parameters, b.section_lengths, b.unknowns, single.history, b.base_history, b.fields[:0],
+        b.base_fields, b.nodes[:0], b.residual,
+    )  # fmt: skip
+    sweep(kind, lanes, c0, mesh, shared)
     matrix = np.empty((m, m))
     for i in range(m):
         for k in range(m):
-            value = (resL[i * L + k + 1] - resL[i * L]) / step[k]
+            value = (b.residual[i * L + k + 1] - b.residual[i * L]) / perturbation[k]
             if not math.isfinite(value):
                 return False
             matrix[i, k] = value
     return invert(matrix, inverse)
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def invert(matrix, inverse):
     """Inverse by Gauss-Jordan elimination with partial pivoting and row scaling; False if singular. Destroys ``matrix``."""
     m = matrix.shape[0]
@@ -117,10 +128,10 @@ def invert(matrix, inverse):
     return True
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def broyden(inverse, dx, dr, work):
     """Broyden's update of the inverse Jacobian (m, m) in place, (dx - inv dr) dx^T inv / (dx^T inv dr), after x moved by ``dx`` and the
-    imbalance by ``dr`` (m,). ``work`` (2, m) is written to."""
+    residual by ``dr`` (m,). ``work`` (2, m) is written to."""
     m = len(dx)
     product, left = work[0], work[1]
     product[:] = 0.0
@@ -139,55 +150,37 @@ def broyden(inverse, dx, dr, work):
                 inverse[i, k] += g * left[k]
 
 
-@njit(cache=True, nogil=True)
-def solve(
-    tubes,
-    lane,
-    lanes,
-    mesh,
-    c0,
-    par,
-    seclen,
-    x,
-    hist,
-    histb,
-    small,
-    big,
-    scale,
-    step,
-    inverse,
-    fresh,
-    tolerance,
-    limit,
-):
-    """Find the unknowns ``x`` (m,) at which the tip is in balance; ``x`` and ``inverse`` are updated in place.
+@njit(nogil=True)
+def solve(kind, c0, mesh, solver, x, inverse, fresh):
+    """Find the unknowns ``x`` (m,) at which the residual vanishes; ``x`` and ``inverse`` are updated in place.
 
-    ``small`` and ``big`` are the buffers of one lane and of the Jacobian's lanes; ``scale`` (m,) the unit of each imbalance, ``step`` (m,)
-    the perturbation of each unknown; ``fresh`` False if ``inverse`` holds a usable inverse Jacobian of an earlier solve.
+    ``solver``: :class:`~ctr_dynamics.kernels.structures.ShootingSolver`, with parameters, lengths and histories in its buffers of one lane, where the
+    fields and nodes of the solution are left. ``fresh`` False if ``inverse`` holds a usable inverse Jacobian of an earlier solve.
     Returns (outcome, iterations, plain sweeps, Jacobian sweeps).
     """
     m = len(x)
-    W, out, outb, nodes, res = small
-    trial = np.empty(m)
+    single, wide = solver.single, solver.jacobian
+    scale, perturbation, tolerance, limit = solver.options
+    trial, res = single.unknowns, single.residual
     dx = np.empty(m)
     previous = np.empty(m)
     work = np.empty((2, m))
     sweeps, jacobians = 0, 0
     newest = False
-    L = lane_count(lanes)
+    L = unknown_lanes(kind).count
     if fresh:
-        if not jacobian(tubes, lanes, mesh, c0, par, seclen, x, hist, histb, big, step, inverse):
+        if not jacobian(kind, c0, mesh, single, x, wide, perturbation, inverse):
             return NOT_FINITE, 0, 0, 1
         jacobians += 1
         newest = True
         for i in range(m):
-            res[i] = big[9][i * L]
+            res[i] = wide.residual[i * L]
         norm = scaled_norm(res, scale)
     else:
         norm = math.inf
     if norm <= tolerance or not fresh:  # the fields belong to the last plain sweep
-        sweep(tubes, lane, W, c0, mesh,
-              par, seclen, x, hist, histb, out, outb, nodes, res)  # fmt: skip
+        trial[:] = x
+        sweep(kind, ONE_LANE, c0, mesh, single)
         sweeps += 1
         norm = scaled_norm(res, scale)
     for iteration in range(limit):
@@ -205,8 +198,7 @@ def solve(
         while True:
             for i in range(m):
                 trial[i] = x[i] + factor * dx[i]
-            sweep(tubes, lane, W, c0, mesh,
-                  par, seclen, trial, hist, histb, out, outb, nodes, res)  # fmt: skip
+            sweep(kind, ONE_LANE, c0, mesh, single)
             sweeps += 1
             best = scaled_norm(res, scale)
             if best < (1.0 - 0.1 * factor) * norm or not newest or factor < 1e-3:
@@ -227,49 +219,38 @@ def solve(
                 return CONVERGED, iteration + 1, sweeps, jacobians
             if not slow:
                 continue
-        if not jacobian(tubes, lanes, mesh, c0, par, seclen, x, hist, histb, big, step, inverse):
+        if not jacobian(kind, c0, mesh, single, x, wide, perturbation, inverse):
             return NOT_FINITE, iteration, sweeps, jacobians
         jacobians += 1
         newest = True
-        if best >= norm:  # the trial was rejected: res belongs to it, so evaluate at x again
-            sweep(tubes, lane, W, c0, mesh,
-                  par, seclen, x, hist, histb, out, outb, nodes, res)  # fmt: skip
+        if best >= norm:  # the trial was rejected: the residual belongs to it, so evaluate at x again
+            trial[:] = x
+            sweep(kind, ONE_LANE, c0, mesh, single)
             sweeps += 1
             norm = scaled_norm(res, scale)
     return STALLED, limit, sweeps, jacobians
 
 
-def lanes_for(count: int) -> tuple[int, ...]:
-    """A lane tuple with room for ``count`` lanes: one, or a multiple of the vector width."""
-    return () if count == 1 else (0,) * math.ceil(count / 8)
-
-
-def lanes_free(count: int) -> int:
-    """Lanes that a sweep with ``count`` lanes has beside them."""
-    return max(1, 8 * len(lanes_for(count))) - count
-
-
 def aligned_zeros(size: int) -> np.ndarray:
-    """Zeros that begin with a line of the cache, so that every pack of lanes lies in one line."""
-    block = np.zeros(size + PACK - 1)
-    first = -block.ctypes.data % (8 * PACK) // 8
+    """Zeros that begin with a line of the cache, so that every batch of lanes lies in one line."""
+    block = np.zeros(size + SIMD_WIDTH - 1)
+    first = -block.ctypes.data % (8 * SIMD_WIDTH) // 8
     return block[first : first + size]
 
 
-def buffers(n: int, mesh, points: int, nodes: int, lanes: int, rows: int):
-    """Zeroed buffers of a sweep with ``lanes`` lanes: (W, par, seclen, x, hist, histb, out, outb, nodes, res), flat."""
-    S, F = state_rows(n), field_rows(n)
-    base = base_rows(n, mesh.base_cells)
-    sizes = (
-        rows,
-        parameter_rows(n),
-        len(mesh.sec_cells),
-        5 + n,
-        points * F,
-        base,
-        points * F,
-        base,
-        nodes * S,
-        5 + n,
+def sweep_buffers(n, mesh, points, nodes, lanes):
+    """Zeroed :class:`SweepBuffers` for ``lanes`` lanes, of a mesh with so many ``points`` and ``nodes``."""
+    base = base_field_count(n, mesh.base_cells)
+    sizes = SweepBuffers(
+        workspace=workspace_rows(n).size,
+        parameters=parameter_rows(n).size,
+        section_lengths=len(mesh.sec_cells),
+        unknowns=unknown_rows(n).size,
+        history=points * field_rows(n).size,
+        base_history=base,
+        fields=points * field_rows(n).size,
+        base_fields=base,
+        nodes=nodes * state_rows(n).size,
+        residual=unknown_rows(n).size,
     )
-    return tuple(aligned_zeros(size * lanes) for size in sizes)
+    return SweepBuffers(*(aligned_zeros(size * lanes) for size in sizes))

@@ -3,6 +3,7 @@
 import numpy as np
 
 from ctr_dynamics.kernels.compiler import njit
+from ctr_dynamics.kernels.layout import input_rows
 
 compiled = njit(cache=True, nogil=True, error_model="numpy")
 
@@ -24,9 +25,10 @@ def on_lines(values, time_ns, value, rate):
 def stage_rows(times, t0_ns, joints, load, rows, beta_rate):
     """Fill ``rows`` (stages, inputs) and ``beta_rate`` (N,) at ``times`` (s after ``t0_ns``) from the values around them; see :func:`on_lines`.
 
-    The order in a row is that of :func:`ctr_dynamics.model.simulator.stage_inputs`.
+    The order in a row is that of :data:`ctr_dynamics.kernels.layout.INPUTS`.
     """
     n = len(beta_rate)
+    given = input_rows(n)
     value, rate = np.empty(2 * n), np.empty(2 * n)
     wrench, change = np.empty(6), np.empty(6)
     for k in range(len(times)):
@@ -34,11 +36,12 @@ def stage_rows(times, t0_ns, joints, load, rows, beta_rate):
         on_lines(joints, time_ns, value, rate)
         on_lines(load, time_ns, wrench, change)
         for i in range(n):
-            rows[k, i], rows[k, n + i], rows[k, 2 * n + i] = value[i], rate[i], value[n + i]
-        for i in range(6):
-            rows[k, 3 * n + i] = wrench[i]
-        for i in range(rows.shape[1] - 3 * n - 6):
-            rows[k, 3 * n + 6 + i] = rate[n + i]
+            rows[k, given.alpha + i], rows[k, given.alpha_rate + i] = value[i], rate[i]
+            rows[k, given.beta + i] = value[n + i]
+        for i in range(6):  # force and torque
+            rows[k, given.force + i] = wrench[i]
+        for i in range(rows.shape[1] - given.beta_rate):
+            rows[k, given.beta_rate + i] = rate[n + i]
     beta_rate[:] = rate[n:]
 
 

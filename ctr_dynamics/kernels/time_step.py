@@ -3,18 +3,23 @@
 import numpy as np
 
 from ctr_dynamics.kernels.compiler import njit
-from ctr_dynamics.kernels.layout import RATE_NOW, RATES, Y_BEFORE, Y_NOW
+from ctr_dynamics.kernels.layout import (
+    RATE_NOW,
+    RATES,
+    Y_BEFORE,
+    Y_NOW,
+    input_row,
+    parameter_rows,
+    unknown_rows,
+)
 from ctr_dynamics.kernels.sections import section_lengths
 from ctr_dynamics.kernels.shooting import CONVERGED, solve
-from ctr_dynamics.kernels.workspace import input_row
 
 RENEW = 2  # sweeps a stage beyond which the next step starts with a new Jacobian, which costs two
-
-
 EARLIER = 4  # steps whose unknowns are kept to start the next one from
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def extrapolate(unknowns, earlier, unit, guess):
     """Start of the next step, stage by stage, into ``guess`` (stages, m): the straight line, parabola or cubic through the last steps'
     ``unknowns`` (stages, m) and ``earlier`` (EARLIER, stages, m), whichever would have met the last step best.
@@ -46,7 +51,7 @@ def extrapolate(unknowns, earlier, unit, guess):
                 guess[j, i] = 4.0 * (y0 + y2) - 6.0 * y1 - y3
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def remember(unknowns, earlier, found):
     """After a step: ``found`` become the ``unknowns``, and those the newest of the ``earlier``."""
     for i in range(EARLIER - 1, 0, -1):
@@ -55,47 +60,47 @@ def remember(unknowns, earlier, found):
     unknowns[:] = found
 
 
-@njit(cache=True, nogil=True)
-def history(weights, bank, hist, histb):
-    """h = sum of weights (slots,) times the stored fields ``bank`` (slots, fields), into the main and the base part."""
-    main = len(hist)
-    hist[:] = 0.0
-    histb[:] = 0.0
+@njit(nogil=True)
+def fill_history(weights, bank, history, base_history):
+    """h = sum of ``weights`` (slots,) times the stored fields ``bank`` (slots, fields), into the main and the base part."""
+    main = len(history)
+    history[:] = 0.0
+    base_history[:] = 0.0
     for slot in range(len(weights)):
         w = weights[slot]
         if w != 0.0:
             for i in range(main):
-                hist[i] += w * bank[slot, i]
-            for i in range(len(histb)):
-                histb[i] += w * bank[slot, main + i]
+                history[i] += w * bank[slot, i]
+            for i in range(len(base_history)):
+                base_history[i] += w * bank[slot, main + i]
 
 
-@njit(cache=True, nogil=True)
-def step(tubes, lane, lanes, mesh, c0, weights, par, inputs, bank, guess, found, inverse, fresh, small, big, scale, perturb,
-         tolerance, limit):  # fmt: skip
+@njit(nogil=True)
+def advance_step(kind, mesh, scheme, solver, inputs, guess, found, bank, inverse, fresh):
     """Advance the stored fields ``bank`` by one step.
 
-    ``inputs`` (stages, 3N + 6): alpha, alpha rate, beta of every tube, tip force and torque, at the stage times. ``guess`` and ``found``
-    (stages, 5 + N): unknowns to start from and those found. On failure ``bank`` is as it was before the step.
-    Returns (outcome, iterations, plain sweeps, Jacobian sweeps).
+    ``scheme``: :class:`~ctr_dynamics.kernels.structures.StageCoefficients`. ``inputs`` (stages, inputs): see
+    :data:`ctr_dynamics.kernels.layout.INPUTS`, at the stage times; they are written to the parameters in the solver's buffers. ``guess`` and
+    ``found`` (stages, 5 + N): unknowns to start from and those found. ``inverse``, ``fresh``: see :func:`~ctr_dynamics.kernels.shooting.solve`.
+    On failure ``bank`` is as it was before the step. Returns (outcome, iterations, plain sweeps, Jacobian sweeps).
     """
-    n = len(tubes)
+    n = kind.tubes
+    m, beta = unknown_rows(n).size, parameter_rows(n).beta
+    c0, weights = scheme
     stages = len(c0)
-    W, seclen, hist, histb, out, outb, nodes, res = small
-    x = np.empty(5 + n)
+    b = solver.single
+    par, hist, histb, out, outb = b.parameters, b.history, b.base_history, b.fields, b.base_fields
+    x = np.empty(m)
     iterations, sweeps, jacobians = 0, 0, 0
     for stage in range(stages):
-        history(weights[stage], bank, hist, histb)
+        fill_history(weights[stage], bank, hist, histb)
         for i in range(inputs.shape[1]):
-            par[input_row(tubes, i)] = inputs[stage, i]
-        section_lengths(mesh.bp_tube, mesh.bp_offset, par[13 * n : 14 * n], seclen)
-        for i in range(5 + n):
+            par[input_row(n, i)] = inputs[stage, i]
+        section_lengths(mesh.bp_tube, mesh.bp_offset, par[beta : beta + n], b.section_lengths)
+        for i in range(m):
             # what the guess missed at the stage before, it misses here too
             x[i] = guess[stage, i] + (found[stage - 1, i] - guess[stage - 1, i] if stage else 0.0)
-        outcome, its, plain, jacs = solve(
-            tubes, lane, lanes, mesh, c0[stage], par, seclen, x, hist, histb, (W, out, outb, nodes, res), big, scale, perturb,
-            inverse, fresh, tolerance, limit,
-        )  # fmt: skip
+        outcome, its, plain, jacs = solve(kind, c0[stage], mesh, solver, x, inverse, fresh)
         fresh = False
         iterations += its
         sweeps += plain
@@ -108,7 +113,7 @@ def step(tubes, lane, lanes, mesh, c0, weights, par, inputs, bank, guess, found,
             rate[i] = c0[stage] * out[i] + hist[i]
         for i in range(len(histb)):
             rate[main + i] = c0[stage] * outb[i] + histb[i]
-        for i in range(5 + n):
+        for i in range(m):
             found[stage, i] = x[i]
     main = len(hist)
     for i in range(main + len(histb)):

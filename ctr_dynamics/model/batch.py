@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 
 from ctr_dynamics.errors import InputError
 from ctr_dynamics.kernels.batched_steps import advance_batch
-from ctr_dynamics.kernels.layout import RATES
-from ctr_dynamics.kernels.shooting import lanes_for
+from ctr_dynamics.kernels.kinds import lanes_for
+from ctr_dynamics.kernels.layout import RATES, input_rows
+from ctr_dynamics.kernels.structures import Cases, RunArrays
 from ctr_dynamics.kernels.time_step import EARLIER
 from ctr_dynamics.model.model import Model
 from ctr_dynamics.model.simulator import Inputs, Simulator, State
@@ -86,9 +87,9 @@ def _batch(
     width: int,
 ) -> list[Trajectory | None]:
     """Trajectories of at most ``width`` cases; None for those that have to be simulated alone."""
-    n, m, stages, dt = model.n, 5 + model.n, scheme.stages, scheme.dt
-    lanes = lanes_for(width) if width > 1 else ()
-    L = max(1, 8 * len(lanes))
+    n, m, stages, dt = model.n, model.unknown_count, scheme.stages, scheme.dt
+    lanes = lanes_for(width)
+    L = lanes.count
     starts: list[State | None] = []
     for block, rows in zip(parameters, inputs, strict=True):
         first = to_inputs(n, rows(np.zeros(1))[0])
@@ -107,16 +108,19 @@ def _batch(
     number = starts.index(leader)
     source = [j if usable[j] else number for j in range(L)]
     mesh = leader.mesh
-    big = model.buffers(mesh, L)
-    big[1][:] = np.stack([parameters[j] for j in source], axis=1).ravel()
+    batch, solver = model.sweep_buffers(mesh, L), model.shooting_solver(mesh, tolerance, limit=LIMIT)
+    batch.parameters[:] = np.stack([parameters[j] for j in source], axis=1).ravel()
     bank = np.stack([s.bank for s in own], axis=2).reshape(RATES + stages, -1)
     unknowns = np.stack([s.unknowns for s in own], axis=2).reshape(stages, -1)
-    earlier = np.stack([unknowns] * EARLIER)
-    inverse, alive, fresh = np.zeros((L, m, m)), usable.copy(), np.ones(L, bool)
-    one = tuple(model.buffers(mesh, 1)[i] for i in (1, 2, 3, 4, 5))
-    few = model.jacobian_lanes
-    eight = model.buffers(mesh, 8 * len(few))
-    unit = np.repeat(model.step, L)
+    nothing = np.zeros((0, 0))  # the parameters, Jacobians and nodes of the cases lie elsewhere
+    run_arrays = RunArrays(
+        nothing[0:0].ravel(), bank, unknowns, np.stack([unknowns] * EARLIER), nothing, nothing
+    )
+    cases = Cases(
+        np.empty(m * L), np.zeros((L, m, m)), np.ones(L, bool), usable.copy(), np.zeros(L, np.int64)
+    )
+    alive = cases.alive
+    unit = np.repeat(model.perturbation, L)
     steps = int(np.floor(duration / dt + 1e-9))
     tips = np.zeros((steps + 1, TIP_ROWS, L))
     tips[0] = np.stack([s.nodes[-1, :TIP_ROWS] for s in own], axis=1)
@@ -126,14 +130,13 @@ def _batch(
         times = (np.arange(k, k + count)[:, None] + scheme.times) * dt
         given = [rows(times.ravel()).reshape(count, stages, -1) for rows in inputs]
         for j in range(len(inputs)):
-            beta = given[j][:, -1, 2 * n : 3 * n]
+            beta = given[j][:, -1, input_rows(n)["beta"]]
             moves = not np.all(beta == own[j].inputs.beta)
             if moves and (model.moving_precurvature or while_fitting(model, leader.key, beta) < count):
                 alive[j] = False
         rows_now = np.stack([given[j] for j in source], axis=3)
         sweeps += advance_batch(
-            model.tubes, lanes, few, mesh, scheme.c0, scheme.weights, rows_now, bank, unknowns, earlier, inverse, fresh, alive, big, one, eight,
-            model.scale, model.step, unit, tolerance, LIMIT, tips[k + 1 : k + 1 + count],
+            model.kind, lanes, mesh, scheme.coefficients, batch, solver, rows_now, run_arrays, unit, cases, tips[k + 1 : k + 1 + count]
         )  # fmt: skip
         if not alive.any():
             break

@@ -14,7 +14,8 @@ from typing import NamedTuple
 import numpy as np
 
 from ctr_dynamics.errors import InputError
-from ctr_dynamics.kernels.sections import Mesh, section_lengths
+from ctr_dynamics.kernels.sections import section_lengths
+from ctr_dynamics.kernels.structures import Mesh
 
 STAGES = 4  # Runge-Kutta stages a cell, each with its own history
 _STAGE_XI = (0.0, 0.5, 0.5, 1.0)

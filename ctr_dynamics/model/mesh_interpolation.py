@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.sparse import block_diag, csr_array, eye_array, kron
 
-from ctr_dynamics.kernels.workspace import base_rows
+from ctr_dynamics.kernels.layout import base_field_count, field_rows
 from ctr_dynamics.model.mesh import STAGES, Key, Mesh
 
 _STAGE_XI = np.array([0.0, 0.5, 0.5, 1.0])
@@ -34,8 +34,8 @@ def coarse_key(key: Key, nodes: int) -> Key:
 
 def transfer(n: int, fine: Mesh, coarse: Mesh) -> Transfer:
     """Cubic interpolation inside each section, between the points that are nodes; fields behind the plate are the same on both meshes."""
-    F = 7 + 2 * n
-    base = base_rows(n, fine.base_cells)
+    F = field_rows(n).size
+    base = base_field_count(n, fine.base_cells)
     return Transfer(
         _fields(fine.sec_cells, coarse.sec_cells, F, base),
         _fields(coarse.sec_cells, fine.sec_cells, F, base),

@@ -5,8 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from ctr_dynamics.effects import make_plant
-from ctr_dynamics.kernels.shooting import buffers, lanes_for
-from ctr_dynamics.kernels.workspace import workspace_rows
+from ctr_dynamics.kernels.kinds import Physics, RobotKind, unknown_lanes
+from ctr_dynamics.kernels.layout import input_rows, unknown_rows
+from ctr_dynamics.kernels.shooting import sweep_buffers
+from ctr_dynamics.kernels.structures import ShootingOptions, ShootingSolver, SweepBuffers
 from ctr_dynamics.model.mesh import (
     Key,
     Mesh,
@@ -21,6 +23,7 @@ from ctr_dynamics.model.mesh import (
 from ctr_dynamics.robot import Robot
 
 LOAD_SLOPE_LIMIT = 0.02  # of the force and moment that bend the robot
+SHOOTING_ITERATIONS = 40
 
 
 class Model:
@@ -40,14 +43,14 @@ class Model:
 
     Attributes:
         n: number of tubes; tube 1 is the innermost.
-        tubes, lane: tuples whose lengths tell the compiler the tube count and one lane; ``tubes`` holds floats for the extended kernels.
-        extended: whether those are in use: when the robot file names an extension that changes the physics.
-        jacobian_lanes: lanes of the Jacobian's sweep.
+        extended: whether the extended physics is in use: when the robot file names an extension that needs it.
+        kind: number of tubes and physics, for the compiler.
         layout: rows of the parameter block.
         plant: the robot file with its extensions. parameters: (NP,) its block; actuators and tip wrench are 0.
-        scale: (5 + N,) N and N m, unit of each shooting residual; step: (5 + N,) perturbation of each unknown for Newton's
-            method; tangent_step: a much smaller one, for tangents: strong friction between tubes bends the residual, and errors of a tangent grow
-            from step to step.
+        scale: (5 + N,) N and N m, unit of each shooting residual.
+        perturbation: (5 + N,) finite-difference perturbation of each unknown for Newton's method.
+        tangent_perturbation: a much smaller one, for tangents: strong friction between tubes makes the residual nonlinear, and errors of a tangent
+            grow from step to step.
         load_slope_limit: (6,) N and N m: a change of a load's slope that adds more than this within a step is worth dividing the step.
         nodes: requested nodes from plate to tip.
     """
@@ -55,8 +58,6 @@ class Model:
     def __init__(self, robot: Robot, nodes: int = 24, base_cells: int = 4, extended: bool = False) -> None:
         self.robot = robot
         self.n = n = robot.n_tubes
-        self.lane = ()
-        self.jacobian_lanes = lanes_for(6 + n)
         self.plant = make_plant(robot)
         self.layout, self.parameters = self.plant.layout, self.plant.block
         self.nodes = nodes
@@ -71,14 +72,14 @@ class Model:
             for tube in robot.tubes
         )
         self.extended = extended or self.plant.extended
-        self.tubes: tuple[float, ...] = (0.0,) * n if self.extended else (0,) * n
+        self.kind = RobotKind(n, Physics.EXTENDED if self.extended else Physics.PLAIN)
         reach = float(robot.lengths[0] + robot.rest.beta.value[0])
         stiffness = robot.tubes[0].bending_stiffness
         force, moment = stiffness / reach**2, stiffness / reach
         self.scale = np.array([force] * 3 + [moment] * (2 + n))
         self.load_slope_limit = LOAD_SLOPE_LIMIT * np.array([force] * 3 + [moment] * 3)
-        self.step = np.array([moment] * n + [force] * 3 + [moment] * 2) * 1e-6
-        self.tangent_step = 5e-5 * self.step
+        self.perturbation = np.array([moment] * n + [force] * 3 + [moment] * 2) * 1e-6
+        self.tangent_perturbation = 5e-5 * self.perturbation
         self._meshes: dict[Key, Mesh] = {}
         # precurvature that varies within a tube's segments, or twists it behind the plate, moves over the cells with the tube
         self.moving_precurvature = any(
@@ -88,9 +89,15 @@ class Model:
         )
 
     @property
+    def unknown_count(self) -> int:
+        """Unknowns of the shooting problem, 5 + N."""
+        return unknown_rows(self.n).size
+
+    @property
     def input_count(self) -> int:
         """Inputs of a stage: alpha, its rate, beta of every tube, force and torque on the tip, and beta rates in the extended model."""
-        return (4 if self.extended else 3) * self.n + 6
+        rows = input_rows(self.n)
+        return rows.size if self.extended else rows.beta_rate
 
     def mesh(self, beta: np.ndarray, key: Key | None = None) -> tuple[Key, Mesh]:
         """Key and mesh of the sections at the translations ``beta`` (N,) m; with ``key`` the sections are kept while they still suit.
@@ -106,6 +113,22 @@ class Model:
             self._meshes[key] = build_mesh(self.segments, beta, key, self.base_cells)
         return key, self._meshes[key]
 
-    def buffers(self, mesh: Mesh, lanes: int) -> tuple[np.ndarray, ...]:
-        """Buffers of a sweep: (W, par, seclen, x, hist, histb, out, outb, nodes, res), flat, ``lanes`` numbers a row."""
-        return buffers(self.n, mesh, point_count(mesh), node_count(mesh), lanes, workspace_rows(self.n))
+    def sweep_buffers(self, mesh: Mesh, lanes: int) -> SweepBuffers:
+        """Zeroed buffers of a sweep with ``lanes`` lanes."""
+        return sweep_buffers(self.n, mesh, point_count(mesh), node_count(mesh), lanes)
+
+    def shooting_solver(
+        self,
+        mesh: Mesh,
+        tolerance: float,
+        parameters: np.ndarray | None = None,
+        limit: int = SHOOTING_ITERATIONS,
+    ) -> ShootingSolver:
+        """Buffers and options of a shooting problem on ``mesh``; ``parameters`` (NP,): an array to read instead of one of its own."""
+        single = self.sweep_buffers(mesh, 1)
+        if parameters is not None:
+            single = single._replace(parameters=parameters)
+        jacobian = self.sweep_buffers(mesh, unknown_lanes(self.kind).count)
+        return ShootingSolver(
+            single, jacobian, ShootingOptions(self.scale, self.perturbation, tolerance, limit)
+        )

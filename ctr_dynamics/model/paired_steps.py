@@ -1,4 +1,6 @@
-"""Two simulations of one robot a step at a time, side by side in the same sweeps: four lanes, two of them probes, take no longer than one.
+"""Two simulations of one robot a step at a time, side by side in the same sweeps.
+
+Four lanes take no longer than one: two of them are the runs, the other two renew the Jacobians.
 
 Sections, mesh and time scheme are common; parameters, actuators, loads and histories are each one's own.
 """
@@ -13,13 +15,14 @@ import numpy as np
 
 from ctr_dynamics.errors import InputError
 from ctr_dynamics.kernels.layout import RATES, Y_NOW
-from ctr_dynamics.kernels.paired_time_step import PAIR_LANES, step_both
+from ctr_dynamics.kernels.paired_time_step import PAIR_LANES, advance_both
+from ctr_dynamics.kernels.structures import PairBuffers
 from ctr_dynamics.model.mesh import Key, Mesh
 from ctr_dynamics.model.simulator import InputsAt, Record, Simulator, State, StepResult, divided, stage_inputs
 from ctr_dynamics.model.time_scheme import Scheme, make_scheme
 
 
-class Pair:
+class PairedSteps:
     """Steps two simulators of one model, scheme and tolerance together."""
 
     def __init__(self, first: Simulator, second: Simulator) -> None:
@@ -29,7 +32,9 @@ class Pair:
         self.first, self.second = first, second
         self._times = first.scheme.times * first.scheme.dt
         self._key: Key = ((), ())  # sections that the buffers are for
-        self._buffers: tuple = ()
+        self._buffers: PairBuffers | None = None
+        stages, m = first.scheme.stages, first.model.unknown_count
+        self._found, self._alive = np.empty((2, stages, m)), np.ones(2, np.bool_)
 
     def step(
         self,
@@ -98,18 +103,17 @@ class Pair:
                 return None
         if key != self._key:
             self._key, self._buffers = key, self._make(mesh)
-        work, found, alive = self._buffers
-        # a step may be too short to probe all columns: the next one begins at another
-        column = scheme.stages * round(t / self.first.scheme.dt) % len(model.step)
-        sweeps, jacobians = step_both(
-            model.tubes, model.jacobian_lanes, mesh, scheme.c0, scheme.weights, (self.first.parameters, self.second.parameters), (rows_a, rows_b),
-            (a.bank, b.bank), (a.unknowns, b.unknowns), (a.earlier, b.earlier), found, (a.inverse, b.inverse), (a.usable, b.usable),
-            work, model.scale, model.step, self.first.tolerance, self.first.limit, column, (a.nodes, b.nodes), alive,
+        found, alive = self._found, self._alive
+        # a step may be too short to renew all columns: the next one begins at another
+        column = scheme.stages * round(t / self.first.scheme.dt) % model.unknown_count
+        runs = a.arrays(self.first.parameters), b.arrays(self.second.parameters)
+        sweeps, jacobians = advance_both(
+            model.kind, mesh, scheme.coefficients, self._buffers, runs, (rows_a, rows_b), found, (a.usable, b.usable), column, alive
         )  # fmt: skip
         if not (sweeps and alive[0] and alive[1]):
             a.usable, b.usable = a.usable and bool(alive[0]), b.usable and bool(alive[1])
             return None
-        a.usable = b.usable = True  # the probes keep the Jacobians so
+        a.usable = b.usable = True  # the spare lanes keep the Jacobians so
         a.mesh = b.mesh = mesh
         a.inputs, b.inputs = last_a, last_b
         records: tuple[Record, ...] = ()
@@ -128,14 +132,12 @@ class Pair:
             StepResult(True, "ok", iterations, sweeps, jacobians),
         )
 
-    def _make(self, mesh: Mesh) -> tuple:
-        """Buffers of the kernel, the unknowns found at the stages of both (2, stages, 5 + N), and whether they converged."""
-        model, stages = self.first.model, self.first.scheme.stages
-        big, alone = model.buffers(mesh, len(PAIR_LANES)), model.buffers(mesh, 1)
-        work = (
-            big,
-            tuple(alone[i] for i in (1, 2, 3, 4, 5)),
-            model.buffers(mesh, 8 * len(model.jacobian_lanes)),
-            np.empty((2, len(alone[4]) + len(alone[5]))),
+    def _make(self, mesh: Mesh) -> PairBuffers:
+        """Buffers for the sections of ``mesh``."""
+        model = self.first.model
+        batch, solver = (
+            model.sweep_buffers(mesh, PAIR_LANES.count),
+            model.shooting_solver(mesh, self.first.tolerance),
         )
-        return work, np.empty((2, stages, 5 + model.n)), np.ones(2, np.bool_)
+        fields = len(solver.single.history) + len(solver.single.base_history)
+        return PairBuffers(batch, solver, np.empty((2, fields)))

@@ -9,14 +9,15 @@ from itertools import pairwise
 from typing import Literal, NamedTuple
 
 import numpy as np
-from scipy.interpolate import CubicSpline
 
 from ctr_dynamics.errors import InputError
-from ctr_dynamics.kernels.layout import RATES, Y_BEFORE, Y_NOW
+from ctr_dynamics.kernels.layout import RATES, Y_BEFORE, Y_NOW, input_rows, state_rows
 from ctr_dynamics.kernels.shooting import CONVERGED, NOT_FINITE
-from ctr_dynamics.kernels.time_step import EARLIER, RENEW, extrapolate, remember, step
-from ctr_dynamics.model.mesh import Mesh, point_positions
+from ctr_dynamics.kernels.structures import RunArrays, ShootingSolver
+from ctr_dynamics.kernels.time_step import EARLIER, RENEW, advance_step, extrapolate, remember
+from ctr_dynamics.model.mesh import Mesh
 from ctr_dynamics.model.model import Model
+from ctr_dynamics.model.remeshing import remap_fields
 from ctr_dynamics.model.statics import Statics
 from ctr_dynamics.model.time_scheme import Scheme, make_scheme
 
@@ -123,6 +124,10 @@ class State:
         self.unknowns[:] = self.unknowns[-1]
         self.earlier[:] = self.unknowns[-1]
 
+    def arrays(self, parameters: np.ndarray) -> RunArrays:
+        """The arrays for the kernels, with the ``parameters`` (NP,) of the run."""
+        return RunArrays(parameters, self.bank, self.unknowns, self.earlier, self.inverse, self.nodes)
+
     @property
     def fields(self) -> np.ndarray:
         """(fields,) q, omega, u, gamma at every point: the state of the PDE. A view: writing changes the state."""
@@ -165,8 +170,7 @@ class Simulator:
         self.scheme = scheme or make_scheme("sdirk3", 0.003)
         self.tolerance = tolerance
         self.parameters = (model.parameters if parameters is None else parameters).copy()
-        self.limit = 40
-        self._buffers: dict[tuple, tuple] = {}
+        self._solvers: dict[tuple, ShootingSolver] = {}
 
     def rest(self, inputs: Inputs, guess: np.ndarray | None = None) -> State:
         """State at rest in the static equilibrium at ``inputs``.
@@ -185,7 +189,7 @@ class Simulator:
         stages = self.scheme.stages
         bank = np.zeros((RATES + stages, len(equilibrium.fields)))
         bank[Y_NOW] = bank[Y_BEFORE] = equilibrium.fields
-        m = 5 + self.model.n
+        m = self.model.unknown_count
         unknowns = np.tile(equilibrium.x, (stages, 1))
         return State(
             equilibrium.key,
@@ -285,39 +289,37 @@ class Simulator:
         record: bool | Literal["end"],
         start: np.ndarray | None = None,
     ) -> StepResult:
-        n, stages = self.model.n, scheme.stages
-        inputs, last = stage_inputs(self.model, inputs_at, t + scheme.times * scheme.dt)
+        model, stages = self.model, scheme.stages
+        inputs, last = stage_inputs(model, inputs_at, t + scheme.times * scheme.dt)
         if not math.isfinite(np.vdot(inputs, inputs)):
             return StepResult(False, "actuators or load hold a number that is not finite", 0, 0, 0)
         bank, mesh = state.bank, state.mesh
         try:
-            still = not self.model.moving_precurvature and last.beta.tobytes() == state.inputs.beta.tobytes()
-            key, now_mesh = (state.key, mesh) if still else self.model.mesh(last.beta, state.key)
+            still = not model.moving_precurvature and last.beta.tobytes() == state.inputs.beta.tobytes()
+            key, now_mesh = (state.key, mesh) if still else model.mesh(last.beta, state.key)
         except InputError as error:
             return StepResult(False, str(error), 0, 0, 0)
         if key != state.key:
-            bank = remap_fields(n, bank, mesh, state.inputs.beta, now_mesh, last.beta)
+            bank = remap_fields(model.n, bank, mesh, state.inputs.beta, now_mesh, last.beta)
             fresh = True
         mesh = now_mesh
-        small, big = self._work(key, mesh)
+        solver = self.solver(key, mesh)
         if start is None:
             guess = np.empty_like(state.unknowns)
-            extrapolate(state.unknowns, state.earlier, self.model.step, guess)
+            extrapolate(state.unknowns, state.earlier, model.perturbation, guess)
         else:
             guess = start
         before = bank[:RATES].copy() if record is True else bank[:0]
         found = np.empty_like(guess)
-        outcome, iterations, sweeps, jacobians = step(
-            self.model.tubes, self.model.lane, self.model.jacobian_lanes, mesh, scheme.c0, scheme.weights, self.parameters,
-            inputs, bank, guess, found, state.inverse, fresh, small, big, self.model.scale, self.model.step,
-            self.tolerance, self.limit,
-        )  # fmt: skip
+        outcome, iterations, sweeps, jacobians = advance_step(
+            model.kind, mesh, scheme.coefficients, solver, inputs, guess, found, bank, state.inverse, fresh
+        )
         state.usable = outcome == CONVERGED and sweeps <= RENEW * stages
         if outcome != CONVERGED:
             return StepResult(False, OUTCOMES[outcome], iterations, sweeps, jacobians)
         state.key, state.mesh, state.bank = key, mesh, bank
         remember(state.unknowns, state.earlier, found)
-        state.nodes = small[6].reshape(-1, 16 + 3 * n).copy()
+        state.nodes = solver.single.nodes.reshape(-1, state_rows(model.n).size).copy()
         state.inputs = last
         records: tuple[Record, ...] = ()
         if record:
@@ -328,15 +330,11 @@ class Simulator:
             records = (Record(scheme, key, mesh, before, own(bank[Y_NOW]), rates, inputs, found, times),)
         return StepResult(True, "ok", iterations, sweeps, jacobians, records=records)
 
-    def _work(self, key: tuple, mesh: Mesh) -> tuple:
-        if key not in self._buffers:
-            W, _, seclen, _, hist, histb, out, outb, nodes, res = self.model.buffers(mesh, 1)
-            lanes = 8 * len(self.model.jacobian_lanes)
-            self._buffers[key] = (
-                (W, seclen, hist, histb, out, outb, nodes, res),
-                self.model.buffers(mesh, lanes),
-            )
-        return self._buffers[key]
+    def solver(self, key: tuple, mesh: Mesh) -> ShootingSolver:
+        """Buffers and options for the sections ``key``; the kernels read and write the simulator's own parameters."""
+        if key not in self._solvers:
+            self._solvers[key] = self.model.shooting_solver(mesh, self.tolerance, self.parameters)
+        return self._solvers[key]
 
 
 def divided(parts: Sequence[StepResult]) -> StepResult:
@@ -357,93 +355,13 @@ def stage_inputs(model: Model, inputs_at: InputsAt, times: np.ndarray) -> tuple[
     at_once = getattr(inputs_at, "stages", None)
     if at_once is not None:
         return at_once(times)
-    n = model.n
+    given = input_rows(model.n)
+    alpha, alpha_rate, beta, force, torque, beta_rate = (given[name] for name in given.names)
     rows = np.empty((len(times), model.input_count))
     for row, time in zip(rows, times, strict=True):
         now = inputs_at(time)
-        row[:n], row[n : 2 * n], row[2 * n : 3 * n] = now.alpha, now.alpha_rate, now.beta
-        row[3 * n : 3 * n + 3], row[3 * n + 3 : 3 * n + 6] = now.force, now.torque
-        row[3 * n + 6 :] = now.beta_rate[: model.input_count - 3 * n - 6]
+        row[alpha], row[alpha_rate], row[beta] = now.alpha, now.alpha_rate, now.beta
+        row[force], row[torque] = now.force, now.torque
+        if model.extended:
+            row[beta_rate] = now.beta_rate
     return rows, now
-
-
-def remap_fields(
-    n: int, bank: np.ndarray, old: Mesh, old_beta: np.ndarray, new: Mesh, new_beta: np.ndarray
-) -> np.ndarray:
-    """Fields (rows, fields) of the sections ``old`` at ``old_beta`` as fields of the sections ``new`` at ``new_beta``.
-
-    By interpolation inside each old section, never across one. Sections that are the same but for their cells keep their reference coordinate.
-    The Runge-Kutta stages of a cell are not the field at their abscissa: at the middle they miss it by -e and +e with e of second order in the
-    cell's length, at the end by an error of third order. These offsets belong to the history as well, or the change of cells would be a kick.
-    """
-    old_s, old_section = point_positions(old, old_beta)
-    new_s, new_section = point_positions(new, new_beta)
-    F = 7 + 2 * n
-    main = len(old_s) * F
-    ends = [old_s[old_section == k][-1] for k in range(len(old.sec_cells))]
-    result = np.zeros((len(bank), len(new_s) * F + bank.shape[1] - main))
-    result[:, len(new_s) * F :] = bank[:, main:]
-    fields = bank[:, :main].reshape(len(bank), -1, F).swapaxes(0, 1)
-    target = result[:, : len(new_s) * F].reshape(len(bank), -1, F).swapaxes(0, 1)
-    same = np.array_equal(old.bp_tube, new.bp_tube) and np.array_equal(old.bp_offset, new.bp_offset)
-    for k in range(len(new.sec_cells)):
-        where = np.flatnonzero(new_section == k)
-        s = new_s[where] * old_s[-1] / new_s[-1]
-        middle = 0.5 * (s[0] + s[-1])
-        source = (
-            k if same else next((j for j, end in enumerate(ends) if middle <= end + 1e-12), len(ends) - 1)
-        )
-        points = np.flatnonzero(old_section == source)
-        x = old_s[points]
-        if same:
-            s = x[0] + (new_s[where] - new_s[where][0]) / max(np.ptp(new_s[where]), 1e-15) * (x[-1] - x[0])
-        target[where] = _resample(x, fields[points], s)
-    return result
-
-
-def _resample(x: np.ndarray, values: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """Stage values (points, ...) of one section's cells at ``x`` as those of other cells at ``at``; both hold four stages a cell and the end."""
-    if x[-1] - x[0] < 1e-12:
-        return np.repeat(values[-1:], len(at), axis=0)
-    at = np.clip(at, x[0], x[-1])
-    first, second, last = values[1:-1:4], values[2:-1:4], values[3:-1:4]
-    nodes = np.concatenate([values[0:-1:4], values[-1:]])
-    knots = np.concatenate([x[0:-1:4], x[-1:]])
-    centres = 0.5 * (knots[:-1] + knots[1:])
-    grid = np.empty(2 * len(centres) + 1)
-    grid[0::2], grid[1::2] = knots, centres
-    known = np.empty((len(grid), *values.shape[1:]))
-    known[0::2], known[1::2] = nodes, 0.5 * (first + second)
-    result = CubicSpline(grid, known)(at) if len(grid) > 3 else _quadratic(grid, known, at)
-    ratio = (at[-1] - at[0]) / ((len(at) - 1) // 4) / (x[-1] - x[0]) * len(centres)
-    half, end = 0.5 * (second - first) * ratio**2, (last - nodes[1:]) * ratio**3
-    for stage, offset in ((1, -half), (2, half), (3, end)):
-        result[stage:-1:4] += _linear(centres, offset, 0.5 * (at[0:-1:4] + at[3:-1:4]))
-    return result
-
-
-def _linear(x: np.ndarray, values: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """Linear interpolation of values (points, ...), held outside the range of ``x``."""
-    if len(x) == 1:
-        return np.repeat(values, len(at), axis=0)
-    left = np.clip(np.searchsorted(x, at, side="right") - 1, 0, len(x) - 2)
-    w = np.clip((at - x[left]) / (x[left + 1] - x[left]), 0.0, 1.0).reshape(-1, *[1] * (values.ndim - 1))
-    return (1.0 - w) * values[left] + w * values[left + 1]
-
-
-def _quadratic(x: np.ndarray, values: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """Parabola through three values (3, ...)."""
-    w0 = (at - x[1]) * (at - x[2]) / ((x[0] - x[1]) * (x[0] - x[2]))
-    w1 = (at - x[0]) * (at - x[2]) / ((x[1] - x[0]) * (x[1] - x[2]))
-    w2 = (at - x[0]) * (at - x[1]) / ((x[2] - x[0]) * (x[2] - x[1]))
-    return np.tensordot(np.stack([w0, w1, w2], axis=1), values, axes=1)
-
-
-def remap_columns(
-    n: int, columns: np.ndarray, old: Mesh, old_beta: np.ndarray, new: Mesh, new_beta: np.ndarray
-) -> np.ndarray:
-    """Columns (slots, fields, r) of stored fields carried over like the fields themselves."""
-    slots, _, r = columns.shape
-    rows = np.ascontiguousarray(columns.transpose(0, 2, 1)).reshape(slots * r, -1)
-    moved = remap_fields(n, rows, old, old_beta, new, new_beta)
-    return np.ascontiguousarray(moved.reshape(slots, r, -1).transpose(0, 2, 1))

@@ -13,10 +13,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ctr_dynamics.kernels.sections import section_lengths
 from ctr_dynamics.model.mesh import Mesh
 from ctr_dynamics.model.model import Model
-from ctr_dynamics.model.statics import _Work
+from ctr_dynamics.model.statics import StaticProblem
 
 TOLERANCE = 1e-6  # of the scaled imbalance: the measure then has five digits
 HELD = 1e-4  # change of the measure between calls, relative, below which the robot counts as standing
@@ -67,9 +66,9 @@ class StabilityWatch:
         self.model = model
         self.parameters = (model.parameters if parameters is None else parameters).copy()
         self._x: np.ndarray | None = None
-        self._solved: _Work | None = None  # what that was found with
+        self._solved: StaticProblem | None = None  # what that was found with
         self._last: tuple[float, float] | None = None
-        self._work: dict[int, tuple[Mesh, _Work]] = {}
+        self._problems: dict[int, tuple[Mesh, StaticProblem]] = {}
 
     def reset(self) -> None:
         """Forget the last equilibrium, as after a snap or a restart."""
@@ -93,40 +92,39 @@ class StabilityWatch:
             InputError: translations out of range.
         """
         layout, par = self.model.layout, self.parameters
-        work = self._problem(beta)
+        problem = self._problem(beta)
         par[layout["alpha"]], par[layout["alpha_rate"]], par[layout["beta"]] = alpha, 0.0, beta
         par[layout["force"]] = 0.0 if force is None else force
         par[layout["torque"]] = 0.0 if torque is None else torque
         followed = self._x is not None
-        found, x = False, np.zeros(5 + self.model.n)
+        found, x = False, np.zeros(self.model.unknown_count)
         for start in (self._x, guess, None if followed else x):
             if start is not None and not found:
                 x = np.array(start, float)
-                known = start is self._x and work is self._solved  # then so is the Jacobian, nearly
-                found = bool(np.isfinite(x).all()) and work.newton(par, x, TOLERANCE, fresh=not known)
+                known = start is self._x and problem is self._solved  # then so is the Jacobian, nearly
+                found = bool(np.isfinite(x).all()) and problem.newton(par, x, fresh=not known)
                 if found and start is not self._x:
                     self._last = None  # another branch: no common line
         if not found:
             self.reset()
             return Stability(math.nan, None, True)
-        self._x, self._solved = x, work
-        measure = work.stability(par, x)
+        self._x, self._solved = x, problem
+        measure = problem.stability(par, x)
         ahead = time_to_snap(*self._last, t, measure) if self._last is not None else None
         if self._last is None or t > self._last[0]:
             self._last = (t, measure)
         return Stability(measure, ahead, not math.isfinite(measure))
 
-    def _problem(self, beta: np.ndarray) -> _Work:
+    def _problem(self, beta: np.ndarray) -> StaticProblem:
         if self._solved is not None and np.array_equal(beta, self._solved.beta):
             return self._solved
         _, mesh = self.model.mesh(beta)
-        kept = self._work.get(id(mesh))
+        kept = self._problems.get(id(mesh))
         if kept is None or kept[0] is not mesh:
-            if len(self._work) > 8:
-                self._work.clear()
-            kept = (mesh, _Work(self.model, mesh, beta))
-            self._work[id(mesh)] = kept
-        work = kept[1]
-        work.beta = np.array(beta)
-        section_lengths(mesh.bp_tube, mesh.bp_offset, work.beta, work.seclen)
-        return work
+            if len(self._problems) > 8:
+                self._problems.clear()
+            kept = (mesh, StaticProblem(self.model, mesh, beta, TOLERANCE))
+            self._problems[id(mesh)] = kept
+        problem = kept[1]
+        problem.move(beta)
+        return problem

@@ -11,10 +11,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ctr_dynamics.kernels.end_angles import end_angles
-from ctr_dynamics.kernels.rod import sweep
+from ctr_dynamics.kernels.kinds import ONE_LANE, lanes_for
+from ctr_dynamics.kernels.layout import state_rows
 from ctr_dynamics.kernels.sections import section_lengths
-from ctr_dynamics.kernels.shooting import CONVERGED, broadcast, lanes_for, solve
-from ctr_dynamics.kernels.workspace import lane_count
+from ctr_dynamics.kernels.shooting import CONVERGED, broadcast, solve
+from ctr_dynamics.kernels.sweep import sweep
 from ctr_dynamics.model.mesh import Key, Mesh
 from ctr_dynamics.model.model import Model
 
@@ -105,59 +106,59 @@ class Statics:
         par[layout["beta"]] = beta
         par[layout["force"]] = force
         par[layout["torque"]] = torque
-        work = _Work(model, mesh, beta)
+        problem = StaticProblem(model, mesh, beta, self.tolerance)
         if end_angles is not None:
-            x, found = self._from_end_angles(work, par, np.asarray(end_angles, float))
-            found = found and self._to_loads(work, par, x)
+            x, found = self._from_end_angles(problem, par, np.asarray(end_angles, float))
+            found = found and self._to_loads(problem, par, x)
         elif guess is not None:
             x = np.array(guess, float)
-            found = work.newton(par, x, self.tolerance)
+            found = problem.newton(par, x)
             if not found:
                 x[:] = 0.0
-                found = self._grow(work, par, x)
+                found = self._grow(problem, par, x)
         else:
-            x, found = self._stable(work, par)
-        return work.result(key, x, par, found)
+            x, found = self._stable(problem, par)
+        return problem.result(key, x, par, found)
 
-    def _stable(self, work: _Work, par: np.ndarray) -> tuple[np.ndarray, bool]:
+    def _stable(self, problem: StaticProblem, par: np.ndarray) -> tuple[np.ndarray, bool]:
         """The first stable equilibrium of several starts, or an unstable one when no start leads to a stable one."""
         fallback: np.ndarray | None = None
         alpha = par[self.model.layout["alpha"]]
 
         def starts() -> Iterator[tuple[np.ndarray, bool]]:
-            x = np.zeros(5 + self.model.n)
-            yield x, work.newton(par, x, self.tolerance)
-            x = np.zeros(5 + self.model.n)
-            yield x, self._grow(work, par, x)
+            x = np.zeros(self.model.unknown_count)
+            yield x, problem.newton(par, x)
+            x = np.zeros(self.model.unknown_count)
+            yield x, self._grow(problem, par, x)
             # the energy has a minimum for some twist of each tube against the next: half turns apart in steps of 45 degrees
             for eighths in product((0, 1, -1, 2, -2, 3, -3, 4), repeat=min(self.model.n - 1, 2)):
                 shift = np.zeros(self.model.n)
                 shift[1 : 1 + len(eighths)] = np.cumsum(eighths) * (math.pi / 4)
-                x, found = self._from_end_angles(work, par, alpha + shift)
-                yield x, found and self._to_loads(work, par, x)
+                x, found = self._from_end_angles(problem, par, alpha + shift)
+                yield x, found and self._to_loads(problem, par, x)
 
         for x, found in starts():
             if found:
-                if work.stability(par, x) > 0.0:
+                if problem.stability(par, x) > 0.0:
                     return x, True
                 fallback = x.copy() if fallback is None else fallback
-        return (np.zeros(5 + self.model.n), False) if fallback is None else (fallback, True)
+        return (np.zeros(self.model.unknown_count), False) if fallback is None else (fallback, True)
 
-    def _grow(self, work: _Work, par: np.ndarray, x: np.ndarray) -> bool:
+    def _grow(self, problem: StaticProblem, par: np.ndarray, x: np.ndarray) -> bool:
         """Continuation in one factor on precurvature, weight and load."""
         names = ("precurvature", "gravity", "force", "torque")
         rows = np.concatenate([self.model.layout.rows(name) for name in names])
-        return _continue(work, par, x, rows, self.tolerance)
+        return _continue(problem, par, x, rows)
 
-    def _to_loads(self, work: _Work, par: np.ndarray, x: np.ndarray) -> bool:
+    def _to_loads(self, problem: StaticProblem, par: np.ndarray, x: np.ndarray) -> bool:
         """Continuation in the weight and the load alone, from an unloaded solution."""
         rows = np.concatenate([self.model.layout.rows(name) for name in ("gravity", "force", "torque")])
         if not np.any(par[rows]):
-            return work.newton(par, x, self.tolerance)
-        return _continue(work, par, x, rows, self.tolerance)
+            return problem.newton(par, x)
+        return _continue(problem, par, x, rows)
 
     def _from_end_angles(
-        self, work: _Work, par: np.ndarray, end_angles: np.ndarray
+        self, problem: StaticProblem, par: np.ndarray, end_angles: np.ndarray
     ) -> tuple[np.ndarray, bool]:
         """Unloaded solution whose end angles are near the given ones.
 
@@ -167,8 +168,8 @@ class Statics:
         unloaded = par.copy()
         for name in ("gravity", "force", "torque"):
             unloaded[self.model.layout[name]] = 0.0
-        x, _ = work.backward(unloaded, end_angles)
-        return x, work.newton(unloaded, x, self.tolerance)
+        x, _ = problem.backward(unloaded, end_angles)
+        return x, problem.newton(unloaded, x)
 
     def stability(
         self,
@@ -189,15 +190,17 @@ class Statics:
         par[layout["beta"]] = beta
         par[layout["force"]] = force
         par[layout["torque"]] = torque
-        return _Work(self.model, equilibrium.mesh, np.asarray(beta, float)).stability(par, equilibrium.x)
+        return StaticProblem(self.model, equilibrium.mesh, np.asarray(beta, float), self.tolerance).stability(
+            par, equilibrium.x
+        )
 
 
-def _continue(work: _Work, par: np.ndarray, x: np.ndarray, rows: np.ndarray, tolerance: float) -> bool:
+def _continue(problem: StaticProblem, par: np.ndarray, x: np.ndarray, rows: np.ndarray) -> bool:
     """Raise the parameters in ``rows`` from 0 to their values in adaptive steps; ``x`` follows. True when they are reached."""
     target = par[rows].copy()
     reached, step = 0.0, 0.1
     par[rows] = 0.0
-    if not work.newton(par, x, tolerance):
+    if not problem.newton(par, x):
         par[rows] = target
         return False
     before, x_before = reached, x.copy()
@@ -207,7 +210,7 @@ def _continue(work: _Work, par: np.ndarray, x: np.ndarray, rows: np.ndarray, tol
         guess = x.copy()
         if reached > before:
             guess += (x - x_before) * (trial - reached) / (reached - before)
-        if work.newton(par, guess, tolerance):
+        if problem.newton(par, guess):
             before, x_before = reached, x.copy()
             x[:] = guess
             reached = trial
@@ -220,80 +223,77 @@ def _continue(work: _Work, par: np.ndarray, x: np.ndarray, rows: np.ndarray, tol
     return True
 
 
-class _Work:
-    """Buffers of one static problem on one mesh."""
+class StaticProblem:
+    """A static problem on one mesh, with its buffers.
 
-    def __init__(self, model: Model, mesh: Mesh, beta: np.ndarray) -> None:
-        self.model, self.mesh, self.beta = model, mesh, beta
-        self.plain = model.buffers(mesh, 1)
-        self.lanes = lanes_for(6 + 2 * model.n)
-        self.many = model.buffers(mesh, lane_count(self.lanes))
-        self.seclen = np.zeros(len(mesh.sec_cells))
-        section_lengths(mesh.bp_tube, mesh.bp_offset, beta, self.seclen)
-        self.inverse = np.zeros((5 + model.n, 5 + model.n))
+    Attributes:
+        beta: (N,) m, translations that the section lengths are those of. single: buffers of one lane; what a sweep leaves is read from them.
+    """
 
-    def newton(self, par: np.ndarray, x: np.ndarray, tolerance: float, fresh: bool = True) -> bool:
+    def __init__(self, model: Model, mesh: Mesh, beta: np.ndarray, tolerance: float) -> None:
+        self.model, self.mesh = model, mesh
+        self._solver = model.shooting_solver(mesh, tolerance)
+        self.single = self._solver.single
+        self._lanes = lanes_for(1 + model.unknown_count + model.n)  # base case, unknowns, alpha
+        self._many = model.sweep_buffers(mesh, self._lanes.count)
+        self._inverse = np.zeros((model.unknown_count, model.unknown_count))
+        self.move(beta)
+
+    def move(self, beta: np.ndarray) -> None:
+        """Go to other translations (N,) m, of the same sections."""
+        self.beta = np.array(beta, float)
+        section_lengths(self.mesh.bp_tube, self.mesh.bp_offset, self.beta, self.single.section_lengths)
+
+    def newton(self, par: np.ndarray, x: np.ndarray, fresh: bool = True) -> bool:
         """Solve for ``x`` in place; ``x`` is left as it was when there is no solution. ``fresh`` False: the Jacobian's inverse is at hand."""
-        model = self.model
-        W, _, _, _, hist, histb, out, outb, nodes, res = self.plain
         trial = x.copy()
-        outcome, *_ = solve(
-            model.tubes, model.lane, self.lanes, self.mesh, 0.0, par, self.seclen, trial, hist, histb,
-            (W, out, outb, nodes, res), self.many, model.scale, model.step, self.inverse, fresh, tolerance, 40,
-        )  # fmt: skip
+        self.single.parameters[:] = par
+        outcome, *_ = solve(self.model.kind, 0.0, self.mesh, self._solver, trial, self._inverse, fresh)
         if outcome == CONVERGED:
             x[:] = trial
         return outcome == CONVERGED
 
     def sweep(self, par: np.ndarray, x: np.ndarray) -> None:
         """One plain sweep at ``x``; results stay in the buffers."""
-        W, _, _, _, hist, histb, out, outb, nodes, res = self.plain
-        mesh = self.mesh
-        sweep(
-            self.model.tubes, self.model.lane, W, 0.0, mesh, par, self.seclen, x, hist, histb, out, outb, nodes, res,
-        )  # fmt: skip
+        self.single.parameters[:], self.single.unknowns[:] = par, x
+        sweep(self.model.kind, ONE_LANE, 0.0, self.mesh, self.single)
 
     def result(self, key: tuple, x: np.ndarray, par: np.ndarray, converged: bool) -> Equilibrium:
         """Equilibrium at ``x``."""
         self.sweep(par, x)
-        _, _, _, _, _, _, out, outb, nodes, _ = self.plain
-        states = nodes.reshape(-1, 16 + 3 * self.model.n).copy()
+        fields = self.single.fields
+        states = self.single.nodes.reshape(-1, state_rows(self.model.n).size).copy()
         return Equilibrium(
             converged=converged,
             x=x.copy(),
-            fields=np.concatenate([out, outb]),
+            fields=np.concatenate([fields, self.single.base_fields]),
             nodes=states,
             mesh=self.mesh,
             key=key,
-            end_angles=self.end_angles(out[:, None], states[:, :, None])[:, 0],
+            end_angles=self.end_angles(fields[:, None], states[:, :, None])[:, 0],
         )
 
-    def end_angles(self, out: np.ndarray, states: np.ndarray) -> np.ndarray:
-        """psi_L (N, lanes) from fields (points * F, lanes) and states (nodes, S, lanes): base angle plus the integral of u_1z, plus theta."""
-        angles = np.zeros((self.model.n, out.shape[1]))
-        end_angles(self.mesh.sec_cells, self.mesh.sec_tubes, self.seclen, out, states, angles)
+    def end_angles(self, fields: np.ndarray, states: np.ndarray) -> np.ndarray:
+        """psi_L (N, lanes) from ``fields`` (points * F, lanes) and ``states`` (nodes, S, lanes): base angle plus the integral of u_1z, plus theta."""
+        angles = np.zeros((self.model.n, fields.shape[1]))
+        mesh = self.mesh
+        end_angles(mesh.sec_cells, mesh.sec_tubes, self.single.section_lengths, fields, states, angles)
         return angles
 
-    def joint_jacobian(
-        self, par: np.ndarray, x: np.ndarray, step: np.ndarray, alpha_rows: np.ndarray
-    ) -> np.ndarray:
+    def joint_jacobian(self, par: np.ndarray, x: np.ndarray) -> np.ndarray:
         """d(r, psi_L)/d(x, alpha), (5 + 2N, 5 + 2N), by perturbed lanes."""
-        model, mesh, L = self.model, self.mesh, lane_count(self.lanes)
-        n, m = model.n, 5 + model.n
-        W, parL, seclenL, xL, histL, histbL, outL, outbL, nodesL, resL = self.many
-        broadcast(self.lanes, par, parL)
-        broadcast(self.lanes, self.seclen, seclenL)
-        broadcast(self.lanes, x, xL)
+        model, L, b, step = self.model, self._lanes.count, self._many, self.model.perturbation
+        n, m = model.n, model.unknown_count
+        broadcast(self._lanes, par, b.parameters)
+        broadcast(self._lanes, self.single.section_lengths, b.section_lengths)
+        broadcast(self._lanes, x, b.unknowns)
         for i in range(m):
-            xL[i * L + 1 + i] += step[i]
-        for i, row in enumerate(alpha_rows):
-            parL[row * L + 1 + m + i] += 1e-7
-        sweep(
-            model.tubes, self.lanes, W, 0.0, mesh,
-            parL, seclenL, xL, histL, histbL, outL, outbL, nodesL, resL,
-        )  # fmt: skip
-        angles = self.end_angles(outL.reshape(-1, L), nodesL.reshape(-1, 16 + 3 * n, L))
-        values = np.concatenate([resL.reshape(m, L), angles])
+            b.unknowns[i * L + 1 + i] += step[i]
+        for i, row in enumerate(model.layout.rows("alpha")):
+            b.parameters[row * L + 1 + m + i] += 1e-7
+        sweep(model.kind, self._lanes, 0.0, self.mesh, b)
+        angles = self.end_angles(b.fields.reshape(-1, L), b.nodes.reshape(-1, state_rows(n).size, L))
+        values = np.concatenate([b.residual.reshape(m, L), angles])
         steps = np.concatenate([step, np.full(n, 1e-7)])
         change = values[:, 1 : 1 + m + n] - values[:, :1]
         # the base angle is that of a quaternion, which begins anew after two turns
@@ -303,7 +303,7 @@ class _Work:
     def stability(self, par: np.ndarray, x: np.ndarray) -> float:
         """det(d alpha / d psi_L) at ``x``, see :meth:`Statics.stability`."""
         m = len(x)
-        joint = self.joint_jacobian(par, x, self.model.step, self.model.layout.rows("alpha"))
+        joint = self.joint_jacobian(par, x)
         if not np.isfinite(joint).all():
             return math.nan
         sign_x, log_x = np.linalg.slogdet(joint[:m, :m])
@@ -340,7 +340,7 @@ class _Work:
             point -= 4 * cells + 1
             fine = 8
             for cell in reversed(range(cells)):
-                step = self.seclen[k] / cells / fine
+                step = self.single.section_lengths[k] / cells / fine
                 reference = ust[point + 4 * cell + 1]
                 for _ in range(fine):
                     turn, wind = slope(angles, torque, present, reference)
@@ -348,7 +348,7 @@ class _Work:
                         angles - 0.5 * step * turn, torque - 0.5 * step * wind, present, reference
                     )
                     angles, torque = angles - step * turn, torque - step * wind
-        x = np.zeros(5 + n)
+        x = np.zeros(self.model.unknown_count)
         x[:n] = torque
         # at s = 0 the frame of tube 1 is turned by psi_1(0): moments of the unloaded robot vanish in total
         alpha = angles + self.beta * torque / GJ

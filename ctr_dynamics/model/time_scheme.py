@@ -8,11 +8,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
 from ctr_dynamics.errors import InputError
 from ctr_dynamics.kernels.layout import RATES, Y_NOW
+from ctr_dynamics.kernels.structures import StageCoefficients
 
 
 @dataclass(frozen=True)
@@ -41,6 +43,11 @@ class Scheme:
     def stages(self) -> int:
         """Number of implicit solves a step."""
         return len(self.c0)
+
+    @cached_property
+    def coefficients(self) -> StageCoefficients:
+        """``c0`` and ``weights`` for the kernels."""
+        return StageCoefficients(self.c0, self.weights)
 
 
 def _bdf_alpha(name: str, dt: float, alpha: float, order: int) -> Scheme:

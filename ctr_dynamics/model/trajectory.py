@@ -14,20 +14,29 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctr_dynamics.errors import InputError
-from ctr_dynamics.kernels.lanes import PACK
-from ctr_dynamics.kernels.layout import RATES
-from ctr_dynamics.kernels.shooting import CONVERGED, aligned_zeros, lanes_for
-from ctr_dynamics.kernels.step_sequence import advance, advance_tangent
-from ctr_dynamics.kernels.tangent import linearise, step_tangent
-from ctr_dynamics.kernels.workspace import input_row
+from ctr_dynamics.kernels.kinds import SIMD_WIDTH, lanes_for, unknown_lanes
+from ctr_dynamics.kernels.layout import RATES, input_rows, parameters_of_inputs, state_rows
+from ctr_dynamics.kernels.linearise import linearise
+from ctr_dynamics.kernels.shooting import CONVERGED, aligned_zeros
+from ctr_dynamics.kernels.step_sequence import NO_TANGENT, advance, advance_tangent
+from ctr_dynamics.kernels.structures import (
+    Derivatives,
+    FiniteDifferences,
+    RunTangent,
+    Solution,
+    SolvedStep,
+    TangentBuffers,
+)
+from ctr_dynamics.kernels.tangent import step_tangent
 from ctr_dynamics.model.mesh import Key, Mesh, fits
 from ctr_dynamics.model.model import Model
-from ctr_dynamics.model.simulator import Inputs, Record, Simulator, State, remap_columns
+from ctr_dynamics.model.remeshing import remap_columns
+from ctr_dynamics.model.simulator import Inputs, Record, Simulator, State
 from ctr_dynamics.model.time_scheme import Scheme
 
 Floats = NDArray[np.float64]
 InputRows = Callable[[Floats], Floats]
-TIP_ROWS = 13  # p, h, q, omega
+TIP_ROWS = state_rows(1).force  # p, h, q, omega
 CHUNK = 256  # steps between returns to Python
 PATIENCE = 40  # steps that may need more than the compiled loop before a run is given up
 SENSITIVE = 10.0  # m, of the tip by a quantity's unit: where a ten-thousandth of it moves the tip by a millimetre, no derivative tells of a change
@@ -56,19 +65,25 @@ class Trajectory:
 class _Columns:
     """Columns of the stored fields along a simulation, with their buffers.
 
-    Packs of eight columns lie apart, each in one piece of memory; columns of zeros fill the last one.
+    Batches of eight columns lie apart, each in one piece of memory; columns of zeros fill the last one.
     """
 
     def __init__(self, model: Model, effect: Floats, input_effect: Callable[[Floats], Floats]) -> None:
         self.asked = effect.shape[1]
-        self.count = -(-self.asked // PACK) * PACK
+        self.count = -(-self.asked // SIMD_WIDTH) * SIMD_WIDTH
         self.model, self.effect = model, self._padded(effect)
         self._input_effect = input_effect
-        self.wide = (*lanes_for(6 + model.n), 0)  # a pack for columns beside the unknowns' lanes
-        m = 5 + model.n
-        self.dx, self.matrix = np.zeros((m, self.count)), np.zeros((m, m))
-        self.dnodes = np.zeros((16 + 3 * model.n, self.count))
-        self._buffers: dict[Key, tuple] = {}
+        # a batch for columns beside the unknowns' lanes
+        self.lanes = lanes_for(unknown_lanes(model.kind).count + SIMD_WIDTH)
+        self.differences = FiniteDifferences(EPSILON, model.tangent_perturbation)
+        m = model.unknown_count
+        self.result = Derivatives(
+            np.zeros((m, m)),
+            np.zeros((m, self.count)),
+            np.zeros((0, self.count)),
+            np.zeros((state_rows(model.n).size, self.count)),
+        )
+        self._buffers: dict[Key, TangentBuffers] = {}
 
     def _padded(self, columns: Floats) -> Floats:
         spare = [(0, 0)] * (columns.ndim - 1) + [(0, self.count - self.asked)]
@@ -78,75 +93,78 @@ class _Columns:
         """(k, inputs, columns) derivatives of the inputs at times (k,)."""
         return self._padded(self._input_effect(times))
 
-    def buffers(self, key: Key, mesh: Mesh, slots: int) -> tuple:
-        """(many, work, before) for the sections ``key``."""
+    def buffers(self, key: Key, mesh: Mesh, slots: int) -> TangentBuffers:
+        """Buffers for the sections ``key``."""
         if key not in self._buffers:
-            L = 8 * len(self.wide)
-            many = self.model.buffers(mesh, L)
-            main, base = len(many[4]) // L, len(many[5]) // L
-            fields = main + base
-            work = (
-                np.zeros(main), np.zeros(base), np.zeros((slots, fields)), np.zeros_like(self.effect),
-            )  # fmt: skip
-            self._buffers[key] = many, work, np.zeros((RATES, fields))
+            sweep = self.model.sweep_buffers(mesh, self.lanes.count)
+            main, base = len(sweep.history) // self.lanes.count, len(sweep.base_history) // self.lanes.count
+            self._buffers[key] = TangentBuffers(
+                sweep,
+                np.zeros(main),
+                np.zeros(base),
+                np.zeros((slots, main + base)),
+                np.zeros_like(self.effect),
+                np.zeros((main + base, self.count)),
+            )
         return self._buffers[key]
 
     def start(self, state: State, par: Floats, row: Floats, drow: Floats, slots: int) -> Floats:
         """Columns at rest; returns those of the tip (13, r)."""
         n, layout = self.model.n, self.model.layout
-        many, work, _ = self.buffers(state.key, state.mesh, slots)
-        hist, histb, _, dstage = work
-        hist[:], histb[:] = 0.0, 0.0
-        fields = np.zeros((len(hist) + len(histb), self.count))
-        rows = input_rows(n)[: len(row)]
-        par = par.copy()
+        b = self.buffers(state.key, state.mesh, slots)
+        b.history[:], b.base_history[:] = 0.0, 0.0
+        fields = np.zeros((len(b.history) + len(b.base_history), self.count))
+        rows = parameters_of_inputs(n)[: len(row)]
+        par, dparameters = par.copy(), b.dparameters
         par[rows] = row
         par[layout["alpha_rate"]] = par[layout["beta_rate"]] = 0.0
-        dstage[:] = self.effect
-        dstage[rows] += drow[: len(rows)]
-        dstage[layout["alpha_rate"]] = dstage[layout["beta_rate"]] = 0.0
+        dparameters[:] = self.effect
+        dparameters[rows] += drow[: len(rows)]
+        dparameters[layout["alpha_rate"]] = dparameters[layout["beta_rate"]] = 0.0
+        solution = Solution(par, state.unknowns[-1], b.history, b.base_history)
+        result = self.result._replace(fields=fields)
         linearise(
-            self.model.tubes, self.wide, state.mesh, 0.0, par, dstage, state.unknowns[-1], hist, histb, np.zeros_like(fields), EPSILON,
-            self.model.tangent_step, many, self.matrix, self.dx, fields, self.dnodes,
+            self.model.kind, self.lanes, 0.0, state.mesh, solution, dparameters, np.zeros_like(fields), self.differences, b.sweep, result
         )  # fmt: skip
-        self.bank = aligned_zeros(len(fields) * slots * self.count).reshape(-1, slots, len(fields), PACK)
-        self.bank[:, :2] = np.moveaxis(fields.reshape(len(fields), -1, PACK), 1, 0)[:, None]
+        self.bank = aligned_zeros(len(fields) * slots * self.count).reshape(
+            -1, slots, len(fields), SIMD_WIDTH
+        )
+        self.bank[:, :2] = np.moveaxis(fields.reshape(len(fields), -1, SIMD_WIDTH), 1, 0)[:, None]
         return self.tip
 
     @property
     def tip(self) -> Floats:
         """(13, r) columns of the tip."""
-        return self.dnodes[:TIP_ROWS, : self.asked].copy()
+        return self.result.nodes[:TIP_ROWS, : self.asked].copy()
 
     def remap(self, old: Mesh, old_beta: Floats, new: Mesh, new_beta: Floats) -> None:
         """Carry the columns to another set of sections."""
         blocks, slots, fields, _ = self.bank.shape
         flat = np.moveaxis(self.bank, 0, 2).reshape(slots, fields, -1)
         flat = remap_columns(self.model.n, flat, old, old_beta, new, new_beta)
-        self.bank = np.ascontiguousarray(np.moveaxis(flat.reshape(slots, -1, blocks, PACK), 2, 0))
+        self.bank = np.ascontiguousarray(np.moveaxis(flat.reshape(slots, -1, blocks, SIMD_WIDTH), 2, 0))
 
     def follow(self, record: Record, par: Floats) -> bool:
         """Move the columns over one recorded (sub)step."""
-        slots = self.bank.shape[1]
-        many, work, _ = self.buffers(record.key, record.mesh, slots)
-        dinputs = self.input_effect(record.times)
+        buffers = self.buffers(record.key, record.mesh, self.bank.shape[1])
+        done = SolvedStep(par.copy(), record.inputs, record.found, record.before, record.rates, record.after)
         return step_tangent(
-            self.model.tubes, self.wide, record.mesh, record.scheme.c0, record.scheme.weights, par.copy(), record.inputs, record.found,
-            record.before, record.rates, self.effect, dinputs, EPSILON, self.model.tangent_step, many, work, self.bank, self.matrix,
-            self.dx, self.dnodes,
+            self.model.kind, self.lanes, record.mesh, record.scheme.coefficients, done, self.effect, self.input_effect(record.times),
+            self.differences, buffers, self.bank, self.result,
         )  # fmt: skip
-
-
-def input_rows(n: int) -> NDArray[np.int64]:
-    """Rows of the parameter block that hold the inputs of ``n`` tubes, in their order."""
-    return np.array([input_row.py_func((0,) * n, i) for i in range(4 * n + 6)])
 
 
 def to_inputs(n: int, row: Floats) -> Inputs:
     """One row of inputs as :class:`Inputs`; without rates of beta they are 0."""
-    rate = row[3 * n + 6 :] if len(row) > 3 * n + 6 else np.zeros(n)
+    rows = input_rows(n)
+    rate = row[rows["beta_rate"]] if len(row) > rows.beta_rate else np.zeros(n)
     return Inputs(
-        row[:n], row[n : 2 * n], row[2 * n : 3 * n], rate, row[3 * n : 3 * n + 3], row[3 * n + 3 : 3 * n + 6]
+        row[rows["alpha"]],
+        row[rows["alpha_rate"]],
+        row[rows["beta"]],
+        rate,
+        row[rows["force"]],
+        row[rows["torque"]],
     )
 
 
@@ -203,7 +221,7 @@ def run(
         count = min(CHUNK, steps - k)
         times = (np.arange(k, k + count)[:, None] + scheme.times) * dt
         rows_now = inputs(times.ravel()).reshape(count, stages, -1)
-        beta = rows_now[:, -1, 2 * n : 3 * n]
+        beta = rows_now[:, -1, input_rows(n)["beta"]]
         still = bool(np.all(beta == state.inputs.beta))
         usable = count
         if model.moving_precurvature and not still:
@@ -220,7 +238,7 @@ def run(
             if taken:
                 state.inputs = to_inputs(n, rows_now[taken - 1, -1])
             if columns is not None and out is not None:
-                lost = _lost(out[k + 1 : k + 1 + taken]) if outcome != -1 else taken - 1
+                lost = _lost(out[k + 1 : k + 1 + taken]) if outcome != NO_TANGENT else taken - 1
                 if lost < taken:
                     out[k + 1 + lost :] = 0.0
                     columns = None
@@ -246,7 +264,7 @@ def run(
             if columns is not None:
                 for record in result.records:
                     if record.key != key:
-                        columns.remap(mesh, before, record.mesh, record.inputs[-1, 2 * n : 3 * n])
+                        columns.remap(mesh, before, record.mesh, record.inputs[-1, input_rows(n)["beta"]])
                         key = record.key
                     if not columns.follow(record, parameters):
                         columns = None
@@ -306,34 +324,30 @@ def _fast(
     dtips: Floats | None,
 ) -> tuple[int, int, int]:
     """Steps in the compiled loop; returns (steps taken, sweeps, outcome)."""
-    small, big = simulator._work(state.key, state.mesh)
-    scheme = simulator.scheme
-    nodes = small[6]
+    solver = simulator.solver(state.key, state.mesh)
+    kind, scheme, mesh = model.kind, simulator.scheme, state.mesh
+    coefficients, arrays, fresh = scheme.coefficients, state.arrays(simulator.parameters), not state.usable
     # the compiled loop reads the tip from the last rows of the node states
-    S = 16 + 3 * model.n
+    S = state_rows(model.n).size
     last = np.empty((len(rows), S))
-    common = (
-        model.tubes, model.lane, model.jacobian_lanes,
-    )  # fmt: skip
-    solver = (
-        state.mesh, scheme.c0, scheme.weights, simulator.parameters, rows, state.bank, state.unknowns, state.earlier, state.inverse,
-        not state.usable, small, big, model.scale, model.step,
-    )  # fmt: skip
     if columns is None:
-        taken, sweeps, outcome = advance(*common, *solver, simulator.tolerance, simulator.limit, last)
+        taken, sweeps, outcome = advance(kind, mesh, coefficients, solver, rows, arrays, fresh, last)
     else:
         assert dtips is not None
-        many, work, before = columns.buffers(state.key, state.mesh, len(state.bank))
+        buffers = columns.buffers(state.key, mesh, len(state.bank))
         shape = (*rows.shape, columns.count)
         dinputs = np.ascontiguousarray(columns.input_effect(times.ravel()).reshape(shape))
+        before = np.zeros((RATES, state.bank.shape[1]))
+        tangent = RunTangent(
+            before, columns.effect, dinputs, columns.differences, buffers, columns.bank, columns.result, dtips
+        )
         taken, sweeps, outcome = advance_tangent(
-            *common, columns.wide, *solver, model.tangent_step, simulator.tolerance, simulator.limit, last, columns.effect, dinputs,
-            EPSILON, many, work, columns.bank, before, columns.matrix, columns.dx, columns.dnodes, dtips,
-        )  # fmt: skip
-    if outcome == -1:  # the step has been taken, and has no tangent
+            kind, columns.lanes, mesh, coefficients, solver, rows, arrays, fresh, last, tangent
+        )
+    if outcome == NO_TANGENT:  # the step has been taken
         taken += 1
     tips[:taken] = last[:taken, :TIP_ROWS]
-    state.usable = outcome in (CONVERGED, -1)
+    state.usable = outcome in (CONVERGED, NO_TANGENT)
     if taken:
-        state.nodes = nodes.reshape(-1, S).copy() if state.usable else state.nodes
+        state.nodes = solver.single.nodes.reshape(-1, S).copy() if state.usable else state.nodes
     return taken, sweeps, outcome

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from ctr_dynamics.errors import InputError
-from ctr_dynamics.kernels.snap_newton import Arrays
+from ctr_dynamics.kernels.layout import state_rows
+from ctr_dynamics.kernels.snap_residual import GridArrays
 from ctr_dynamics.model.mesh import Tubes, breakpoints
 
 SPACING = 0.001  # m, of cells on robots without a grid of their own
@@ -32,7 +33,7 @@ class Grid:
         unknowns: their number.
     """
 
-    arrays: Arrays
+    arrays: GridArrays
     cells: tuple[int, ...]
     edges: np.ndarray
     unknowns: int
@@ -120,7 +121,7 @@ def build_grid(tubes: Tubes, beta: np.ndarray, cells: tuple[int, ...]) -> Grid:
     first_cell = base + np.concatenate([[0], np.cumsum(cells[1:])]).astype(np.int64)
     lengths = np.diff(edges)
     ds = np.array([lengths[k] / cells[k + 1] if k >= 0 else 0.0 for k in cell_section])
-    state = np.array([16 + 3 * m for m in present])
+    state = np.array([state_rows(m).size for m in present])
     rows = np.array([state[k] if k >= 0 else 3 * turning for k in cell_section], dtype=np.int64)
     size = np.concatenate([[turning if base else 0], rows]).astype(np.int64)
     size[base] = 3 * turning + 5 + n - turning
@@ -130,7 +131,7 @@ def build_grid(tubes: Tubes, beta: np.ndarray, cells: tuple[int, ...]) -> Grid:
             size[first_cell[k + 1]] -= 1 if after else 6
     start = np.concatenate([[0], np.cumsum(size)]).astype(np.int64)
     row_start = np.concatenate([[0], np.cumsum(rows)]).astype(np.int64)
-    arrays = Arrays(
+    arrays = GridArrays(
         n=n,
         turning=turning,
         base=base,

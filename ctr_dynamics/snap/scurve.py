@@ -12,8 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from ctr_dynamics.errors import InputError
+from ctr_dynamics.kernels.layout import state_rows
 from ctr_dynamics.model.model import Model
-from ctr_dynamics.model.statics import Statics, _Work
+from ctr_dynamics.model.statics import StaticProblem, Statics
 from ctr_dynamics.robot import Robot
 
 NODES = 100  # of the sweep: the curve then lies within 1e-9 rad of a refined one
@@ -65,7 +66,7 @@ def s_curve(
     if robot.n_tubes < 2:
         raise InputError(f"robot {robot.name} has one tube", do="an S-curve needs two")
     model = Model(robot, nodes=nodes)
-    n, m = model.n, 5 + model.n
+    n, m = model.n, model.unknown_count
     layout = model.layout
     beta = np.asarray(beta, float)
     alpha = np.full(n, alpha_2)
@@ -74,10 +75,9 @@ def s_curve(
         raise InputError("no static equilibrium with all tubes aligned", do="check the robot file")
     par = model.parameters.copy()
     par[layout["beta"]] = beta
-    work = _Work(model, start.mesh, beta)
-    rows = layout.rows("alpha")
+    problem = StaticProblem(model, start.mesh, beta, 1e-9)
     z = np.concatenate([start.x, [alpha_2]])
-    unit = np.concatenate([model.step * 1e6, [1.0]])  # of each unknown
+    unit = np.concatenate([model.perturbation * 1e6, [1.0]])  # of each unknown
     before = z
     targets = np.linspace(0.0, last, points)
     theta_b, stability = np.empty(points), np.empty(points)
@@ -87,13 +87,13 @@ def s_curve(
         for _ in range(20):
             alpha[0] = guess[m]
             par[layout["alpha"]] = alpha
-            work.sweep(par, guess[:m])
-            _, _, _, _, _, _, out, _, states, res = work.plain
-            psi = work.end_angles(out[:, None], states.reshape(-1, 16 + 3 * n, 1))[:, 0]
-            value = np.concatenate([res / model.scale, [psi[1] - psi[0] - target]])
+            problem.sweep(par, guess[:m])
+            b = problem.single
+            psi = problem.end_angles(b.fields[:, None], b.nodes.reshape(-1, state_rows(n).size, 1))[:, 0]
+            value = np.concatenate([b.residual / model.scale, [psi[1] - psi[0] - target]])
             if np.abs(value).max() < 1e-10:
                 break
-            joint = work.joint_jacobian(par, guess[:m], model.step, rows)
+            joint = problem.joint_jacobian(par, guess[:m])
             jacobian = np.vstack(
                 [joint[:m, : m + 1] / model.scale[:, None], joint[m + 1, : m + 1] - joint[m, : m + 1]]
             )
@@ -108,5 +108,5 @@ def s_curve(
             )
         before, z = z, guess
         theta_b[k] = alpha_2 - z[m]
-        stability[k] = work.stability(par, z[:m])
+        stability[k] = problem.stability(par, z[:m])
     return SCurve(theta_b, targets, stability)

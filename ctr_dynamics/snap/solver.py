@@ -7,8 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from ctr_dynamics.errors import InputError
-from ctr_dynamics.kernels.layout import RATE_NOW, Y_BEFORE, Y_NOW
-from ctr_dynamics.kernels.snap_newton import CONVERGED, NOT_FINITE, make_work, solve
+from ctr_dynamics.kernels.layout import RATE_NOW, Y_BEFORE, Y_NOW, field_rows, state_rows
+from ctr_dynamics.kernels.snap_newton import CONVERGED, NOT_FINITE, solve
+from ctr_dynamics.kernels.snap_residual import solver_arrays
 from ctr_dynamics.model.model import Model
 from ctr_dynamics.model.time_scheme import make_scheme
 from ctr_dynamics.robot import Robot
@@ -27,7 +28,7 @@ ABSENT = {
     "tip_spring",
 }
 EQUATIONS = {"derived": 1.0, "printed": 0.0}
-"""Share of each form, for row ``TURNING`` (docs/model.md, *Gyroscopic term of (12)*)."""
+"""Factor of each form, for the last row of the parameters (docs/model.md, *Gyroscopic term of (12)*)."""
 OUTCOMES = {
     CONVERGED: "ok",
     1: "Newton's method did not converge",
@@ -86,7 +87,7 @@ class SnapSolver:
         self.tolerance = tolerance
         self.parameters = np.append(model.parameters, EQUATIONS[equations])
         self.parameters[model.layout["beta"]] = self.beta
-        self.work = make_work(self.grid.arrays)
+        self.work = solver_arrays(self.grid.arrays)
         size = self.work.left.shape[1]
         self.scratch = (np.zeros((size, size)), np.zeros((size, size)))
         self.x = np.zeros(self.grid.unknowns)
@@ -290,13 +291,13 @@ class SnapSolver:
         psi = self.parameters[self.model.layout["alpha"]][0] + work.out_drive[0]
         if g.turning:
             psi = work.right[g.base, 0]
-        twist = work.out[: len(g.ds) - g.base, 8] * g.ds[g.base :]
+        twist = work.out[: len(g.ds) - g.base, field_rows(self.n).curvature_z] * g.ds[g.base :]
         angles = np.zeros(self.n)
         for k, m in enumerate(g.tubes):
             after = g.tubes[k + 1] if k + 1 < len(g.tubes) else 0
             if after < m:
                 node = g.first_cell[k + 1]
-                theta = work.right[node, 17 + m + m - 1] if m > 1 else 0.0
+                theta = work.right[node, state_rows(m).theta + m - 2] if m > 1 else 0.0
                 angles[m - 1] = psi + twist[: node - g.base].sum() + theta
         return angles
 
@@ -315,9 +316,9 @@ class SnapSolver:
         """
         g, work = self.grid.arrays, self.work
         node = g.first_cell[int(np.max(np.flatnonzero(g.tubes > 1))) + 1]
-        twist = work.out[node - g.base : len(g.ds) - g.base, 8] @ g.ds[node:]
+        twist = work.out[node - g.base : len(g.ds) - g.base, field_rows(self.n).curvature_z] @ g.ds[node:]
         m = int(g.tubes[g.cell_section[node - 1]])
-        return float(work.right[node, 18 + m] + twist)
+        return float(work.right[node, state_rows(m).theta] + twist)
 
     def tube_end(self, i: int) -> np.ndarray:
         """(3,) m in ``ctr_base``, end of tube ``i`` (0 is the innermost)."""

@@ -55,7 +55,7 @@ def test_columns_together_are_those_apart(recording, robot, known, monkeypatch):
     with monkeypatch.context() as patch:
         patch.setattr(trajectory, "EPSILON", 1e-6)
         for model in forward_model.models.values():
-            patch.setattr(model, "tangent_step", 0.1 * model.step)
+            patch.setattr(model, "tangent_perturbation", 0.1 * model.perturbation)
         assert apart()[0] < 1e-5
     step = 0.01
     shifted = [

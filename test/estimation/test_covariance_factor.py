@@ -7,7 +7,7 @@ import ctr_dynamics.estimation.filter.covariance_factor as factor_module
 from ctr_dynamics.estimation.filter.covariance_factor import CovarianceFactor
 from ctr_dynamics.estimation.filter.energy_norm import energy_rows, field_weights
 from ctr_dynamics.estimation.filter.parameter_priors import model_uncertainty
-from ctr_dynamics.kernels.workspace import base_rows
+from ctr_dynamics.kernels.layout import base_field_count
 from ctr_dynamics.model.mesh import build_mesh
 from ctr_dynamics.model.mesh_interpolation import coarse_key, transfer
 from ctr_dynamics.model.model import Model
@@ -52,7 +52,7 @@ def test_transfer_is_exact_for_cubics_inside_each_section(robot):
     coarse = build_mesh(fine.segments, BETA, short, mesh.base_cells)
     assert max(coarse.sec_cells) >= 3
     F, S = 7 + 2 * fine.n, 16 + 3 * fine.n
-    base = base_rows(fine.n, mesh.base_cells)
+    base = base_field_count(fine.n, mesh.base_cells)
     rng = np.random.default_rng(2)
     coefficients = rng.normal(size=(len(mesh.sec_cells), 4, S))
     for k, cells in enumerate(coarse.sec_cells):

@@ -29,7 +29,7 @@ class Oracle:
 
     def __init__(self, layout, par: np.ndarray, mesh, seclen: np.ndarray, c0: float) -> None:
         self.n, self.mesh, self.seclen, self.c0 = layout.n, mesh, seclen, c0
-        self.p = {name: par[layout[name]] for name in layout._rows}
+        self.p = {name: par[layout[name]] for name in layout.names}
         self.J = [np.diag([1.0, 1.0, 2.0]) * i for i in self.p["inertia_per_length"]]
         self.K = [
             np.diag([e, e, g])

@@ -11,8 +11,9 @@ import pytest
 from model_cases import dominant_frequency, make_robot, make_tube
 from scipy.interpolate import CubicSpline
 
-from ctr_dynamics.kernels.rod import sweep
+from ctr_dynamics.kernels.kinds import ONE_LANE
 from ctr_dynamics.kernels.sections import section_lengths
+from ctr_dynamics.kernels.sweep import sweep
 from ctr_dynamics.model.mesh import node_positions
 from ctr_dynamics.model.model import Model
 from ctr_dynamics.model.simulator import Inputs, Simulator
@@ -92,15 +93,14 @@ def tip_velocities(tips):
 def sweep_at_rest(model, x, rates):
     """Node states of one sweep without history (c0 = 0), for unknowns and rates of the actuators that need not be in balance."""
     _, mesh = model.mesh(BETA)
-    W, par, lengths, at, hist, histb, out, outb, nodes, res = model.buffers(mesh, 1)
-    par[:] = model.parameters
-    par[model.layout["beta"]] = BETA
-    par[model.layout["alpha_rate"]] = rates
-    section_lengths(mesh.bp_tube, mesh.bp_offset, BETA, lengths)
-    at[:] = x
-    hist[:], histb[:] = 0.0, 0.0
-    sweep(model.tubes, (), W, 0.0, mesh, par, lengths, at, hist, histb, out, outb, nodes, res)
-    return node_positions(mesh, BETA), nodes.reshape(-1, 22).copy()
+    b = model.sweep_buffers(mesh, 1)
+    b.parameters[:] = model.parameters
+    b.parameters[model.layout["beta"]] = BETA
+    b.parameters[model.layout["alpha_rate"]] = rates
+    section_lengths(mesh.bp_tube, mesh.bp_offset, BETA, b.section_lengths)
+    b.unknowns[:] = x
+    sweep(model.kind, ONE_LANE, 0.0, mesh, b)
+    return node_positions(mesh, BETA), b.nodes.reshape(-1, 22).copy()
 
 
 # -- drives --

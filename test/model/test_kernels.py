@@ -5,10 +5,10 @@ import pytest
 from model_cases import many_tubes
 from model_oracle import Oracle
 
-from ctr_dynamics.kernels.lanes import sincos
-from ctr_dynamics.kernels.rod import sweep
+from ctr_dynamics.kernels.kinds import ONE_LANE, lanes_for
 from ctr_dynamics.kernels.sections import section_lengths
-from ctr_dynamics.kernels.workspace import lane_count
+from ctr_dynamics.kernels.sincos import sincos
+from ctr_dynamics.kernels.sweep import sweep
 from ctr_dynamics.model.model import Model
 
 
@@ -34,16 +34,16 @@ def random_problem(n, seed, nodes=12):
 
 def compiled(model, mesh, lanes, par, beta, x, hist, histb, c0):
     """One sweep; every argument (rows, L). Returns res, fields, base fields, nodes as (rows, L)."""
-    L = lane_count(lanes)
-    W, parL, seclenL, xL, histL, histbL, out, outb, nodes, res = model.buffers(mesh, L)
-    for target, source in ((parL, par), (xL, x), (histL, hist), (histbL, histb)):
+    L = lanes.count
+    b = model.sweep_buffers(mesh, L)
+    for target, source in ((b.parameters, par), (b.unknowns, x), (b.history, hist), (b.base_history, histb)):
         target[:] = np.asarray(source).reshape(-1, L).ravel()
     lengths = np.zeros(len(mesh.sec_cells))
     for j in range(L):
         section_lengths(mesh.bp_tube, mesh.bp_offset, beta.reshape(-1, L)[:, j].copy(), lengths)
-        seclenL.reshape(-1, L)[:, j] = lengths
-    sweep(model.tubes, lanes, W, c0, mesh, parL, seclenL, xL, histL, histbL, out, outb, nodes, res)  # fmt: skip
-    return tuple(a.reshape(-1, L).copy() for a in (res, out, outb, nodes))
+        b.section_lengths.reshape(-1, L)[:, j] = lengths
+    sweep(model.kind, lanes, c0, mesh, b)
+    return tuple(a.reshape(-1, L).copy() for a in (b.residual, b.fields, b.base_fields, b.nodes))
 
 
 def relative(found, expected):
@@ -61,7 +61,7 @@ def test_sweep_equals_its_numpy_twin(n, c0):
     model, mesh, par, beta, x, hist, histb = random_problem(n, 10 * n)
     if c0 == 0.0:
         hist, histb = 0.0 * hist, 0.0 * histb
-    found = compiled(model, mesh, (), par, beta, x, hist, histb, c0)
+    found = compiled(model, mesh, ONE_LANE, par, beta, x, hist, histb, c0)
     lengths = np.zeros(len(mesh.sec_cells))
     section_lengths(mesh.bp_tube, mesh.bp_offset, beta, lengths)
     expected = Oracle(model.layout, par, mesh, lengths, c0).sweep(x, hist, histb)
@@ -80,13 +80,13 @@ def test_sweep_equals_its_numpy_twin(n, c0):
 @pytest.mark.parametrize("n", [1, 2, 3, 4])
 def test_lanes_equal_separate_sweeps(n):
     """Sixteen problems at once, everything perturbed in each, against sweeps of one lane."""
-    lanes, L, c0 = (0, 0), 16, 765.0
+    lanes, L, c0 = lanes_for(16), 16, 765.0
     model, mesh, *base = random_problem(n, 5)
     rng = np.random.default_rng(7)
     many = [np.asarray(v)[:, None] * (1 + 1e-2 * rng.standard_normal((len(v), L))) for v in base]
     together = compiled(model, mesh, lanes, *many, c0)
     for j in (0, 3, 15):
-        alone = compiled(model, mesh, (), *(v[:, j] for v in many), c0)
+        alone = compiled(model, mesh, ONE_LANE, *(v[:, j] for v in many), c0)
         for a, b in zip(together, alone, strict=True):
             assert relative(a[:, j], b) < 1e-10
 
@@ -118,8 +118,8 @@ def test_torsion_row_of_the_total_moment_is_the_sum_of_the_tubes():
     changed = par.copy()
     changed[model.layout["tube_coulomb"]] = 0.05
     changed[model.layout["tube_viscous"]] = 1e-6
-    plain = compiled(model, mesh, (), par, beta, x, hist, histb, 0.0)[3].reshape(-1, 16 + 3 * n)
-    rubbing = compiled(model, mesh, (), changed, beta, x, hist, histb, 0.0)[3].reshape(-1, 16 + 3 * n)
+    plain = compiled(model, mesh, ONE_LANE, par, beta, x, hist, histb, 0.0)[3].reshape(-1, 16 + 3 * n)
+    rubbing = compiled(model, mesh, ONE_LANE, changed, beta, x, hist, histb, 0.0)[3].reshape(-1, 16 + 3 * n)
     first, rubbed = plain[0, 18 : 18 + n], rubbing[0, 18 : 18 + n]
     assert np.abs(rubbed - first).max() > 1e-6  # friction acts on each tube
     assert abs(rubbed.sum() - first.sum()) < 1e-15  # and on their sum not at all

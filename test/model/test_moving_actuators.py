@@ -12,7 +12,8 @@ from model_cases import make_robot, make_tube, many_tubes, still
 from ctr_dynamics.kernels.layout import RATES
 from ctr_dynamics.model.mesh import fits, node_count, section_key
 from ctr_dynamics.model.model import Model
-from ctr_dynamics.model.simulator import Inputs, Simulator, remap_fields
+from ctr_dynamics.model.remeshing import remap_fields
+from ctr_dynamics.model.simulator import Inputs, Simulator
 from ctr_dynamics.model.statics import Statics
 from ctr_dynamics.model.time_scheme import make_scheme
 from ctr_dynamics.robot_files import load_robot

@@ -1,11 +1,12 @@
-"""Two simulations in the same sweeps against each alone, and the probes that keep their Jacobians."""
+"""Two simulations in the same sweeps against each alone, and the spare lanes that renew their Jacobians."""
 
 import numpy as np
 import pytest
 
-from ctr_dynamics.kernels.batched_shooting import _learn
+from ctr_dynamics.kernels.batched_shooting import renew_columns
+from ctr_dynamics.kernels.kinds import Lanes
 from ctr_dynamics.model.model import Model
-from ctr_dynamics.model.paired_steps import Pair
+from ctr_dynamics.model.paired_steps import PairedSteps
 from ctr_dynamics.model.simulator import Inputs, Simulator
 from ctr_dynamics.model.time_scheme import make_scheme
 from ctr_dynamics.robot_files import load_robot
@@ -56,7 +57,7 @@ def test_a_pair_goes_where_each_goes_alone(model, scheme, slide):
     inputs = turning(0.02, slide), turning(0.0, slide)
     states = [at_rest(s, at) for s, at in zip((first, second), inputs, strict=True)]
     alone = [state.copy() for state in states]
-    pair, hard = Pair(first, second), 0
+    pair, hard = PairedSteps(first, second), 0
     for k in range(40):
         results = pair.step(*states, k * DT, *inputs)
         if results is None:
@@ -81,7 +82,7 @@ def test_the_record_is_that_of_a_step_alone(model):
     at = turning(0.02)
     a, b = at_rest(first, at), at_rest(second, at)
     alone = a.copy()
-    pair = Pair(first, second)
+    pair = PairedSteps(first, second)
     for k in range(5):
         found = pair.step(a, b, k * DT, at, at, record=True)
         expected = first.step(alone, k * DT, at, record="end")
@@ -100,7 +101,7 @@ def test_a_step_that_is_divided_is_that_of_each_alone(model):
 
     states = [at_rest(first, letting_go), at_rest(second, letting_go)]
     alone, whole = [state.copy() for state in states], states[0].copy()
-    pair = Pair(first, second)
+    pair = PairedSteps(first, second)
     for k in range(8):
         events = (4.4 * DT, 4.7 * DT) if k == 4 else ()
         results = pair.step(*states, k * DT, letting_go, letting_go, record=True, events=events)
@@ -157,12 +158,12 @@ def test_where_they_cannot_go_together_nothing_is_done(model, case):
         other = turning(force=1e9)
     a, b = at_rest(first, turning()), at_rest(second, turning())
     before = a.copy(), b.copy()
-    assert Pair(first, second).step(a, b, 0.0, at, other) is None
+    assert PairedSteps(first, second).step(a, b, 0.0, at, other) is None
     for state, was in zip((a, b), before, strict=True):
         assert state.key == was.key
         for name in ("bank", "unknowns", "earlier", "nodes"):
             assert np.array_equal(getattr(state, name), getattr(was, name))
-    assert Pair(first, second).step(a, b, 0.0, turning(), turning()) is not None
+    assert PairedSteps(first, second).step(a, b, 0.0, turning(), turning()) is not None
 
 
 def test_the_parameters_hold_the_inputs_of_the_step_as_after_one_alone(model):
@@ -171,34 +172,34 @@ def test_the_parameters_hold_the_inputs_of_the_step_as_after_one_alone(model):
     at = turning(0.02)
     a, b = at_rest(first, at), at_rest(second, at)
     c = a.copy()
-    assert Pair(first, second).step(a, b, 0.0, at, at) is not None
+    assert PairedSteps(first, second).step(a, b, 0.0, at, at) is not None
     assert alone.step(c, 0.0, at).ok
     assert np.array_equal(first.parameters, alone.parameters)
 
 
-def test_a_probe_renews_its_column():
+def test_a_finite_difference_renews_its_column():
     """Of an inverse that is a little wrong, one column of what it inverts becomes exact, the others stay; all of them after a round."""
     rng, m = np.random.default_rng(0), 7
     exact, units = rng.normal(size=(m, m)), 10.0 ** -rng.integers(5, 8, m)
     wrong = exact + 0.1 * rng.normal(size=(m, m))
     inverse = np.linalg.inv(wrong)[None].copy()
     column = 3
-    for probed in (3, 4, 5, 6, 0, 1, 2):
+    for renewed in (3, 4, 5, 6, 0, 1, 2):
         imbalance = np.zeros((m, 2))
-        imbalance[:, 1] = exact[:, probed] * units[probed]
-        column = _learn((False, False), imbalance.ravel(), column, units, inverse, np.empty((2, m)))
-        wrong[:, probed] = exact[:, probed]
+        imbalance[:, 1] = exact[:, renewed] * units[renewed]
+        column = renew_columns(Lanes(2, 2), imbalance.ravel(), column, units, inverse, np.empty((2, m)))
+        wrong[:, renewed] = exact[:, renewed]
         assert np.allclose(np.linalg.inv(inverse[0]), wrong, atol=1e-9)
     assert column == 3
     assert np.allclose(np.linalg.inv(inverse[0]), exact, atol=1e-9)
 
 
 @pytest.mark.parametrize("imbalance", [np.nan, np.inf, 0.0], ids=["nan", "infinite", "singular"])
-def test_a_probe_that_tells_nothing_changes_nothing(imbalance):
+def test_a_finite_difference_that_tells_nothing_changes_nothing(imbalance):
     rng, m = np.random.default_rng(1), 7
     inverse = rng.normal(size=(1, m, m))
     before = inverse.copy()
     found = np.zeros((m, 2))
     found[:, 1] = imbalance
-    assert _learn((False, False), found.ravel(), 0, np.full(m, 1e-6), inverse, np.empty((2, m))) == 1
+    assert renew_columns(Lanes(2, 2), found.ravel(), 0, np.full(m, 1e-6), inverse, np.empty((2, m))) == 1
     assert np.array_equal(inverse, before)

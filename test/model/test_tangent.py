@@ -6,8 +6,9 @@ Initial fields, a parameter and an actuator angle.
 import numpy as np
 import pytest
 
-from ctr_dynamics.kernels.layout import RATES
-from ctr_dynamics.kernels.shooting import lanes_for
+from ctr_dynamics.kernels.kinds import lanes_for
+from ctr_dynamics.kernels.layout import RATES, input_rows
+from ctr_dynamics.kernels.structures import Derivatives, FiniteDifferences, SolvedStep, TangentBuffers
 from ctr_dynamics.kernels.tangent import step_tangent
 from ctr_dynamics.model.model import Model
 from ctr_dynamics.model.simulator import Inputs, Simulator
@@ -58,7 +59,7 @@ def test_tangent_of_steps_equals_finite_differences(scheme):
         return state, records
 
     state, records = run()
-    m, stages = 5 + model.n, make_scheme(scheme, DT).stages
+    m, stages = model.unknown_count, make_scheme(scheme, DT).stages
     fields = state.bank.shape[1]
     columns = np.zeros((1, RATES + stages, fields, COLUMNS))
     columns[0, :RATES, :, 0] = direction
@@ -67,18 +68,25 @@ def test_tangent_of_steps_equals_finite_differences(scheme):
     parameters[angle, 2] = 0.01
     parameters[force, 3] = 0.01
     lanes = lanes_for(1 + m + COLUMNS)
-    big = model.buffers(state.mesh, 8 * len(lanes))
-    points, base = big[4].size // (8 * len(lanes)), big[5].size // (8 * len(lanes))
-    inverse, dx, nodes = np.zeros((m, m)), np.zeros((m, COLUMNS)), np.zeros((state.nodes.size, COLUMNS))
-    work = (
-        np.zeros(points), np.zeros(base), np.zeros((RATES + stages, fields)), np.zeros((layout.size, COLUMNS)),
-    )  # fmt: skip
-    still = np.zeros((stages, 3 * model.n + 6, COLUMNS))
+    sweep = model.sweep_buffers(state.mesh, lanes.count)
+    buffers = TangentBuffers(
+        sweep,
+        np.zeros(sweep.history.size // lanes.count),
+        np.zeros(sweep.base_history.size // lanes.count),
+        np.zeros((RATES + stages, fields)),
+        np.zeros((layout.size, COLUMNS)),
+        np.zeros((0, COLUMNS)),
+    )
+    nodes = np.zeros((state.nodes.size, COLUMNS))
+    result = Derivatives(np.zeros((m, m)), np.zeros((m, COLUMNS)), np.zeros((0, COLUMNS)), nodes)
+    differences = FiniteDifferences(1e-6, 0.1 * model.perturbation)
+    still = np.zeros((stages, input_rows(model.n).beta_rate, COLUMNS))
     for record in records:
+        done = SolvedStep(
+            model.parameters.copy(), record.inputs, record.found, record.before, record.rates, record.after
+        )
         assert step_tangent(
-            model.tubes, lanes, record.mesh, record.scheme.c0, record.scheme.weights, model.parameters.copy(),
-            record.inputs, record.found, record.before, record.rates, parameters, still, 1e-6, 0.1 * model.step, big,
-            work, columns, inverse, dx, nodes,
+            model.kind, lanes, record.mesh, record.scheme.coefficients, done, parameters, still, differences, buffers, columns, result
         )  # fmt: skip
 
     h = 1e-4

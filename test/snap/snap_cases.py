@@ -6,7 +6,7 @@ import numpy as np
 from model_cases import many_tubes
 from model_oracle import Oracle, rotation, turn
 
-from ctr_dynamics.kernels.snap_newton import make_work, residual
+from ctr_dynamics.kernels.snap_residual import residual, solver_arrays
 from ctr_dynamics.model.model import Model
 from ctr_dynamics.snap.solver import SnapSolver
 
@@ -59,7 +59,7 @@ def random_problem(n: int, seed: int, last_at_plate: bool = True, extended: bool
 def error_of(solver: SnapSolver, x: np.ndarray, c0: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """E, fields and base fields at `x` with the solver's histories."""
     arrays = solver.grid.arrays
-    work = make_work(arrays)
+    work = solver_arrays(arrays)
     for mine, given in (
         (work.hist, solver.work.hist),
         (work.hist_base, solver.work.hist_base),

@@ -5,8 +5,10 @@ import pytest
 from snap_cases import Twin, error_of, random_problem
 
 from ctr_dynamics.errors import InputError
-from ctr_dynamics.kernels import snap_newton as newton
-from ctr_dynamics.kernels.snap_equations import body, slope, state_size
+from ctr_dynamics.kernels.layout import field_rows, state_rows
+from ctr_dynamics.kernels.snap_equations import Side, body, slope
+from ctr_dynamics.kernels.snap_jacobian import back_solve, factorise
+from ctr_dynamics.kernels.snap_residual import residual
 from ctr_dynamics.model.model import Model
 from ctr_dynamics.robot_files import load_robot
 from ctr_dynamics.snap.grid import build_grid, default_cells
@@ -44,7 +46,7 @@ def test_spinning_discs_turn_as_their_angular_momentum_says():
     layout, par = solver.model.layout, solver.parameters.copy()
     for axis, value in zip("xyz", (4.9e-10, 4.9e-10, 9.6e-10), strict=True):
         par[layout[f"body_inertia_{axis}"]] = value
-    y, hist = rng.uniform(-1, 1, state_size(m)), rng.uniform(-1, 1, 7 + 2 * n) * 1e4
+    y, hist = rng.uniform(-1, 1, state_rows(m).size), rng.uniform(-1, 1, field_rows(n).size) * 1e4
     y[10:13] *= 300.0
     gamma_row, omega = 17 + 2 * m, y[10:13]
     y[gamma_row] = 9000.0
@@ -63,8 +65,9 @@ def test_spinning_discs_turn_as_their_angular_momentum_says():
 
     def bending_rate(parameters):
         """(2,) m_xy,s of a piece of the tubes."""
-        out, w, f = np.zeros(7 + 2 * n), np.zeros(2 * n), np.zeros(state_size(m))
-        slope(y, m, n, parameters, np.zeros(3 * n), hist, c0, out, w, f)
+        side = Side(np.zeros(3 * n), hist, np.zeros(field_rows(n).size))
+        w, f = np.zeros(2 * n), np.zeros(state_rows(m).size)
+        slope(y, m, n, parameters, side, c0, w, f)
         return f[16:18]
 
     still = par.copy()
@@ -84,9 +87,9 @@ def test_elimination_inverts_the_jacobian(n, c0, extended):
     solver, x = random_problem(n, n, extended=extended)
     x = solver.x + 0.1 * (x - solver.x)
     g, work = solver.grid.arrays, solver.work
-    newton.residual(g, x, solver.parameters, c0, work)
+    residual(g, x, solver.parameters, c0, work)
     size = work.left.shape[1]
-    assert newton.factorise(g, x, solver.parameters, c0, work, np.zeros((size, size)), np.zeros((size, size)))
+    assert factorise(g, x, solver.parameters, c0, work, np.zeros((size, size)), np.zeros((size, size)))
     J = np.empty((len(x), len(x)))
     for j in range(len(x)):
         step = np.zeros(len(x))
@@ -94,7 +97,7 @@ def test_elimination_inverts_the_jacobian(n, c0, extended):
         J[:, j] = (error_of(solver, x + step, c0)[0] - error_of(solver, x - step, c0)[0]) / 2e-6
     v = np.random.default_rng(n).standard_normal(len(x))
     solution = np.empty(len(x))
-    newton.back_solve(g, work, J @ v, solution)
+    back_solve(g, work, J @ v, solution)
     dense = np.linalg.solve(J, J @ v)
     assert np.abs(solution - v).max() < 1e-3
     assert np.abs(dense - v).max() < 1e-3  # the differences themselves are good enough to say so

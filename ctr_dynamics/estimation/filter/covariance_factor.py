@@ -18,12 +18,22 @@ from ctr_dynamics.estimation.filter.factor_reduction import BasisChange
 from ctr_dynamics.estimation.filter.parameter_priors import ModelUncertainty
 from ctr_dynamics.kernels.covariance import position_deviations
 from ctr_dynamics.kernels.factor_operations import sparse_product
-from ctr_dynamics.kernels.shooting import lanes_for, lanes_free
-from ctr_dynamics.kernels.tangent import linearise, theta_tangent
+from ctr_dynamics.kernels.kinds import lanes_for, lanes_free
+from ctr_dynamics.kernels.layout import input_rows, state_rows
+from ctr_dynamics.kernels.linearise import linearise
+from ctr_dynamics.kernels.structures import (
+    Derivatives,
+    FiniteDifferences,
+    Solution,
+    SolvedStep,
+    TangentBuffers,
+)
+from ctr_dynamics.kernels.tangent import theta_tangent
 from ctr_dynamics.model.mesh import Key, Mesh, build_mesh
 from ctr_dynamics.model.mesh_interpolation import Transfer, coarse_key, transfer
 from ctr_dynamics.model.model import Model
-from ctr_dynamics.model.simulator import Record, remap_columns
+from ctr_dynamics.model.remeshing import remap_columns
+from ctr_dynamics.model.simulator import Record
 
 Floats = NDArray[np.float64]
 FACTOR_NODES = 12  # of the factor's sections: fused errors of a model with 100 nodes change by less than 1 um
@@ -69,9 +79,10 @@ class CovarianceFactor:
     def __init__(self, model: Model, uncertainty: ModelUncertainty, rank: int) -> None:
         self.model, self.uncertainty = model, uncertainty
         # lanes that would idle beside them in the tangent's sweep carry columns too
-        self.rank = rank + lanes_free(6 + model.n + rank)
+        self.rank = rank + lanes_free(1 + model.unknown_count + rank)
         self._effect = csr_array(uncertainty.effect)
         self._work: dict[tuple, tuple] = {}
+        self._differences = FiniteDifferences(EPSILON, model.tangent_perturbation)
         self._coarse: dict[Key, tuple[Key, Mesh, Transfer | None]] = {}
         self.interpolation: Transfer | None = None
         self._norm = EnergyNorm(model)
@@ -96,10 +107,10 @@ class CovarianceFactor:
         model, unc = self.model, self.uncertainty
         own, mesh, interpolation = self._coarse_sections(key, mesh, beta)
         count = len(unc.names)
-        lanes = lanes_for(6 + model.n + count)
-        big = model.buffers(mesh, 8 * len(lanes))
-        main, base = len(big[4]) // (8 * len(lanes)), len(big[5]) // (8 * len(lanes))
-        m = 5 + model.n
+        m = model.unknown_count
+        lanes = lanes_for(1 + m + count)
+        sweep = model.sweep_buffers(mesh, lanes.count)
+        main, base = len(sweep.history) // lanes.count, len(sweep.base_history) // lanes.count
         par = par.copy()
         par[model.layout["alpha"]], par[model.layout["beta"]], par[model.layout["alpha_rate"]] = (
             alpha,
@@ -108,10 +119,11 @@ class CovarianceFactor:
         )
         scale = np.where(unc.sigma > 0, unc.sigma, 1e-3)
         dx, fields = np.zeros((m, count)), np.zeros((main + base, count))
-        dnodes = np.zeros((len(big[8]) // (8 * len(lanes)), count))
+        dnodes = np.zeros((len(sweep.nodes) // lanes.count, count))
+        solution = Solution(par, x, np.zeros(main), np.zeros(base))
         if not linearise(
-            model.tubes, lanes, mesh, 0.0, par, unc.effect * scale, x, np.zeros(main), np.zeros(base),
-            np.zeros((main + base, count)), 1e-4, model.tangent_step, big, np.zeros((m, m)), dx, fields, dnodes,
+            model.kind, lanes, 0.0, mesh, solution, unc.effect * scale, np.zeros((main + base, count)),
+            FiniteDifferences(1e-4, model.tangent_perturbation), sweep, Derivatives(np.zeros((m, m)), dx, fields, dnodes),
         ):  # fmt: skip
             dx[:], fields[:], dnodes[:] = 0.0, 0.0, 0.0  # some may have been written
         self.key, self.mesh, self.interpolation = own, mesh, interpolation
@@ -156,10 +168,10 @@ class CovarianceFactor:
         ``par`` (NP,): the parameter block. ``behind``: s, time before them that V has not followed yet.
         """
         model = self.model
-        m = 5 + model.n
+        m = model.unknown_count
         dpar = carried(self._effect, self.theta)
         for record in records:
-            beta = record.inputs[-1, 2 * model.n : 3 * model.n]
+            beta = record.inputs[-1, input_rows(model.n)["beta"]]
             key, mesh, interpolation = self._coarse_sections(record.key, record.mesh, beta)
             if key != self.key:
                 self._remap(key, mesh, beta)
@@ -171,20 +183,25 @@ class CovarianceFactor:
             work_key = (key, columns)
             if work_key not in self._work:
                 lanes = lanes_for(1 + m + columns)
-                L = 8 * len(lanes)
-                big = model.buffers(mesh, L)
-                main, base = len(big[4]) // L, len(big[5]) // L
-                self._work[work_key] = (
-                    lanes, big, (np.zeros(main), np.zeros(base), np.zeros((main + base, columns))), np.zeros((m, m)),
-                    (len(big[8]) // L, columns),
+                sweep = model.sweep_buffers(mesh, lanes.count)
+                main, base = len(sweep.history) // lanes.count, len(sweep.base_history) // lanes.count
+                buffers = TangentBuffers(
+                    sweep, np.zeros(main), np.zeros(base), np.zeros((0, 0)), np.zeros((0, 0)), np.zeros((main + base, columns))
                 )  # fmt: skip
-            lanes, big, work, inverse, shape = self._work[work_key]
+                self._work[work_key] = (
+                    lanes,
+                    buffers,
+                    np.zeros((m, m)),
+                    (len(sweep.nodes) // lanes.count, columns),
+                )
+            lanes, buffers, inverse, shape = self._work[work_key]
             # not in place: where a stage cannot be linearised, V stays as it is
             stored = self._spare if self._spare.shape == self.stored.shape else np.empty_like(self.stored)
             dx, dnodes = np.empty((m, columns)), np.empty(shape)
+            done = SolvedStep(par.copy(), record.inputs, record.found, record.before, rate[None], after)
             ok = theta_tangent(
-                model.tubes, lanes, mesh, record.scheme.dt + behind, par.copy(), record.inputs[-1], record.found[-1], after,
-                rate, dpar, EPSILON, model.tangent_step, big, work, self.stored, stored, inverse, dx, dnodes,
+                model.kind, lanes, mesh, record.scheme.dt + behind, done, dpar, self._differences, buffers, self.stored,
+                Derivatives(inverse, dx, stored, dnodes),
             )  # fmt: skip
             if not ok:
                 self._spare = stored
@@ -201,7 +218,7 @@ class CovarianceFactor:
 
     def nodes_change(self, a: Floats) -> Floats:
         """(nodes, S) change of the model's node states by the coefficients ``a`` (r,)."""
-        change = (self.dnodes @ a).reshape(-1, 16 + 3 * self.model.n)
+        change = (self.dnodes @ a).reshape(-1, state_rows(self.model.n).size)
         return change if self.interpolation is None else carried(self.interpolation.nodes, change)
 
     def position_deviation(self, pi: Floats) -> Floats:
@@ -210,7 +227,7 @@ class CovarianceFactor:
         The last result is given again while neither the rows nor ``pi`` are other arrays.
         """
         if self._deviation is None or self._deviation[0] is not self.dnodes or self._deviation[1] is not pi:
-            deviation = position_deviations(self.dnodes, 16 + 3 * self.model.n, pi)
+            deviation = position_deviations(self.dnodes, state_rows(self.model.n).size, pi)
             if self.interpolation is not None:
                 deviation = carried(self.interpolation.nodes, deviation)
             self._deviation = self.dnodes, pi, deviation

@@ -8,6 +8,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from ctr_dynamics.kernels.layout import base_end_rows, field_rows
 from ctr_dynamics.kernels.sections import section_lengths
 from ctr_dynamics.model.mesh import Key, Mesh
 from ctr_dynamics.model.model import Model
@@ -21,7 +22,7 @@ MOVED = 1e-3
 def field_weights(model: Model, mesh: Mesh, beta: Floats) -> Floats:
     """(fields,) weights of the energy norm on ``mesh`` with translations ``beta`` (N,) m."""
     n, layout, par = model.n, model.layout, model.parameters
-    F = 7 + 2 * n
+    F = field_rows(n).size
     seclen = np.zeros(len(mesh.sec_cells))
     section_lengths(mesh.bp_tube, mesh.bp_offset, beta, seclen)
     EI, GJ = par[layout["bending_stiffness"]], par[layout["torsional_stiffness"]]
@@ -46,7 +47,9 @@ def field_weights(model: Model, mesh: Mesh, beta: Floats) -> Floats:
         stage = np.append(np.tile(np.array([1.0, 2.0, 2.0, 1.0]) / 6.0 * step, mesh.base_cells), 0.0)
         rows.append((stage[:, None] * np.array([2 * RI[i], GJ[i]])).ravel())
         assert len(stage) == base_points
-    rows.append(np.zeros(4 * n))  # what only the extended physics moves at the tubes' bases and ends
+    rows.append(
+        np.zeros(base_end_rows(n).size)
+    )  # what only the extended physics moves at the tubes' bases and ends
     weights = np.concatenate(rows)
     body = par[layout["body_mass"]][0]
     main = sum((4 * c + 1) * F for c in mesh.sec_cells)
@@ -62,7 +65,9 @@ def energy_rows(model: Model, mesh: Mesh, beta: Floats) -> tuple[NDArray[np.int6
     """
     alike: list[NDArray[np.int64]] = []
     begin = 0
-    for cells, size in [(c, 7 + 2 * model.n) for c in mesh.sec_cells] + [(mesh.base_cells, 2)] * model.n:
+    for cells, size in [(c, field_rows(model.n).size) for c in mesh.sec_cells] + [
+        (mesh.base_cells, 2)
+    ] * model.n:
         points = np.arange(4 * cells + 1)
         points[2::4] -= 1
         points[3::4] += 1

@@ -155,4 +155,4 @@ class TipWindow:
 
 def insertion_fraction(model: Model) -> float:
     """Of d beta_1 / dt, what the velocities of ``model`` hold already: 0 without the extension `insertion_velocity`."""
-    return float(model.plant.block[model.layout["insertion"]][0]) if model.extended else 0.0
+    return float(model.plant.block[model.layout["insertion_velocity"]][0]) if model.extended else 0.0

@@ -1,9 +1,27 @@
-"""Numbers of several lanes at once, as a type of the compiler: kernels are written for one number and compiled for one, two, four or eight.
+"""Numbers of several lanes at once, as types of the compiler: kernels are written for one number and compiled for one, two, four or eight.
 
-A *lane* is one complete copy of the problem. A :class:`Pack` holds the same quantity of up to eight lanes in one vector of the processor (or more,
-where they are shorter); arithmetic on it is plain IEEE arithmetic on every lane. :class:`Rows` is a view of a flat array whose element ``r``
-is one number, or one pack, of row ``r``. Views count no references and check no bounds. A :func:`local_copy` of the workspace lies on the
-stack of the function that makes it: where all its indices are known to the compiler, it becomes registers.
+Why. A sweep along the tubes is one long chain of dependent operations: the processor mostly waits for its own last result. So it can compute other
+copies of the problem meanwhile, almost for nothing. The Jacobian (one perturbed unknown in each copy), the tangent of a step (one perturbed
+parameter in each copy) and two runs of the estimator are such copies. Each is a *lane* (:mod:`ctr_dynamics.kernels.kinds`).
+
+How. In memory the lane is the last index of every array, so that the same quantity of neighbouring lanes lies side by side. A
+:class:`SimdBatch` is a number of the compiler's that holds one such quantity for two, four or eight lanes in one vector register. Arithmetic
+on it is plain IEEE arithmetic on every lane, so that a lane gives the same bits alone and in company. A :class:`RowView` is a view of a flat array
+whose element ``r`` is the number, or the batch, of row ``r``::
+
+    @njit
+    def double(lanes, values):                       # values: (rows, lanes.count), flat
+        for first in range(0, lanes.count, lanes.width):
+            x = view(lanes, values, first, lanes.count)
+            for r in range(len(x)):
+                x[r] = 2.0 * x[r]                    # one number, or eight at once
+
+    double(ONE_LANE, np.ones(5))
+    double(Lanes(16, 8), np.ones(5 * 16))            # two batches of eight
+
+Why not loops over the lanes of plain arrays. The compiler would have to prove that the rows do not overlap and to keep the inner loops of some
+hundred statements vectorised and in registers; views count no references, check no bounds and leave nothing to prove. A :func:`local_copy` of the
+workspace lies on the stack of the function that makes it: where all its indices are known to the compiler, it becomes registers.
 
 No fast-math flags: which copy of a kernel runs depends on what was compiled before, and copies would round differently. Fused multiplications
 are asked for by name (:func:`fma`), and are then the same in every copy.
@@ -25,50 +43,45 @@ from numba.extending import (
     type_callable,
 )
 
-from ctr_dynamics.kernels.compiler import njit
-from ctr_dynamics.kernels.workspace import workspace_rows
+from ctr_dynamics.kernels.kinds import SIMD_WIDTH
+from ctr_dynamics.kernels.layout import workspace_rows
 
-PACK = 8  # lanes of a pack: a line of the cache, and the longest vector of today's processors
 DOUBLE = ir.DoubleType()
 INDEX = ir.IntType(64)
 
-_TWO_OVER_PI = 2.0 / math.pi
-_PIO2_HI = 1.57079632679489655800e00
-_PIO2_LO = 6.12323399573676603587e-17
 
-
-class Pack(types.Type):
+class SimdBatch(types.Type):
     """``width`` float64 numbers, one of each lane."""
 
     def __init__(self, width: int) -> None:
         self.width = width
-        super().__init__(name=f"Pack({width})")
+        super().__init__(name=f"SimdBatch({width})")
 
     def can_convert_from(self, typingctx, other):
         """A number is the same in every lane."""
         return numba.core.typeconv.Conversion.safe if isinstance(other, types.Number) else None
 
     def unify(self, typingctx, other):
-        """With a number it becomes a pack."""
+        """With a number it becomes a batch."""
         return self if isinstance(other, types.Number) else None
 
 
-class Rows(types.Type):
-    """View of a flat array: element ``r`` is the number or pack of row ``r``."""
+class RowView(types.Type):
+    """View of a flat array: element ``r`` is the number or batch of row ``r``."""
 
     def __init__(self, number: types.Type) -> None:
         self.number = number
-        super().__init__(name=f"Rows({number})")
+        super().__init__(name=f"RowView({number})")
 
 
-@register_model(Pack)
-class _PackModel(models.PrimitiveModel):
+@register_model(SimdBatch)
+class _BatchModel(models.PrimitiveModel):
     def __init__(self, dmm, fe_type):
         super().__init__(dmm, fe_type, _vector(fe_type))
 
 
-@register_model(Rows)
-class _RowsModel(models.StructModel):
+@register_model(RowView)
+class _ViewModel(models.StructModel):
     def __init__(self, dmm, fe_type):
         members = [
             ("data", types.CPointer(types.float64)),
@@ -79,14 +92,13 @@ class _RowsModel(models.StructModel):
 
 
 def _vector(number):
-    return ir.VectorType(DOUBLE, number.width) if isinstance(number, Pack) else DOUBLE
+    return ir.VectorType(DOUBLE, number.width) if isinstance(number, SimdBatch) else DOUBLE
 
 
 def _number_of(lanes):
-    """Type of the numbers of a block of lanes: float64 for an empty lane tuple, else packs."""
-    if not len(lanes):
-        return types.float64
-    return Pack(len(lanes) if isinstance(lanes.dtype, types.Boolean) else PACK)
+    """Type of the numbers of the type ``lanes``: float64, or batches."""
+    width = lanes.constants["width"]
+    return types.float64 if width == 1 else SimdBatch(width)
 
 
 def _widened(context, builder, value, source, target):
@@ -94,7 +106,7 @@ def _widened(context, builder, value, source, target):
     if source == target:
         return value
     value = context.cast(builder, value, source, types.float64)
-    if not isinstance(target, Pack):
+    if not isinstance(target, SimdBatch):
         return value
     kind = _vector(target)
     first = builder.insert_element(ir.Constant(kind, ir.Undefined), value, ir.Constant(ir.IntType(32), 0))
@@ -102,16 +114,16 @@ def _widened(context, builder, value, source, target):
     return builder.shuffle_vector(first, ir.Constant(kind, ir.Undefined), mask)
 
 
-@lower_cast(types.Number, Pack)
+@lower_cast(types.Number, SimdBatch)
 def _widen(context, builder, source, target, value):
     return _widened(context, builder, value, source, target)
 
 
 def _common(kinds):
-    """The pack among operands of one pack type and numbers; None for anything else."""
-    packs = {kind for kind in kinds if isinstance(kind, Pack)}
-    plain = all(isinstance(kind, (Pack, types.Number)) for kind in kinds)
-    return packs.pop() if plain and len(packs) == 1 else None
+    """The batch type among operands of one such type and numbers; None for anything else."""
+    batches = {kind for kind in kinds if isinstance(kind, SimdBatch)}
+    plain = all(isinstance(kind, (SimdBatch, types.Number)) for kind in kinds)
+    return batches.pop() if plain and len(batches) == 1 else None
 
 
 def _binary(function, instruction):
@@ -127,14 +139,14 @@ def _binary(function, instruction):
         a, b = (_widened(context, builder, v, kind, signature.return_type) for v, kind in pairs)
         return getattr(builder, instruction)(a, b)
 
-    for kinds in ((Pack, Pack), (Pack, types.Number), (types.Number, Pack)):
+    for kinds in ((SimdBatch, SimdBatch), (SimdBatch, types.Number), (types.Number, SimdBatch)):
         lower_builtin(function, *kinds)(lower)
 
 
 def _llvm(builder, name, number, args):
     """Call of LLVM's function ``name`` for numbers of one type."""
     kind = _vector(number)
-    suffix = f"v{number.width}f64" if isinstance(number, Pack) else "f64"
+    suffix = f"v{number.width}f64" if isinstance(number, SimdBatch) else "f64"
     declared = ir.FunctionType(kind, [kind] * len(args))
     return builder.call(
         cgutils.get_or_insert_function(builder.module, declared, f"llvm.{name}.{suffix}"), args
@@ -156,7 +168,7 @@ def _elementary(function, name):
     def lower(context, builder, signature, args):
         return _llvm(builder, name, signature.return_type, args)
 
-    lower_builtin(function, Pack)(lower)
+    lower_builtin(function, SimdBatch)(lower)
 
 
 for _plain, _in_place, _instruction in (
@@ -172,7 +184,7 @@ for _function, _name in ((math.sqrt, "sqrt"), (math.floor, "floor"), (math.exp, 
 _unary(operator.neg)
 
 
-@lower_builtin(operator.neg, Pack)
+@lower_builtin(operator.neg, SimdBatch)
 def _negative(context, builder, signature, args):
     return builder.fneg(args[0])
 
@@ -209,7 +221,7 @@ def largest(typingctx, a):
 
     def code(context, builder, signature, args):
         value = args[0]
-        if not isinstance(a, Pack):
+        if not isinstance(a, SimdBatch):
             return value
         best = builder.extract_element(value, ir.Constant(ir.IntType(32), 0))
         for lane in range(1, a.width):
@@ -221,12 +233,12 @@ def largest(typingctx, a):
 
 
 def _align_stack(builder, kind):
-    """Let the function's stack begin where a pack of the LLVM type ``kind`` may lie in one line of the cache.
+    """Let the function's stack begin where a batch of the LLVM type ``kind`` may lie in one line of the cache.
 
-    LLVM settles that before it knows that packs will be put aside there: an object that it cannot remove tells it.
+    LLVM settles that before it knows that batches will be put aside there: an object that it cannot remove tells it.
     """
     anchor = cgutils.alloca_once(builder, kind)
-    anchor.align = 8 * PACK
+    anchor.align = 8 * SIMD_WIDTH
     taken = ir.FunctionType(ir.VoidType(), [anchor.type])
     builder.asm(taken, "", "r", [anchor], side_effect=True)
 
@@ -238,10 +250,10 @@ def _view(context, builder, kind, data, stride, count):
 
 
 @intrinsic
-def rows(typingctx, lanes, array, first, stride):
-    """View of the flat float64 ``array`` from its element ``first`` on, ``stride`` elements a row, in packs of the lane tuple ``lanes``;
-    for the empty one the stride is 1."""
-    kind = Rows(_number_of(lanes))
+def view(typingctx, lanes, array, first, stride):
+    """View of the flat float64 ``array`` from its element ``first`` on, ``stride`` elements a row, in batches of ``lanes.width``; of a width of 1 the
+    stride is 1."""
+    kind = RowView(_number_of(lanes))
 
     def code(context, builder, signature, args):
         _, values, first, stride = args
@@ -253,9 +265,9 @@ def rows(typingctx, lanes, array, first, stride):
 
 
 @intrinsic
-def columns(typingctx, table, first):
-    """View of columns ``first`` to ``first`` + 7 of ``table`` (rows, columns), whose columns lie side by side, as one pack a row."""
-    kind = Rows(Pack(PACK))
+def column_view(typingctx, table, first):
+    """View of columns ``first`` to ``first`` + 7 of ``table`` (rows, columns), whose columns lie side by side, as one batch a row."""
+    kind = RowView(SimdBatch(SIMD_WIDTH))
 
     def code(context, builder, signature, args):
         table_of = context.make_array(table)(context, builder, args[0])
@@ -267,14 +279,14 @@ def columns(typingctx, table, first):
 
 
 @intrinsic
-def local_copy(typingctx, tubes, W):
+def local_copy(typingctx, kind, W):
     """Copy of the workspace ``W`` on the stack of the calling function; rows that nobody reads are not copied."""
-    count = workspace_rows(len(tubes))
+    count = workspace_rows(kind.constants["tubes"]).size
 
     def code(context, builder, signature, args):
-        width = W.number.width if isinstance(W.number, Pack) else 1
+        width = W.number.width if isinstance(W.number, SimdBatch) else 1
         data = cgutils.alloca_once(builder, DOUBLE, size=ir.Constant(INDEX, count * width))
-        if isinstance(W.number, Pack):
+        if isinstance(W.number, SimdBatch):
             _align_stack(builder, _vector(W.number))
         copy = _view(context, builder, W, data, ir.Constant(INDEX, width), ir.Constant(INDEX, count))
         for r in range(count):  # one by one, so that every index is a constant
@@ -283,14 +295,14 @@ def local_copy(typingctx, tubes, W):
             builder.store(value, _place(context, builder, W, copy, row, types.intp), align=8)
         return copy
 
-    return W(tubes, W), code
+    return W(kind, W), code
 
 
 def _place(context, builder, kind, view, index, index_kind):
     """Pointer to an element of a view."""
     proxy = cgutils.create_struct_proxy(kind)(context, builder, value=view)
     index = context.cast(builder, index, index_kind, types.intp)
-    if isinstance(kind.number, Pack):  # single numbers lie side by side
+    if isinstance(kind.number, SimdBatch):  # single numbers lie side by side
         index = builder.mul(index, proxy.stride)
     pointer = builder.gep(proxy.data, [index])
     return builder.bitcast(pointer, _vector(kind.number).as_pointer())
@@ -299,14 +311,14 @@ def _place(context, builder, kind, view, index, index_kind):
 @type_callable(operator.getitem)
 def _type_getitem(context):
     def typer(view, index):
-        if isinstance(view, Rows) and isinstance(index, types.Integer):
+        if isinstance(view, RowView) and isinstance(index, types.Integer):
             return view.number
         return None
 
     return typer
 
 
-@lower_builtin(operator.getitem, Rows, types.Integer)
+@lower_builtin(operator.getitem, RowView, types.Integer)
 def _getitem(context, builder, signature, args):
     kind, index_kind = signature.args
     return builder.load(_place(context, builder, kind, args[0], args[1], index_kind), align=8)
@@ -315,7 +327,7 @@ def _getitem(context, builder, signature, args):
 @type_callable(operator.setitem)
 def _type_setitem(context):
     def typer(view, index, value):
-        fits = isinstance(view, Rows) and isinstance(index, types.Integer)
+        fits = isinstance(view, RowView) and isinstance(index, types.Integer)
         if fits and (value == view.number or isinstance(value, types.Number)):
             return types.none
         return None
@@ -323,8 +335,8 @@ def _type_setitem(context):
     return typer
 
 
-@lower_builtin(operator.setitem, Rows, types.Integer, Pack)
-@lower_builtin(operator.setitem, Rows, types.Integer, types.Number)
+@lower_builtin(operator.setitem, RowView, types.Integer, SimdBatch)
+@lower_builtin(operator.setitem, RowView, types.Integer, types.Number)
 def _setitem(context, builder, signature, args):
     kind, index_kind, source = signature.args
     place = _place(context, builder, kind, args[0], args[1], index_kind)
@@ -335,47 +347,11 @@ def _setitem(context, builder, signature, args):
 @type_callable(len)
 def _type_len(context):
     def typer(view):
-        return types.intp if isinstance(view, Rows) else None
+        return types.intp if isinstance(view, RowView) else None
 
     return typer
 
 
-@lower_builtin(len, Rows)
+@lower_builtin(len, RowView)
 def _len(context, builder, signature, args):
     return cgutils.create_struct_proxy(signature.args[0])(context, builder, value=args[0]).count
-
-
-@njit(cache=True, forceinline=True, error_model="numpy")
-def sincos(x):
-    """(sin x, cos x) by polynomials, without library calls; error below 1e-12 for abs(x) < 1e4."""
-    k = math.floor(fma(x, _TWO_OVER_PI, 0.5))
-    r = fma(k, -_PIO2_LO, fma(k, -_PIO2_HI, x))
-    z = r * r
-    zz = z * z
-    # even and odd powers apart (Estrin): half as many operations wait for each other
-    s = fma(
-        fma(
-            zz,
-            fma(1.58962301576546568060e-10, z, -2.50507477628578072866e-8),
-            fma(2.75573136213857245213e-6, z, -1.98412698295895385996e-4),
-        ),
-        zz,
-        fma(8.33333333332211858878e-3, z, -1.66666666666666307295e-1),
-    )
-    s = fma(r * z, s, r)
-    c = fma(
-        fma(
-            zz,
-            fma(-1.13585365213876817300e-11, z, 2.08757008419747316778e-9),
-            fma(-2.75573141792967388112e-7, z, 2.48015872888517045348e-5),
-        ),
-        zz,
-        fma(-1.38888888888730564116e-3, z, 4.16666666666665929218e-2),
-    )
-    c = fma(zz, c, fma(-0.5, z, 1.0))
-    half = math.floor(0.5 * k)
-    odd = fma(-2.0, half, k)  # 0 or 1: odd quadrants swap sine and cosine
-    sign = fma(
-        -2.0, fma(-2.0, math.floor(0.5 * half), half), 1.0
-    )  # the cosine's sign changes every two quadrants
-    return sign * where_above(odd, 0.5, c, s), sign * where_above(odd, 0.5, -s, c)
