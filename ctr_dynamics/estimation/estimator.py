@@ -268,6 +268,10 @@ class Estimator:
         self.health.reinitialise()
         self.innovations.clear()
 
+    def carry_load(self, other: Estimator) -> None:
+        """Have the last known load of ``other``, whose place this one takes: what hangs on the robot still does."""
+        self.inputs.carry_load(other.inputs.load)
+
     def set_fusion(self, on: bool) -> None:
         """Fuse tracker measurements, or go on open loop; measurements are compared all the same."""
         self.health.fusing = on

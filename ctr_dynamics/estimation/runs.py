@@ -26,9 +26,7 @@ from ctr_dynamics.model.time_scheme import make_scheme
 from ctr_dynamics.parameters import Settings
 
 Floats = NDArray[np.float64]
-MAX_FAILURES = (
-    10  # steps in a row that may fail before the model is reinitialised at rest: 30 ms without an output
-)
+MAX_FAILURES = 10  # steps in a row that may fail before the model is reinitialised: 30 ms without an output
 
 
 class Runs:

@@ -1,4 +1,4 @@
-"""Numba kernels of variances: quadratic forms of rows under the covariance of the coefficients, eight rows side by side in one batch."""
+"""Variances: quadratic forms of rows under the covariance of the coefficients, eight rows side by side in the lanes of one vector."""
 
 import math
 
@@ -13,7 +13,10 @@ compiled = njit(cache=True, nogil=True, error_model="numpy")
 
 @compiled
 def side_by_side(rows, first, lanes):
-    """Fill ``lanes`` (s * 8,) with rows ``first`` to ``first`` + 7 of ``rows`` (k, s), zero where there are none: element p of each in one batch."""
+    """Fill ``lanes`` (s * 8,) with rows ``first`` to ``first`` + 7 of ``rows`` (k, s), zero where there are none.
+
+    Element p of all eight lies in one vector.
+    """
     count = min(SIMD_WIDTH, len(rows) - first)
     for p in range(rows.shape[1]):
         for lane in range(count):

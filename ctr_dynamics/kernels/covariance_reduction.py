@@ -45,9 +45,11 @@ def without(pi, root, weakest):
     """Take directions out of a covariance: the ``weakest`` (r, d), orthonormal, of the coefficients whitened by ``root`` (r, r), lower, with
     root root^T = pi[:r, :r].
 
-    Without them the r coefficients have r - d that are free. Returns the covariance of those, each by its deviation, and of all that follows
-    them in ``pi``; the (r - d, r) by which the r coefficients give them; and the change of the columns for :func:`eliminate`: sources (r - d,),
-    places (d,), parts (d, r - d) and deviations (r - d,).
+    Without them the r coefficients have r - d that are free. Returns:
+
+    - the covariance of those, each by its deviation, and of all that follows them in ``pi``;
+    - the (r - d, r) by which the r coefficients give them;
+    - the change of the columns for :func:`eliminate`: sources (r - d,), places (d,), parts (d, r - d) and deviations (r - d,).
     """
     r, d = weakest.shape
     size, k = len(pi), r - d

@@ -357,7 +357,7 @@ class EstimatorNode(Node):
             self.loop.put(lambda: self._estimator.set_fusion(settings["filter.enabled"]))
 
     def _swap(self, estimator: Estimator, settings: Settings) -> None:
-        estimator.inputs.carry_load(self._estimator.inputs.load)
+        estimator.carry_load(self._estimator)
         self._estimator = estimator
         self.timing.policy = settings["output.policy"]
         self.timing.input_timeout_ns = round(settings["input_timeout_s"] * 1e9)

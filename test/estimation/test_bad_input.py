@@ -161,7 +161,7 @@ def Run_without_restart(run):
 
 
 def test_bag_that_starts_again(sweep):
-    """Time runs backwards for good: the estimator starts anew with the new stamps."""
+    """Time runs backwards for good: the estimator begins again with the new stamps."""
     first = [m.shifted(100.0) for m in sweep if m.stamp <= 0.6e9]
     made, outputs = estimator(), []
     for messages in (first, [m for m in sweep if m.stamp <= 0.6e9]):
@@ -219,7 +219,7 @@ def test_gap_of_minutes_is_skipped():
     [(3.0, 0.0, 0.0, 0.0), (0.0, -6.0, 0.0, 0.0), (0.0, 0.0, 0.05, 0.0), (40.0, -40.0, 0.0, 0.0)],
 )
 def test_actuator_jump(jump):
-    """Within 10 ms, far beyond any actuator: no NaN gets out, and the robot comes to rest at the new place."""
+    """Within 10 ms, faster than any actuator: no NaN gets out, and the robot comes to rest at the new place."""
     after = [joints(0.3 + 0.01 * k, np.add(REST, jump)) for k in range(1, 91)]
     run = play([*still(0.3), *after])
     check_outputs(run)
@@ -236,7 +236,7 @@ def test_actuator_jump(jump):
 )
 def test_joints_that_are_wrong_for_a_while_beside_a_tracker_that_is_not(bag, turn, begin, end):
     """A tube's angle is reported too large by ``turn`` rad: the tracker contradicts the model, which is said; two seconds after the joints are
-    right again the outputs are. An estimate of the tracker's delay that readings have driven away must not shut out the later ones."""
+    right again the outputs are. An estimate of the tracker's delay that measurements have driven away must not shut out the later ones."""
 
     def wrong(m):
         if m.kind != "joints" or not begin * 1e9 < m.stamp < end * 1e9:
@@ -250,7 +250,9 @@ def test_joints_that_are_wrong_for_a_while_beside_a_tracker_that_is_not(bag, tur
     since = end + 2.0
     assert all(out.valid for out, t in zip(run.outputs, run.t, strict=True) if t > since)
     error, _ = truth_error(run, bag, "p_trk", since)
-    assert np.sqrt(np.mean(np.sum(error**2, axis=1))) < 6e-3  # m; 7 and 28 mm where readings were shut out
+    assert (
+        np.sqrt(np.mean(np.sum(error**2, axis=1))) < 6e-3
+    )  # m; 7 and 28 mm where measurements were shut out
     health = run.estimator.health
     assert health.dropped <= health.restarts  # a new start knows no tip of the moment before
 
@@ -395,7 +397,7 @@ def test_poses_without_joints_do_not_pile_up(sweep):
 
 
 def test_tracker_on_a_clock_that_is_ahead(sweep):
-    """Poses an hour ahead of the joints are counted, not kept for an hour."""
+    """Poses an hour ahead of the joints are counted, not stored for an hour."""
     run = contiguous(
         play(
             [

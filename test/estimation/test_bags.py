@@ -70,11 +70,11 @@ def test_model_alone_leaves_little_more_than_the_tracker_noise(run_of):
 def test_fusion_removes_what_is_hidden(run_of):
     residual = run_of("payload_protocol").estimator.summary()["residual_rms_m"]
     assert residual["fused"] < 0.4 * residual["predicted"]
-    alone = run_of("payload_protocol").column("predicted_position")
+    open_loop = run_of("payload_protocol").column("predicted_position")
     truth = np.load(BAGS / "truth" / "payload_protocol.npz")
     t = run_of("payload_protocol").t
     true_tip = np.array([np.interp(t, truth["t"], truth["p_trk"][:, i]) for i in range(3)]).T
-    assert nearer(run_of("payload_protocol"), "payload_protocol")[0] < 0.25 * rms(alone - true_tip)
+    assert nearer(run_of("payload_protocol"), "payload_protocol")[0] < 0.25 * rms(open_loop - true_tip)
 
 
 def test_backbone_follows_the_true_shape(run_of):

@@ -113,12 +113,12 @@ def test_a_tracker_that_contradicts_for_good_does_not_lead_the_runs_astray(relea
     messages = [m for m in release if m.stamp < 2e9]
     run = play(reshaped(messages, lambda p, q, m: (p + np.array([beside, 0.0, 0.0]), q)))
     health = run.estimator.health
-    assert health.restarts <= 2, "22 where every second reading is fused"
+    assert health.restarts <= 2, "22 where every second measurement is fused"
     assert health.rejecting
     reasons = {out.reason for out in run.outputs if out.stamp_ns > START_NS + 1_000_000_000}
     assert any("tracker contradicts the model" in reason for reason in reasons)
-    alone = play(messages, {"filter.enabled": False})
-    assert rms(run.column("predicted_position")[-50:] - alone.column("predicted_position")[-50:]) < 1e-6
+    open_loop = play(messages, {"filter.enabled": False})
+    assert rms(run.column("predicted_position")[-50:] - open_loop.column("predicted_position")[-50:]) < 1e-6
 
 
 @pytest.mark.parametrize(
@@ -158,8 +158,8 @@ def test_joints_that_were_wrong_for_a_second_are_overcome():
 def test_a_contradiction_ends_with_the_samples_that_showed_it():
     """A tracker that is unplugged leaves the model's prediction, as one does that has never been there."""
     rng = np.random.default_rng(0)
-    kept = [m for m in bag_messages("clean_release", 2.2) if m.kind != "pose" or m.stamp < 0.7e9]
-    run = play(reshaped(kept, lambda p, q, m: (p + rng.uniform(-0.3, 0.3, 3), q)))
+    messages = [m for m in bag_messages("clean_release", 2.2) if m.kind != "pose" or m.stamp < 0.7e9]
+    run = play(reshaped(messages, lambda p, q, m: (p + rng.uniform(-0.3, 0.3, 3), q)))
     assert any("tracker contradicts the model" in out.reason for out in run.outputs)
     since = [out for out in run.outputs if out.k * 0.003 > 1.75]
     assert since
@@ -197,8 +197,8 @@ def test_fusion_off_is_the_model_alone(release):
     assert len(innovations) == sum(m.kind == "pose" for m in release)
     assert not any(i.accepted for i in innovations)
     assert run.estimator.summary()["residual_rms_m"]["fused"] is None
-    alone = play([m for m in release if m.kind != "pose"])
-    assert np.abs(run.column("tip_position") - alone.column("tip_position")).max() < 1e-6
+    open_loop = play([m for m in release if m.kind != "pose"])
+    assert np.abs(run.column("tip_position") - open_loop.column("tip_position")).max() < 1e-6
 
 
 def test_predicted_pose_is_never_corrected(release, plain):
@@ -340,7 +340,7 @@ def test_registration_parameter_undoes_a_moved_tracker(release, plain):
     assert np.abs(run.column("tip_position") - plain.column("tip_position")).max() < 2e-6
     covariance = plain.column("tip_covariance")
     assert np.abs(run.column("tip_covariance") - covariance).max() < 1e-3 * np.abs(covariance).max()
-    # without the parameter the samples make no sense
+    # without the parameter the measurements make no sense
     assert play(moved[:60]).estimator.health.nis_sum > 1e4
 
 
@@ -389,7 +389,7 @@ def test_parameters_compose_with_the_robot_file():
 
 
 def test_the_lever_arm_of_a_tracker_without_orientation_is_turned_by_the_models_own(release):
-    """The same readings at the end of an arm of 15 mm, with quaternions that mean nothing: residuals are those without the arm."""
+    """The same measurements at the end of an arm of 15 mm, with quaternions that mean nothing: residuals are those without the arm."""
     arm = np.array([0.015, 0.0, 0.0])
     messages, armed = [m for m in release if m.stamp < 2e9], []
     for m in messages:

@@ -32,23 +32,25 @@ def by_hand(V, pi, weights):
     lam, E = np.linalg.eigh(pi[:WIDE, :WIDE])
     root = E * np.sqrt(lam)
     _, U = np.linalg.eigh(root.T @ V.T @ np.diag(weights) @ V @ root)
-    kept = root @ U[:, APPENDED:] @ U[:, APPENDED:].T @ np.linalg.inv(root)
-    return of_columns(V @ kept, pi)
+    projection = root @ U[:, APPENDED:] @ U[:, APPENDED:].T @ np.linalg.inv(root)
+    return of_columns(V @ projection, pi)
 
 
 @pytest.mark.parametrize("way", [reduced, principal])
 @pytest.mark.parametrize("seed", range(12))
 def test_what_is_left_is_the_covariance_of_the_principal_columns(way, seed):
     V, pi, weights = case(seed, 0.3 * seed)
-    after, change, kept = way(pi, V.T @ (weights[:, None] * V), RANK)
+    after, change, projection = way(pi, V.T @ (weights[:, None] * V), RANK)
     fewer = change(V)
     assert fewer.shape == (ROWS, RANK)
     np.testing.assert_array_equal(after, after.T)
     np.testing.assert_allclose(after.diagonal()[:RANK], 1.0, rtol=1e-9)
     np.testing.assert_array_equal(after[RANK:, RANK:], pi[WIDE:, WIDE:])
-    np.testing.assert_allclose(kept @ change(np.eye(WIDE)), np.eye(RANK), atol=1e-9)
-    np.testing.assert_allclose(kept @ pi[:WIDE, :WIDE] @ kept.T, after[:RANK, :RANK], atol=1e-9)
-    np.testing.assert_allclose(kept @ pi[:WIDE, WIDE:], after[:RANK, RANK:], atol=1e-9 * np.abs(after).max())
+    np.testing.assert_allclose(projection @ change(np.eye(WIDE)), np.eye(RANK), atol=1e-9)
+    np.testing.assert_allclose(projection @ pi[:WIDE, :WIDE] @ projection.T, after[:RANK, :RANK], atol=1e-9)
+    np.testing.assert_allclose(
+        projection @ pi[:WIDE, WIDE:], after[:RANK, RANK:], atol=1e-9 * np.abs(after).max()
+    )
     for found, wanted in zip(of_columns(fewer, after), by_hand(V, pi, weights), strict=True):
         np.testing.assert_allclose(found, wanted, rtol=1e-8, atol=1e-9 * np.abs(wanted).max())
 
@@ -127,8 +129,8 @@ def test_kernels_against_plain_python(seed):
     K = np.eye(WIDE) - (root @ weakest) @ (
         weakest.T @ np.linalg.inv(root)
     )  # of the coefficients that are left
-    after, kept, sources, places, parts, deviation = compiled
-    np.testing.assert_allclose(kept, K[sources] / deviation[:, None], rtol=1e-9, atol=1e-11)
+    after, projection, sources, places, parts, deviation = compiled
+    np.testing.assert_allclose(projection, K[sources] / deviation[:, None], rtol=1e-9, atol=1e-11)
     projected = np.block(
         [
             [K @ pi[:WIDE, :WIDE] @ K.T, K @ pi[:WIDE, WIDE:]],

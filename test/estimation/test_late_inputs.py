@@ -1,4 +1,4 @@
-"""Inputs that come late, out of order or early: roll-back, the window of kept tips, and the two output policies."""
+"""Inputs that come late, out of order or early: revert, the window of stored tips, and the two output policies."""
 
 import math
 from collections import Counter
@@ -76,19 +76,19 @@ def test_late_joints_under_predict_end_as_in_time_under_wait(sweep, in_time):
     assert max(differences) > 1e-6
     last = in_time.last
     assert run.last.k == last.k
-    # steps taken again keep the covariance of their first course, and both runs end within the solver's tolerance
+    # steps taken again reuse their stored covariance, and both runs end within the solver's tolerance
     assert np.abs(run.last.tip_position - last.tip_position).max() < 2e-6
     assert np.abs(run.last.tip_velocity - last.tip_velocity).max() < 1e-3
     variance = np.diag(last.tip_covariance)
-    # roll-back after joints keeps the covariance of the first course: a few percent in variance
+    # the stored covariance was that of extrapolated joints: a few percent in variance
     assert np.abs(np.diag(run.last.tip_covariance) - variance).max() < 5e-2 * variance.max()
     assert np.abs(run.last.predicted_position - last.predicted_position).max() < 1e-6
-    # samples are counted once, however often they were fused again
+    # measurements are counted once, however often they were fused again
     assert run.estimator.health.accepted == in_time.estimator.health.accepted
 
 
 def corrected_apart(a, b):
-    """Distances (m) of the tips, fused and of the model alone, after the last corrections: the last output may have been before them."""
+    """Distances (m) of the tips, fused and open loop, after the last corrections: the last output may have been before them."""
     return tuple(
         float(np.linalg.norm(x.last.position - y.last.position))
         for x, y in (
@@ -104,8 +104,8 @@ def nis(run):
     return {i.stamp_ns: i.nis / i.dof for i in reported + run.estimator.innovations.take() if i.dof}
 
 
-@pytest.mark.parametrize("share", [0.3, 0.7])
-def test_corrections_without_time_are_put_off_and_end_the_same(sweep, in_time, share):
+@pytest.mark.parametrize("chance", [0.3, 0.7])
+def test_corrections_without_time_are_put_off_and_end_the_same(sweep, in_time, chance):
     """Joints and poses come late, and now and then there is no time to go on with the correction."""
     rng = np.random.default_rng(7)
     late = [
@@ -116,34 +116,34 @@ def test_corrections_without_time_are_put_off_and_end_the_same(sweep, in_time, s
         late,
         {"output.policy": "predict"},
         tick=STEP,
-        spare=lambda made: math.inf if made.k > 350 or rng.random() < share else 0.0,
+        spare=lambda made: math.inf if made.k > 350 or rng.random() < chance else 0.0,
     )
     check_outputs(run)
     assert [out.k for out in run.outputs] == list(range(len(run.outputs)))
     assert all(out.valid for out in run.outputs)
     assert not run.estimator.correcting
     straight = play(late, {"output.policy": "predict"}, tick=STEP)
-    # put-off corrections are begun anew after what came meanwhile, never left out
+    # postponed corrections begin again after what came meanwhile, and are never left out
     assert run.estimator.health.corrected_steps != straight.estimator.health.corrected_steps
     for reference in (straight, in_time):
-        fused, alone = corrected_apart(run, reference)
-        assert fused < 1e-5  # the covariance of the first course is kept
-        assert alone < 2e-6
-    # samples are counted once, however often they were fused again
+        fused, open_loop = corrected_apart(run, reference)
+        assert fused < 1e-5  # the stored covariance is reused
+        assert open_loop < 2e-6
+    # measurements are counted once, however often they were fused again
     health = run.estimator.health
     assert health.accepted + health.rejected == in_time.estimator.health.accepted
     stamps = [i.stamp_ns for out in run.outputs for i in out.innovations]
     assert len(stamps) == len(set(stamps))
     found, expected = nis(run), nis(straight)
     assert found.keys() == expected.keys()
-    # poses are compared with the corrected course, and not with what was published before the correction
+    # poses are compared with the corrected trajectory, and not with what was published before the correction
     apart = [abs(found[stamp] - expected[stamp]) for stamp in found]
     assert np.mean(apart) < 0.05
 
 
 @pytest.mark.parametrize(("delay", "time_for", "limit"), [(0.002, 3, 0.05e-3), (0.012, 4, 0.2e-3)])
 def test_steps_before_their_correction_do_not_take_it_for_a_jump_of_the_joints(sweep, delay, time_for, limit):
-    """Between two steps there is time for a few of a correction; what is published meanwhile stays near the course that is corrected at once."""
+    """Between two steps there is time for a few of a correction; what is published meanwhile stays near the trajectory that is corrected at once."""
     late = [m.late(delay) if m.kind == "joints" and m.stamp > 0 else m for m in sweep if m.stamp < 1.5e9]
     asked = Counter()
 
@@ -218,7 +218,7 @@ def test_late_load_ends_as_in_time(release, policy):
 
 
 def test_a_jump_of_the_load_is_corrected_at_once_though_there_is_no_time(release):
-    """Poses that were fused into a course without the cut would throw the estimate off by more than what they measure."""
+    """Poses that were fused into a trajectory without the cut would throw the estimate off by more than what they measure."""
     late = [m.late(0.060) if m.kind == "load" and 0.9e9 < m.stamp < 1.3e9 else m for m in release]
     run = play(late, {"output.policy": "predict"}, tick=STEP, spare=lambda made: 0.0)
     reference = play(release, {"output.policy": "predict"}, tick=STEP)
@@ -260,9 +260,9 @@ def test_a_load_beyond_the_window_counts_only_where_it_is_the_newest(release):
     assert np.array_equal(run.column("tip_position"), left_out.column("tip_position"))
 
     # the only news of a load for long, late as it is, is what hangs there now
-    kept = [m for m in messages if m.kind != "load"] + loads[:1]
+    joints_only = [m for m in messages if m.kind != "load"] + loads[:1]
     gone = replace(loads[5], content=((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), loads[5].content[2]))
-    run, unaware = play([*kept, gone.late(0.3)]), play(kept)
+    run, unaware = play([*joints_only, gone.late(0.3)]), play(joints_only)
     assert "too late" not in run.estimator.health.load
     assert np.abs(run.last.predicted_position - unaware.last.predicted_position).max() > 1e-3
 
@@ -274,7 +274,7 @@ def test_a_way_back_begins_with_what_a_pause_has_settled(sweep):
     def with_pauses(made):
         advance, energy = made.advance, made.runs.fused.ekf.factor.energy  # asked for once a reduction
 
-        def paused(*arguments):
+        def then_idle(*arguments):
             steps = advance(*arguments)
             if steps:
                 made.do_idle_work()
@@ -284,7 +284,7 @@ def test_a_way_back_begins_with_what_a_pause_has_settled(sweep):
             counts[-1] += 1
             return energy()
 
-        made.advance, made.runs.fused.ekf.factor.energy = paused, counted
+        made.advance, made.runs.fused.ekf.factor.energy = then_idle, counted
 
     late = [m.late(0.001) if m.kind == "joints" else m for m in sweep]
     for policy in ("wait", "predict"):
@@ -296,12 +296,12 @@ def test_a_way_back_begins_with_what_a_pause_has_settled(sweep):
 
 
 def test_figures_of_poses_that_are_first_fused_on_a_way_back_count_once(sweep, in_time):
-    """Residuals and NIS are means over the same samples, however late these came."""
+    """Residuals and NIS are means over the same measurements, however late these came."""
     late = [m.late(0.012) if m.kind == "joints" else m for m in sweep]
     run = play(late, {"output.policy": "predict"}, tick=STEP, spare=lambda made: 0.0)
     h, reference = run.estimator.health, in_time.estimator.health
     assert h.corrected_steps > 100
-    assert (h._compared, h.nis_count) == (reference._compared, reference.nis_count)
+    assert (h.compared, h.nis_count) == (reference.compared, reference.nis_count)
     found, expected = h.residual_rms(), reference.residual_rms()
     assert found["predicted"] == pytest.approx(expected["predicted"], rel=1e-3)
     assert found["fused"] == pytest.approx(expected["fused"], rel=0.02)

@@ -118,6 +118,6 @@ def test_an_equilibrium_keeps_sections_that_fit():
             break
     else:
         pytest.fail("the sections never differ")
-    fresh, kept = (Statics(model).solve(beta, REST[:2], key=known) for known in (None, key))
-    assert (fresh.key, kept.key) == (model.mesh(beta)[0], key)
-    assert np.linalg.norm(fresh.nodes[-1, :3] - kept.nodes[-1, :3]) < 1e-6
+    fresh, known = (Statics(model).solve(beta, REST[:2], key=known_key) for known_key in (None, key))
+    assert (fresh.key, known.key) == (model.mesh(beta)[0], key)
+    assert np.linalg.norm(fresh.nodes[-1, :3] - known.nodes[-1, :3]) < 1e-6

@@ -90,11 +90,11 @@ def test_signal_bends_where_its_rate_changes_by_more_than_the_least():
 
 
 def test_signal_forgets_only_what_no_later_time_needs():
-    kept, whole = ramp(), ramp()
-    kept.forget(20_000_000)
-    assert kept.stamps == [10_000_000, 30_000_000]
+    shortened, whole = ramp(), ramp()
+    shortened.forget(20_000_000)
+    assert shortened.stamps == [10_000_000, 30_000_000]
     for time in (20_000_000, 25_000_000, 40_000_000):
-        assert np.array_equal(kept.at(time)[0], whole.at(time)[0])
+        assert np.array_equal(shortened.at(time)[0], whole.at(time)[0])
 
 
 def test_joint_order():

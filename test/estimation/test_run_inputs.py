@@ -15,14 +15,14 @@ PLAIN = ActuatorModel(np.ones(2), np.zeros(2), np.zeros(2), np.zeros(2))
 
 
 def line(before, after, begin, end, times):
-    """Values and rates (times, size) on the line between two samples."""
+    """Values and rates (times, size) on the line between two stamps."""
     rate = (after - before) * (1e9 / (end - begin))
     ahead = (np.array(times) - begin) * 1e-9
     return before + ahead[:, None] * rate, np.tile(rate, (len(times), 1))
 
 
 def signal(make):
-    """Seven samples of four values, 10 ms apart."""
+    """Seven stamps with four values, 10 ms apart."""
     made = make()
     for k in range(7):
         made.add(10 * k * MS, RNG.normal(size=4))
@@ -30,7 +30,7 @@ def signal(make):
 
 
 @pytest.fixture(params=["plain", "backlash", "delayed"])
-def sampled(request):
+def stamped(request):
     makes = {
         "plain": lambda: ActuatorSignal(PLAIN),
         "backlash": lambda: ActuatorSignal(PLAIN.changed(backlash=np.array([0.3, 0.0]))),
@@ -60,20 +60,20 @@ def sampled(request):
         (70, 0),
     ],
 )
-def test_stages_together_are_the_stages_alone(sampled, first, extrapolate, load):
+def test_stages_together_are_the_stages_one_by_one(stamped, first, extrapolate, load):
     t0_ns = -3 * MS
     wrench = Signal(6)
     for k in range({"none": 0, "held": 1, "moving": 9}[load]):
         wrench.add((10 * k - 12) * MS, RNG.normal(size=6))
     inputs = SimpleNamespace(
-        t0_ns=t0_ns, joints=sampled, load=wrench, timeout_ns=extrapolate * MS, extrapolating=extrapolate > 0
+        t0_ns=t0_ns, joints=stamped, load=wrench, timeout_ns=extrapolate * MS, extrapolating=extrapolate > 0
     )
     signals = InterpolatedInputs(SimpleNamespace(n=2, input_count=14), inputs)
     stamps = [round((first + part) * MS) for part in (0.4359, 0.718, 1.0)]
     rows, beta_rate = signals.rows(np.array([(stamp - t0_ns) * 1e-9 for stamp in stamps]))
     assert rows.shape == (3, 14)
     for k, stamp in enumerate(stamps):
-        value, rate = sampled.at(stamp, extrapolate * MS)
+        value, rate = stamped.at(stamp, extrapolate * MS)
         force = wrench.at(stamp)[0] if wrench.stamps else np.zeros(6)
         wanted = np.concatenate([value[:2], rate[:2], value[2:], force, rate[2:]])
         np.testing.assert_allclose(rows[k, :12], wanted[:12], rtol=1e-12, atol=1e-15)

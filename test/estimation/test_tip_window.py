@@ -92,7 +92,7 @@ def test_sensitivity_equals_finite_differences():
     H = tracker.innovation(bias, tip, np.eye(COLUMNS + STATES), *expected(tracker, bias, tip))[1]
     assert H.shape == (6, COLUMNS + STATES)
     for column in range(COLUMNS + STATES):
-        readings = []
+        measured = []
         for h in (STEP, -STEP):
             a, b = np.zeros(COLUMNS), bias.copy()
             if column < COLUMNS:
@@ -100,8 +100,8 @@ def test_sensitivity_equals_finite_differences():
             else:
                 b[column - COLUMNS] += h
             # an older pose is that of an earlier time
-            readings.append(expected(tracker, b, moved(tip, a, seconds=-(b[DELAY] - bias[DELAY]))))
-        difference = residual(*readings[0], *readings[1]) / (2 * STEP)
+            measured.append(expected(tracker, b, moved(tip, a, seconds=-(b[DELAY] - bias[DELAY]))))
+        difference = residual(*measured[0], *measured[1]) / (2 * STEP)
         assert np.allclose(H[:, column], difference, rtol=1e-6, atol=1e-7), column
 
 
@@ -261,7 +261,7 @@ def test_window_with_steps_missing():
 
 
 def test_columns_are_interpolated_like_the_tip():
-    """The columns' interpolation is the derivative of the tip's: move all kept tips along a column and compare."""
+    """The columns' interpolation is the derivative of the tip's: move all stored tips along a column and compare."""
     changes = [0.1 * RNG.normal(size=(22, 2)) for _ in range(3)]
 
     def window(along):
@@ -338,7 +338,7 @@ def test_checkpoints_by_reference_are_as_good_as_copies():
     rng, step = np.random.default_rng(4), 0.003
     window = TipWindow(6)
     window.clear(COLUMNS)
-    kept: list[tuple] = []
+    stored_states: list[tuple] = []
     k = 0
 
     def seen(w):
@@ -351,14 +351,14 @@ def test_checkpoints_by_reference_are_as_good_as_copies():
             window.append(step * k, node_at(step * k), rng.normal(size=(22, COLUMNS)), 0.0)
             k += 1
             window.interpolate(int(rng.integers(window.OPEN)))
-            kept.append((k, window.checkpoint(), copy.deepcopy(window)))
+            stored_states.append((k, window.checkpoint(), copy.deepcopy(window)))
         elif action == "reduce" and k:
             window.change_basis(through(rng.normal(size=(COLUMNS + 3, COLUMNS))), COLUMNS)
         elif action == "shift" and k:
             window.shift(1e-3 * rng.normal(size=COLUMNS))
-        elif action == "back" and len(kept) > 5:
-            del kept[-int(rng.integers(1, 5)) :]
-            k, stored, copied = kept[-1]
+        elif action == "back" and len(stored_states) > 5:
+            del stored_states[-int(rng.integers(1, 5)) :]
+            k, stored, copied = stored_states[-1]
             window.restore(stored)
             for a, b in zip(seen(window), seen(copied), strict=True):
                 np.testing.assert_array_equal(a, b)

@@ -108,7 +108,7 @@ def test_modes_are_recomputed_only_where_the_robot_has_moved(model):
         assert not found
         assert np.array_equal(same, frequency)
         assert np.abs(amplitude).max() < 1e-8
-    assert refreshed(ALPHA)[2]  # kept often enough
+    assert refreshed(ALPHA)[2]  # reused often enough
     assert not refreshed(ALPHA)[2]
     moved, amplitude, found = refreshed(ALPHA + np.array([0.3, 0.0]))
     assert found

@@ -1,4 +1,4 @@
-"""The measurement in plain NumPy: what a tip and tracker states predict, and how a reading differs from it (docs/filter.md)."""
+"""The measurement in plain NumPy: what a tip and tracker states predict, and how a measurement differs from it (docs/filter.md)."""
 
 import math
 
@@ -17,7 +17,7 @@ def expected(model, bias, tip):
 
 
 def residual(position, quaternion, expected_position, expected_quaternion, mask=None):
-    """(6,) reading minus expectation; where ``mask`` (6,) leaves out one rotation axis, without the turn about it."""
+    """(6,) measured minus expected; where ``mask`` (6,) leaves out one rotation axis, without the turn about it."""
     turned = multiply(conjugate(expected_quaternion), quaternion)
     if mask is not None and mask[3:].sum() == 2:
         axis = 1 + int(np.argmin(mask[3:]))

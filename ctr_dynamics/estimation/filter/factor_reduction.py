@@ -19,7 +19,7 @@ from ctr_dynamics.kernels.covariance_reduction import eliminate, without
 
 Floats = NDArray[np.float64]
 APPENDED = (
-    3  # columns that the tip force's process noise has appended since the last reduction, one for each axis
+    3  # columns that process noise has appended since the last reduction: one for each axis of the force
 )
 # Least entry of the root's diagonal, by the largest, with which columns are eliminated: solving with the root then keeps some ten digits.
 REGULAR = 1e-5

@@ -13,7 +13,7 @@ from ctr_dynamics.io.messages.topics import accepts_frame
 from ctr_dynamics.sensing.interpolation import finite, joint_order
 
 Floats = NDArray[np.float64]
-UNIT = 1e-3  # by which a quaternion's norm may miss one without a note: trackers send four digits
+UNIT = 1e-3  # by which a quaternion's norm may miss one without a note: rounding of a tracker's driver
 
 
 class Unusable(Exception):

@@ -20,7 +20,7 @@ from ctr_dynamics.estimation.step_output import OK, WARN, Innovation, Status
 
 Floats = NDArray[np.float64]
 
-LAGS = 8  # of the autocorrelation, in measurements: 0.2 s at 40 Hz, half a period of the slowest modes
+LAGS = 8  # of the autocorrelation, in measurements: 0.2 s at 40 Hz, about a period of a slow vibration
 
 
 @dataclass(frozen=True)

@@ -59,6 +59,7 @@ class Health:
         recent: (nis / dof, within the gate) of the last of them.
         tracker_age_s: since the newest measurement that reached the gate, or the start.
         force_sigma: N, deviation of the tip force in the process noise.
+        compared: measurements whose residuals are in the rms of both runs.
         consistency: watches the innovations. stability: of the equilibrium that belongs to the present actuators.
     """
 
@@ -86,8 +87,8 @@ class Health:
     tracker_age_s: float = 0.0
     consistency: ConsistencyMonitor = field(default_factory=ConsistencyMonitor)
     stability: Stability | None = None
+    compared: int = 0
     _squares: tuple[float, float] = (0.0, 0.0)  # m^2, open loop and fused
-    _compared: int = 0
 
     # -- counting --
 
@@ -112,7 +113,7 @@ class Health:
                 self._squares[0] + float(open_loop @ open_loop),
                 self._squares[1] + float(fused @ fused),
             )
-            self._compared += 1
+            self.compared += 1
         if not innovation.dof:
             self.dropped += 1
             return
@@ -130,14 +131,14 @@ class Health:
         """What has been counted of measurements, for :meth:`restore_counts`."""
         return MeasurementCounts(
             self.nis_count, self.nis_sum, self.nis_dof, self.accepted, self.rejected, self.dropped,
-            self._squares, self._compared, list(self.recent),
+            self._squares, self.compared, list(self.recent),
         )  # fmt: skip
 
     def restore_counts(self, counts: MeasurementCounts) -> None:
         """Have counted of measurements what :meth:`measurement_counts` gave."""
         self.nis_count, self.nis_sum, self.nis_dof = counts.nis_count, counts.nis_sum, counts.nis_dof
         self.accepted, self.rejected, self.dropped = counts.accepted, counts.rejected, counts.dropped
-        self._squares, self._compared = counts.squares, counts.compared
+        self._squares, self.compared = counts.squares, counts.compared
         self.recent.clear()
         self.recent.extend(counts.recent)
 
@@ -190,7 +191,7 @@ class Health:
 
     def residual_rms(self) -> dict[str, float | None]:
         """m between measurements and outputs: open loop, and fused where the filter is on."""
-        open_loop, fused = (math.sqrt(s / self._compared) if self._compared else None for s in self._squares)
+        open_loop, fused = (math.sqrt(s / self.compared) if self.compared else None for s in self._squares)
         return {"predicted": open_loop, "fused": fused if self.fusing else None}
 
     def nis_summary(self) -> dict[str, float | int | bool | None]:

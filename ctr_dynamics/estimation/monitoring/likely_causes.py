@@ -282,8 +282,8 @@ class CauseRegression:
     def causes(self) -> list[Cause]:
         """The likeliest causes, likeliest first; none where no cause explains enough of what lies above the noise.
 
-        A cause is worth the logarithm of what it leaves, times the number of independent residuals, less a penalty for each unknown (the
-        Bayesian information criterion): the best one, its rivals, then what explains most of the rest.
+        Listed are the best one, its rivals, then what explains most of the rest. A cause is worth the logarithm of what it leaves, times the
+        number of independent residuals, less a penalty for each unknown (Bayesian information criterion).
         """
         options = self.options
         self._take_in()

@@ -10,9 +10,7 @@ from ctr_dynamics.estimation.step_output import ERROR, OK, WARN, Status
 if TYPE_CHECKING:
     from ctr_dynamics.estimation.monitoring.health import Counter, Health
 
-TRACKER_LIMIT_S = (
-    1.0  # without a usable measurement for longer than this the status says so: 40 missing at 40 Hz
-)
+TRACKER_LIMIT_S = 1.0  # without a usable measurement for longer the status says so: 40 are missing at 40 Hz
 SNAP_WARNING_S = 1.0  # a snap that is nearer than this is warned of: time to stop an actuator by hand
 
 
