@@ -163,10 +163,10 @@ def judge(
     fault: str, listener: Listener, messages: Messages, played: Played, code: int, recording: Path
 ) -> Result:
     """Figures and broken promises."""
-    poses = listener.heard[topics.TIP_POSE]
-    valid = [(played.robot_s(m.arrival_ns), bool(m.data[4])) for m in listener.heard[topics.VALID]]
+    poses = listener.received[topics.TIP_POSE]
+    valid = [(played.robot_s(m.arrival_ns), bool(m.data[4])) for m in listener.received[topics.VALID]]
     marks = [cdr.decode_stamp(m.data) for m in poses]
-    clouds = [cdr.decode_point_cloud(m.data).rows for m in listener.heard[topics.BACKBONE_STATE]]
+    clouds = [cdr.decode_point_cloud(m.data).rows for m in listener.received[topics.BACKBONE_STATE]]
     finite = [np.isfinite(cdr.decode_numbers(m.data, 43)[2]).all() for m in poses] + [
         np.isfinite(c).all() for c in clouds
     ]

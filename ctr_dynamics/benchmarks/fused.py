@@ -17,7 +17,7 @@ from ctr_dynamics.kernels.kinds import ONE_LANE
 from ctr_dynamics.model.model import Model
 from ctr_dynamics.parameters import Settings
 from ctr_dynamics.robot_files import load_robot
-from ctr_dynamics.runtime.garbage_collection import seldom_collected
+from ctr_dynamics.runtime.garbage_collection import rare_garbage_collection
 from ctr_dynamics.runtime.replay import Player
 from ctr_dynamics.runtime.warm_up import warm_up
 
@@ -53,7 +53,7 @@ def fused_replay(
     for _ in range(rounds):
         estimator = Estimator(robot, settings)
         player = Player(estimator)
-        with seldom_collected():
+        with rare_garbage_collection():
             begin = time.perf_counter()
             steps = sum(1 for _ in islice(player.play(opened), most))
             spent = time.perf_counter() - begin

@@ -94,7 +94,7 @@ def demo(
             return failed(console, f"the estimator ended with code {code}", log)
         timing = json.loads((folder / "timing.json").read_text(encoding="utf-8"))
         shift = json.loads((folder / "driver.json").read_text(encoding="utf-8"))
-    heard = listener.heard
+    heard = listener.received
     if not heard[topics.TIP_POSE] or not heard[topics.TIP_POSE_PREDICTED]:
         return failed(
             console,
@@ -150,7 +150,7 @@ def failed(console: Console, what: str, log: str) -> int:
 
 def record(file: Path, listener: Listener) -> None:
     """Write what was heard as a bag; log time is the moment of arrival."""
-    messages = [(m.arrival_ns, topic, m.data) for topic, heard in listener.heard.items() for m in heard]
+    messages = [(m.arrival_ns, topic, m.data) for topic, heard in listener.received.items() for m in heard]
     with write_bag(file, {"source": "ctr-dynamics demo"}) as writer:
         for arrival_ns, topic, data in sorted(messages):
             writer.write(topic, arrival_ns, data)

@@ -26,7 +26,7 @@ from ctr_dynamics.io.bag_reader import RawMessage
 from ctr_dynamics.io.messages import topics
 from ctr_dynamics.io.messages.cdr import CdrError, split_stamp
 from ctr_dynamics.ros import qos
-from ctr_dynamics.ros.node_runner import Stopped, apart, leave, stop_on_signals
+from ctr_dynamics.ros.node_runner import Stopped, exit_at_once, run_in_thread, stop_on_signals
 from ctr_dynamics.ros.parameter_declaration import declare_table
 from ctr_dynamics.ros.topic_names import NAMESPACE, message_class, node_topic
 from ctr_dynamics.runtime.node_parameters import DRIVER
@@ -52,7 +52,7 @@ class DriverNode(Node):
             raise InputError("no bag is given", do="set the parameter bag, e.g. -p bag:=FILE.mcap")
         bag = Path(values["bag"])
         check_targets({"report": values["report"]}, {f"bag {file.name}": file for file in locate(bag).files})
-        self.messages = apart(lambda: load(bag, values["start_s"], values["duration_s"]), stop)
+        self.messages = run_in_thread(lambda: load(bag, values["start_s"], values["duration_s"]), stop)
         profile = qos.profile(values["reliability"], values["depth"])
         present = {message.topic for message in self.messages}
         self.outputs: dict[str, Publisher[Any]] = {
@@ -149,7 +149,7 @@ def main(args: list[str] | None = None) -> int:
                     part.write_text(json.dumps(report), encoding="utf-8")
             node.destroy_node()
         except Stopped:
-            leave()
+            exit_at_once()
         except (InputError, ParameterException, RCLError) as error:
             print(f"driver: {' '.join(str(error).split())}", file=sys.stderr)
             return 2

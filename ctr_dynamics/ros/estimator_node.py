@@ -34,7 +34,7 @@ from ctr_dynamics.io.messages.cdr import (
 from ctr_dynamics.parameters import Settings
 from ctr_dynamics.robot_files import load_robot
 from ctr_dynamics.ros import qos
-from ctr_dynamics.ros.node_runner import Stopped, apart, run_node
+from ctr_dynamics.ros.node_runner import Stopped, run_in_thread, run_node
 from ctr_dynamics.ros.parameter_declaration import declare, watch
 from ctr_dynamics.ros.publishers import Outputs
 from ctr_dynamics.ros.topic_names import NAME, NAMESPACE, message_class, node_topic
@@ -68,7 +68,7 @@ class EstimatorNode(Node):
         written = ("timing_report", "record.rolling_path", "record.path")
         check_targets({name: self.settings[name] for name in written}, {"robot file": self._robot.source})
         try:
-            self._estimator = apart(self._warm_estimator, stop)
+            self._estimator = run_in_thread(self._warm_estimator, stop)
         except Stopped:
             self.destroy_node()  # so that others hear of the end
             raise
@@ -202,7 +202,7 @@ class EstimatorNode(Node):
         if arrival_ns <= 0:  # before the first /clock: the arrival tells nothing of the stamps' clock
             self._estimator.add_joint_state(message.stamp_ns, message.names, message.positions)
             return
-        clock = self.loop.stamp_clock
+        clock = self.loop.clock_offset
         if not clock.sample(message.stamp_ns, arrival_ns):
             rejection = clock.rejection(message.stamp_ns, arrival_ns)
             self._estimator.health.note("joints", "far ahead", rejection)
@@ -264,7 +264,7 @@ class EstimatorNode(Node):
                 self.timing, self.loop.faults, self.loop.last_fault, self.outputs.stamps.behind_ns
             ),
             node_diagnostics.clock_status(
-                self.loop.stamp_clock,
+                self.loop.clock_offset,
                 now_ns,
                 self._use_sim_time,
                 self.timing.input_timeout_ns if self.timing.policy == "predict" else None,

@@ -17,7 +17,7 @@ from rclpy.signals import SignalHandlerOptions
 
 from ctr_dynamics.io.messages import topics
 from ctr_dynamics.ros import qos
-from ctr_dynamics.ros.node_runner import make_executor, turn
+from ctr_dynamics.ros.node_runner import make_executor, serve_callbacks
 from ctr_dynamics.ros.topic_names import NAMESPACE, message_class
 from ctr_dynamics.runtime.live_report import Received
 
@@ -40,7 +40,7 @@ class Listener:
         depth: int = 1000,
         name: str = "listener",
     ) -> None:
-        self.heard: dict[str, list[Received]] = defaultdict(list)
+        self.received: dict[str, list[Received]] = defaultdict(list)
         self.context = Context()
         rclpy.init(context=self.context, domain_id=domain_id, signal_handler_options=SignalHandlerOptions.NO)
         self.node = Node(name, namespace=NAMESPACE, context=self.context, start_parameter_services=False)
@@ -56,7 +56,7 @@ class Listener:
         self._thread = threading.Thread(target=self._spin, name="listener", daemon=True)
 
     def _keep(self, topic: str) -> Callable[[Any], None]:
-        messages = self.heard[topic]
+        messages = self.received[topic]
 
         def keep(data: bytes) -> None:
             messages.append(Received(time.time_ns(), data))
@@ -66,7 +66,7 @@ class Listener:
     def _spin(self) -> None:
         try:
             while self.context.ok():
-                turn(self._executor)
+                serve_callbacks(self._executor)
         except ExternalShutdownException:
             pass
 
@@ -75,7 +75,7 @@ class Listener:
         return all(subscription.get_publisher_count() for subscription in self.subscriptions.values())
 
     def count(self, topic: str) -> int:
-        return len(self.heard[topic])
+        return len(self.received[topic])
 
     def wait_for(self, condition: Callable[[], bool], timeout_s: float) -> bool:
         """Wait until `condition` holds; False when it does not in time."""

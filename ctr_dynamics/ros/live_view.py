@@ -16,7 +16,7 @@ from rclpy.signals import SignalHandlerOptions
 
 from ctr_dynamics.io.messages import topics
 from ctr_dynamics.ros import qos
-from ctr_dynamics.ros.node_runner import make_executor, turn
+from ctr_dynamics.ros.node_runner import make_executor, serve_callbacks
 from ctr_dynamics.ros.topic_names import NAMESPACE, message_class
 
 
@@ -53,7 +53,7 @@ class LiveTopics:
     def _spin(self) -> None:
         try:
             while self._context.ok():
-                turn(self._executor)
+                serve_callbacks(self._executor)
         except ExternalShutdownException:
             pass
 

@@ -62,11 +62,11 @@ def stop_on_signals() -> Iterator[threading.Event]:
             signal.signal(number, value)
 
 
-def apart(work: Callable[[], Result], stop: threading.Event) -> Result:
+def run_in_thread(work: Callable[[], Result], stop: threading.Event) -> Result:
     """The result of long work, done in a thread of its own. What the work raises is raised here.
 
     Raises:
-        Stopped: `stop` was set first. The work goes on: end the process by `leave`.
+        Stopped: `stop` was set first. The work goes on: end the process by `exit_at_once`.
     """
     future: concurrent.futures.Future[Result] = concurrent.futures.Future()
 
@@ -83,7 +83,7 @@ def apart(work: Callable[[], Result], stop: threading.Event) -> Result:
     raise Stopped
 
 
-def leave() -> NoReturn:
+def exit_at_once() -> NoReturn:
     """End the process with code 0 at once: taking the interpreter down under work that goes on would crash."""
     rclpy.try_shutdown()
     sys.stdout.flush()
@@ -91,19 +91,19 @@ def leave() -> NoReturn:
     os._exit(0)
 
 
-def turn(executor: Executor) -> None:
+def serve_callbacks(executor: Executor) -> None:
     """Serve callbacks for a moment."""
     executor.spin_until_future_complete(Future(executor=executor), POLL_S)
 
 
-def spin_until(node: Node, stop: threading.Event) -> None:
+def spin_until_stopped(node: Node, stop: threading.Event) -> None:
     """Serve the node's callbacks until `stop` is set or the context is shut down."""
     executor = make_executor(node.context)
     executor.add_node(node)
     try:
         # The plain spin() of the event-driven executor does not look at signals; short turns do.
         while not stop.is_set() and rclpy.ok(context=node.context):
-            turn(executor)
+            serve_callbacks(executor)
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
     finally:
@@ -126,13 +126,13 @@ def run_node(
             rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
             node = make(stop)
         except Stopped:
-            leave()
+            exit_at_once()
         except (InputError, ParameterException, RCLError) as error:
             print(f"{name}: {' '.join(str(error).split())}", file=sys.stderr)
             rclpy.try_shutdown()
             return 2
         try:
-            spin_until(node, stop)
+            spin_until_stopped(node, stop)
         finally:
             try:
                 close(node)

@@ -13,7 +13,7 @@ from ctr_dynamics.io.messages import topics
 from ctr_dynamics.io.messages.encode import encode_diagnostics
 from ctr_dynamics.ros.qos import QosFaults
 from ctr_dynamics.ros.topic_names import message_class, node_topic
-from ctr_dynamics.runtime.clock_offset import EachOnce
+from ctr_dynamics.runtime.clock_offset import RisingStamps
 from ctr_dynamics.runtime.step_encoder import StepEncoder
 
 
@@ -36,7 +36,7 @@ class Outputs:
         encoder: StepEncoder,
         record: Callable[[str, int, bytes], None] | None = None,
     ) -> None:
-        self.stamps = EachOnce()
+        self.stamps = RisingStamps()
         self._last: Any = None  # the last step that was published
         self._encoder = encoder
         self._record = record

@@ -1,25 +1,25 @@
-"""Stamps against the clocks they are told apart by: the time on the stamps' clock at an arrival, and each stamp once."""
+"""The offset between the clock of the stamps and that of the arrivals; and outputs whose stamps only rise."""
 
 from __future__ import annotations
 
 from collections import deque
 
 LIMIT_NS = 1_000_000_000
-"""Stamps farther than this from where they are expected are of another clock, or of one that has been set back."""
-AGES = 100  # joint states of which the quickest tells how old stamps are at arrival
-WILD = 3  # joint states in a row with stamps far from the known clock: they are of another
+"""Stamps farther than this from their expected time belong to another clock, or to one that was set back."""
+AGES = 100  # joint states: the youngest stamp at its arrival among them gives the offset
+OUTLIERS_IN_A_ROW = 3  # so many stamps in a row far from the known clock belong to another one
 
 
-class StampClock:
-    """Time on the clock of the joint stamps, from that of their arrival: a node's, or a recorder's log time.
+class ClockOffset:
+    """Time on the clock of the joint stamps, from the time of arrival: a node's clock, or the log time of a recording.
 
-    The smallest difference of the last joint states is taken as that of the clocks: clocks drift, and a stamp may be ahead of
-    its time. One stamp that is wildly off changes nothing, three in a row do.
+    The smallest difference of the last joint states is the offset: clocks drift, and messages are delayed. One outlier changes
+    nothing; three in a row mean another clock.
 
     Args:
-        own: arrivals are on the clock that stamps (a node's), as long as the two differ by no more than ``limit_ns``; steps then follow
-            real time, however old joints are when they arrive. A recorder's clock may be any.
-        limit_ns: how far a stamp may lie from where it is expected.
+        own: arrivals and stamps are of one clock while they differ by no more than ``limit_ns``. Steps then follow real time,
+            however late joints arrive. False for a recording, whose clock may be any.
+        limit_ns: how far a stamp may lie from its expected time.
     """
 
     def __init__(self, own: bool = True, limit_ns: int = LIMIT_NS) -> None:
@@ -31,11 +31,11 @@ class StampClock:
         self._ages: deque[int] = deque(maxlen=AGES)
 
     def sample(self, stamp_ns: int, arrival_ns: int) -> bool:
-        """A joint state with that stamp arrived at that time; False where it is wildly ahead, and nothing follows it yet: it is to be left out."""
+        """Take in stamp and arrival of a joint state. False: it is far ahead, and no others follow it yet; leave it out."""
         offset = arrival_ns - stamp_ns
         if self.known and abs(offset - self.offset_ns) > self.limit_ns:
             self._streak += 1
-            if self._streak < WILD:
+            if self._streak < OUTLIERS_IN_A_ROW:
                 return offset > self.offset_ns
             self._ages.clear()
         self._streak = 0
@@ -46,13 +46,13 @@ class StampClock:
         return True
 
     def rejection(self, stamp_ns: int, arrival_ns: int) -> str:
-        """What to say of a joint state that :meth:`sample` has rejected."""
+        """Text on a joint state that :meth:`sample` has rejected."""
         ahead_s = (stamp_ns - self.at(arrival_ns)) * 1e-9
         return f"stamp {ahead_s:.3f} s ahead, limit {self.limit_ns * 1e-9:g} s; left out unless others follow"
 
     @property
     def age_ns(self) -> int:
-        """How old, by the clock of arrivals, the stamp of the quickest of the last joint states was at its arrival."""
+        """Smallest age of the last joint states at their arrival, by the clock of arrivals, ns."""
         return min(self._ages, default=0)
 
     def at(self, now_ns: int) -> int:
@@ -60,11 +60,12 @@ class StampClock:
         return now_ns - self.offset_ns
 
 
-class EachOnce:
-    """Lets stamps through in their order: none that is not later than all before it, not even after a restart.
+class RisingStamps:
+    """Passes only stamps that are later than all before them, even after a restart.
 
     Attributes:
-        last_ns: the last that went through. behind_ns: how far the last one asked for lay before it; 0 where it went through.
+        last_ns: the last stamp that passed.
+        behind_ns: how far the last stamp that was asked about lay before it; 0 where it passed.
     """
 
     def __init__(self) -> None:
@@ -73,7 +74,7 @@ class EachOnce:
         self._may_go_back = False
 
     def passes(self, stamp_ns: int) -> bool:
-        """Whether that stamp may go out; it counts as gone then."""
+        """Whether that stamp may be published; it then counts as published."""
         if self.last_ns is not None and stamp_ns <= self.last_ns:
             behind_ns = self.last_ns - stamp_ns
             if not (self._may_go_back and behind_ns > LIMIT_NS):
@@ -83,9 +84,9 @@ class EachOnce:
         return True
 
     def forget(self) -> None:
-        """The clock itself has gone back (a simulation starts again): earlier stamps are new."""
+        """The clock itself was set back (a simulation starts again): earlier stamps are new."""
         self.last_ns = None
 
     def let_go_back(self) -> None:
-        """After a reset: if the stamps have gone back by more than a second, start from there."""
+        """After a reset: stamps that went back by more than a second pass again."""
         self._may_go_back = True

@@ -1,4 +1,4 @@
-"""Python's search for cyclic garbage, out of the way of a loop of steps."""
+"""Rare garbage collection while steps are taken."""
 
 from __future__ import annotations
 
@@ -6,19 +6,18 @@ import gc
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-SELDOM = 100_000  # objects made and kept, between two searches
+OBJECTS_BETWEEN_COLLECTIONS = 100_000  # made and kept
 
 
 @contextmanager
-def seldom_collected() -> Iterator[None]:
-    """Inside, what there is already is never searched, and the rest seldom: a step leaves hardly any cycles behind, and a search takes
-    milliseconds."""
+def rare_garbage_collection() -> Iterator[None]:
+    """Inside, existing objects are never searched for cycles, and new ones rarely: steps leave hardly any, and a search takes milliseconds."""
     before = gc.get_threshold()
     outermost = gc.get_freeze_count() == 0
     gc.collect()
     if outermost:
         gc.freeze()
-    gc.set_threshold(max(SELDOM, before[0]) if before[0] else 0, *before[1:])
+    gc.set_threshold(max(OBJECTS_BETWEEN_COLLECTIONS, before[0]) if before[0] else 0, *before[1:])
     try:
         yield
     finally:

@@ -1,4 +1,4 @@
-"""Memory that stays with the process: pages that are touched for the first time while steps are due cost more than the steps."""
+"""Memory that stays with the process: the first touch of a page costs more than a step."""
 
 from __future__ import annotations
 
@@ -8,9 +8,10 @@ M_TRIM_THRESHOLD, M_MMAP_MAX, M_ARENA_MAX = -1, -4, -8  # malloc.h of the GNU C 
 
 
 def keep_memory() -> bool:
-    """Have the C library keep what is freed, in one place for all threads, so that what the warm-up has used serves the first steps too.
+    """Have the C library keep freed memory, in one arena for all threads, so that the first steps reuse that of the warm-up.
 
-    Returns False where the C library has no ``mallopt``; nothing is changed then.
+    Returns:
+        False where the C library has no ``mallopt``; nothing is changed then.
     """
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
     if mallopt is None:

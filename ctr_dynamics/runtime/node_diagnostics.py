@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from ctr_dynamics.estimation.step_output import ERROR, OK, WARN, Status
-from ctr_dynamics.runtime.clock_offset import LIMIT_NS, StampClock
+from ctr_dynamics.runtime.clock_offset import LIMIT_NS, ClockOffset
 from ctr_dynamics.runtime.step_loop import INBOX_LIMIT
 from ctr_dynamics.runtime.timing import LATE_NS, VERY_LATE_NS, StepTiming
 
@@ -57,7 +57,7 @@ def timing_status(timing: StepTiming, faults: int, last_fault: str, withheld_beh
     return Status("timing", OK, f"{timing.steps} steps on time", values)
 
 
-def clock_status(clock: StampClock, now_ns: int, use_sim_time: bool, limit_ns: int | None) -> Status:
+def clock_status(clock: ClockOffset, now_ns: int, use_sim_time: bool, limit_ns: int | None) -> Status:
     """Whether the stamps of the joints and the node's clock are of one time; ``limit_ns``: age at arrival beyond which steps lack joints, if any."""
     age_s = clock.age_ns * 1e-9
     values = {

@@ -1,8 +1,7 @@
 """Replay: a recorded bag through the estimator, without a ROS graph and as fast as it goes.
 
-Messages are given to the estimator in the order in which they arrived (log time, ties by topic name), all of
-one arrival time before a step is taken, so that a replay does what a node would have done, and twice the
-same.
+The estimator gets the messages in the order of their arrival (log time, ties by topic name), and all of one arrival time before a step is taken.
+So a replay does what a node would have done, and repeats to the last bit.
 """
 
 from __future__ import annotations
@@ -30,8 +29,8 @@ from ctr_dynamics.io.messages.topics import JOINT_STATES, STEP_NS, TRACKER_TIP
 from ctr_dynamics.parameters import PARAMETERS, Settings
 from ctr_dynamics.robot import Robot
 from ctr_dynamics.robot_files import load_robot
-from ctr_dynamics.runtime.clock_offset import EachOnce, StampClock
-from ctr_dynamics.runtime.garbage_collection import seldom_collected
+from ctr_dynamics.runtime.clock_offset import ClockOffset, RisingStamps
+from ctr_dynamics.runtime.garbage_collection import rare_garbage_collection
 from ctr_dynamics.runtime.input_gate import InputGate
 from ctr_dynamics.runtime.step_encoder import StepEncoder
 
@@ -48,7 +47,7 @@ _MAX_STRETCHES = 100
 
 @dataclass
 class ReplayResult:
-    """Outcome of a replay: the content of summary.json, and what was odd about the inputs, each kind in a line."""
+    """Outcome of a replay: the content of summary.json, and notes on unusual inputs, one line for each kind."""
 
     summary: dict[str, Any]
     notes: list[str] = field(default_factory=list)
@@ -60,8 +59,8 @@ class ReplayResult:
 
 
 def last_joints(bag: Bag) -> tuple[int, int]:
-    """The last stamp of a joint state, ns, stamps of one that is wildly ahead left out, and the last log time of one."""
-    clock = StampClock(own=False)
+    """Last stamp and last log time of the joint states, ns; outliers far ahead are left out."""
+    clock = ClockOffset(own=False)
     last_ns = last_log_ns = 0
     for _, log_ns, data in bag.messages({JOINT_STATES}):
         with contextlib.suppress(CdrError):
@@ -92,7 +91,7 @@ class Player:
         estimator.step_times_s = array("d")
         self.joint_names: set[str] = set()
         self.unused = 0  # messages that came too long after the last joints
-        self._clock = StampClock(own=False)
+        self._clock = ClockOffset(own=False)
         self._now_ns: int | None = None
         self._last_ns = 0  # the last joint stamp
         self._call_times_s = array("d")
@@ -114,7 +113,7 @@ class Player:
             if log_ns > last_log_ns + AFTER_NS:
                 self.unused += len(group)
                 continue
-            # what a live node would have done by itself before these messages came
+            # the steps that a live node would have taken before these messages came
             yield from self._advance(log_ns - 1)
             for item in group:
                 self._add(item)
@@ -146,7 +145,7 @@ class Player:
                 self.estimator.add_tip_load(load.stamp_ns, load.force, load.torque, load.frame_id)
 
     def _advance(self, log_ns: int) -> Iterator[StepOutput]:
-        """Take what is due at that log time; the stamps' time goes back only where their clock has been set back."""
+        """Take the steps due at that log time. Time goes back only where the clock of the stamps was set back."""
         if self._clock.known:
             now_ns = self._clock.at(log_ns)
             if self._now_ns is not None and 0 < self._now_ns - now_ns <= self._clock.limit_ns:
@@ -165,7 +164,7 @@ class Player:
             self.estimator.do_idle_work()
 
 
-class _Invalid:
+class _InvalidStretches:
     """Stretches of invalid steps, for the summary."""
 
     def __init__(self) -> None:
@@ -264,7 +263,7 @@ def replay(
         report_part = stack.enter_context(atomic_file(Path(report))) if report is not None else None
         estimator = make(robot, settings)
         log = _report_log(estimator, opened) if report_part is not None else None
-        stack.enter_context(seldom_collected())
+        stack.enter_context(rare_garbage_collection())
         numbers, times_s = _run(opened, estimator, robot, settings, writer, progress, log)
         notes = [
             *opened.notes,
@@ -318,9 +317,9 @@ def _run(
     """The replay itself; returns the numbers of the summary and the time spent on each step, s."""
     encoder = StepEncoder(settings["output.frame_id"], robot.name, settings["output.backbone_every"])
     player = Player(estimator)
-    invalid = _Invalid()
+    invalid = _InvalidStretches()
     steps = withheld = 0
-    stamps = EachOnce()
+    stamps = RisingStamps()
     first_ns = last_ns = 0
     blocks = [block for file in bag.files for block in file.blocks]
     span_ns = max((b.end_ns for b in blocks), default=0) - min((b.start_ns for b in blocks), default=0)
@@ -370,7 +369,7 @@ def _metadata(provenance: dict[str, Any]) -> dict[str, str]:
 
 
 def _input_notes(problems: dict[str, dict[str, Any]]) -> list[str]:
-    """A line for each kind of odd input that the estimator has noted, by group."""
+    """A line for each kind of unusual input that the estimator has noted, by group."""
     return [
         f"{group}: {kind} ({found['count']}), the last: {found['last']}"
         for group, kinds in problems.items()
@@ -379,7 +378,7 @@ def _input_notes(problems: dict[str, dict[str, Any]]) -> list[str]:
 
 
 def _without(bag: Bag, settings: Settings) -> list[str]:
-    """What a replay does without: a tracker, and the live node's own outputs."""
+    """Notes on what has no effect: a missing tracker, and parameters of the live node."""
     tracker = bag.topics.get(TRACKER_TIP)
     notes = (
         []
@@ -393,7 +392,7 @@ def _without(bag: Bag, settings: Settings) -> list[str]:
 
 
 def _left_out(numbers: dict[str, Any]) -> list[str]:
-    """What of the bag, and of the steps, is in no output."""
+    """Notes on messages and steps that are in no output."""
     withheld, unused = numbers["withheld"], numbers["unused"]
     notes = []
     if withheld:
@@ -409,7 +408,7 @@ def _left_out(numbers: dict[str, Any]) -> list[str]:
 
 
 def no_step(bag: Bag, robot: Robot, names: set[str], problems: dict[str, Any]) -> InputError:
-    """Why a replay of ``bag`` has had no step, from the joint ``names`` in it and the estimator's ``problems`` with them."""
+    """The error that explains why a replay took no step, from the joint ``names`` of the bag and the estimator's ``problems`` with them."""
     expected = ", ".join(f"tube{i}_rotation, tube{i}_translation" for i in range(1, robot.n_tubes + 1))
     found = ", ".join(sorted(names)[:12]) or "none"
     odd = "".join(f"; {note}" for note in _input_notes({"joints": problems}))

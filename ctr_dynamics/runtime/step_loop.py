@@ -16,7 +16,7 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple, Protocol
 
-from ctr_dynamics.runtime.clock_offset import StampClock
+from ctr_dynamics.runtime.clock_offset import ClockOffset
 from ctr_dynamics.runtime.timing import StepTiming
 
 STEP_NS = 3_000_000
@@ -109,7 +109,7 @@ class StepLoop(threading.Thread):
         super().__init__(name="stepping", daemon=True)
         self.estimator = estimator
         self.timing = timing
-        self.stamp_clock = StampClock()
+        self.clock_offset = ClockOffset()
         self.inbox: deque[Callable[[], None]] = deque()
         self.rejected = 0
         self.faults = 0
@@ -299,7 +299,7 @@ class StepLoop(threading.Thread):
     def _now_ns(self) -> int:
         """Time on the clock of the stamps; 0 while there is no clock."""
         now_ns = self._clock_ns()
-        return self.stamp_clock.at(now_ns) if now_ns > 0 else 0
+        return self.clock_offset.at(now_ns) if now_ns > 0 else 0
 
     def _begin_ns(self) -> int:
         """The stamp whose step is to be begun now, so that it is out when it is due; 0 while there is no clock."""

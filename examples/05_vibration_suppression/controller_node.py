@@ -24,7 +24,7 @@ from ctr_dynamics.io.messages.cdr import CdrError, decode_joint_state
 from ctr_dynamics.io.messages.encode import encode_joint_state
 from ctr_dynamics.robot_files import load_robot
 from ctr_dynamics.ros import qos
-from ctr_dynamics.ros.node_runner import spin_until, stop_on_signals
+from ctr_dynamics.ros.node_runner import spin_until_stopped, stop_on_signals
 from ctr_dynamics.ros.topic_names import NAMESPACE, message_class
 
 sys.path.insert(0, str(Path(__file__).parent))
@@ -164,7 +164,7 @@ def main() -> int:
         rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
         node = ControllerNode()
         try:
-            spin_until(node, stop)
+            spin_until_stopped(node, stop)
         finally:
             node.get_logger().info(f"commands: {node.counts}; estimates rejected: {node.rejected}")
             node.destroy_node()

@@ -26,7 +26,7 @@ from ctr_dynamics.io.messages import topics
 from ctr_dynamics.io.messages.cdr import CdrError, decode_joint_state, split_stamp
 from ctr_dynamics.robot_files import load_robot
 from ctr_dynamics.ros import qos
-from ctr_dynamics.ros.node_runner import spin_until, stop_on_signals
+from ctr_dynamics.ros.node_runner import spin_until_stopped, stop_on_signals
 from ctr_dynamics.ros.topic_names import NAMESPACE, message_class
 
 sys.path.insert(0, str(Path(__file__).parent))
@@ -120,7 +120,7 @@ def main() -> int:
     with stop_on_signals() as stop:
         rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
         node = RobotNode()
-        spinner = threading.Thread(target=spin_until, args=(node, stop), daemon=True)
+        spinner = threading.Thread(target=spin_until_stopped, args=(node, stop), daemon=True)
         spinner.start()
         try:
             node.play(stop)

@@ -62,7 +62,7 @@ class RestingRobot(threading.Thread):
 
     def agreeing_pose(self):
         """The model's last tip pose, None before there is one."""
-        heard = self.live.listener.heard[topics.TIP_POSE_PREDICTED]
+        heard = self.live.listener.received[topics.TIP_POSE_PREDICTED]
         return decode_pose_stamped(heard[-1].data) if heard else None
 
     def run(self) -> None:
@@ -136,18 +136,18 @@ class Live:
         self.wait(lambda: self.count(topic) >= target, f"{number} more messages on {topic}")
 
     def stamps(self, topic: str) -> list[int]:
-        return [decode_stamp(message.data) for message in list(self.listener.heard[topic])]
+        return [decode_stamp(message.data) for message in list(self.listener.received[topic])]
 
     def messages(self, topic: str) -> list:
         kind = message_class(topics.TOPIC[topic].ros_type)
-        return [deserialize_message(message.data, kind) for message in list(self.listener.heard[topic])]
+        return [deserialize_message(message.data, kind) for message in list(self.listener.received[topic])]
 
     def valid(self) -> list[bool]:
         return [message.data for message in self.messages(topics.VALID)]
 
     def status(self, name: str):
         """The last diagnostics status of that name, None before the first."""
-        heard = self.listener.heard[topics.DIAGNOSTICS]
+        heard = self.listener.received[topics.DIAGNOSTICS]
         if not heard:
             return None
         array = deserialize_message(heard[-1].data, message_class(topics.TOPIC[topics.DIAGNOSTICS].ros_type))

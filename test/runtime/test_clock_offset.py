@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import pytest
 
-from ctr_dynamics.runtime.clock_offset import EachOnce, StampClock
+from ctr_dynamics.runtime.clock_offset import ClockOffset, RisingStamps
 
 MS = 1_000_000
 PERIOD = 10 * MS
 
 
 def test_stamp_clock_follows_a_foreign_clock_after_three_stamps():
-    clock = StampClock()
+    clock = ClockOffset()
     clock.sample(1000 * MS, 1004 * MS)
     assert clock.agrees
     assert clock.at(7) == 7
@@ -29,7 +29,7 @@ def test_stamp_clock_follows_a_foreign_clock_after_three_stamps():
 
 
 def test_a_recorders_clock_is_that_of_the_stamps_but_for_the_smallest_difference():
-    clock = StampClock(own=False)
+    clock = ClockOffset(own=False)
     assert not clock.known
     offset = 7_000 * MS
     at = []
@@ -43,7 +43,7 @@ def test_a_recorders_clock_is_that_of_the_stamps_but_for_the_smallest_difference
 
 @pytest.mark.parametrize("own", [True, False])
 def test_one_wild_stamp_changes_nothing_and_a_lasting_change_is_followed(own):
-    clock = StampClock(own)
+    clock = ClockOffset(own)
     clock.sample(0, 0)
     assert not clock.sample(10**18, PERIOD), "it is to be left out"
     assert "stamp 999999999.990 s ahead, limit 1 s" in clock.rejection(10**18, PERIOD)
@@ -60,7 +60,7 @@ def test_one_wild_stamp_changes_nothing_and_a_lasting_change_is_followed(own):
 
 
 def test_a_stamp_ahead_of_its_time_is_forgotten_and_a_drift_is_followed():
-    clock = StampClock(own=False)
+    clock = ClockOffset(own=False)
     for i in range(300):
         clock.sample(i * PERIOD + 500 * MS * (i == 20), i * PERIOD)
     assert clock.at(299 * PERIOD) == 299 * PERIOD
@@ -72,7 +72,7 @@ def test_a_stamp_ahead_of_its_time_is_forgotten_and_a_drift_is_followed():
 
 
 def test_each_stamp_passes_once():
-    stamps = EachOnce()
+    stamps = RisingStamps()
     assert [stamps.passes(t) for t in (0, 3, 3, 2, 6)] == [True, True, False, False, True]
     assert stamps.behind_ns == 0
     stamps.let_go_back()

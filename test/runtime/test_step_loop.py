@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import pytest
 
 from ctr_dynamics.estimation.step_output import ERROR, OK, WARN
-from ctr_dynamics.runtime.clock_offset import StampClock
+from ctr_dynamics.runtime.clock_offset import ClockOffset
 from ctr_dynamics.runtime.node_diagnostics import clock_status, topics_status
 from ctr_dynamics.runtime.step_loop import (
     CATCH_UP_NS,
@@ -349,7 +349,7 @@ def test_calls_run_in_the_thread_and_hand_back_result_or_error(clock):
 
 
 def test_joints_that_are_old_at_arrival_are_said_where_steps_are_without_them():
-    clock = StampClock()
+    clock = ClockOffset()
     for k in range(5):
         clock.sample(10 * k * MS, (10 * k + 400 + k) * MS)
     assert clock.agrees
