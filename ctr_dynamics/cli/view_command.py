@@ -12,6 +12,7 @@ import typer
 
 from ctr_dynamics.cli.replay_command import settings_for_replay
 from ctr_dynamics.errors import InputError
+from ctr_dynamics.estimation.monitoring.statuses import all_statuses, snap_ahead
 from ctr_dynamics.io.bag_reader import open_bag
 from ctr_dynamics.io.messages import topics
 from ctr_dynamics.robot import Robot
@@ -100,7 +101,9 @@ def _replay(
         while pending is not None and pending.log_ns <= out.stamp_ns:
             server.put(pending.topic, pending.log_ns, pending.data)
             pending = next(inputs, None)
-        for message in encoder.encode(out, estimator.health.statuses, estimator.health.snap_ahead):
+        for message in encoder.encode(
+            out, lambda: all_statuses(estimator.health), snap_ahead(estimator.health)
+        ):
             server.put(message.topic, message.stamp_ns, message.data)
     if not estimator.health.steps:
         raise no_step(opened, robot, player.joint_names, estimator.summary()["input_problems"]["joints"])

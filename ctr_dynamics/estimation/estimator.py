@@ -23,6 +23,7 @@ from ctr_dynamics.estimation.mode_tracker import ModeTracker
 from ctr_dynamics.estimation.monitoring.consistency_monitor import consistency_monitor
 from ctr_dynamics.estimation.monitoring.health import Health
 from ctr_dynamics.estimation.monitoring.innovation_log import InnovationLog
+from ctr_dynamics.estimation.monitoring.statuses import all_statuses
 from ctr_dynamics.estimation.out_of_sequence import OutOfSequence
 from ctr_dynamics.estimation.runs import Runs
 from ctr_dynamics.estimation.step_output import SolverStats, StepOutput
@@ -397,7 +398,7 @@ class Estimator:
             "tip_force_drive_N": ekf.force_variance.sigma,
             "statuses": [
                 {"name": s.name, "level": s.level, "message": s.message, "values": s.values}
-                for s in self.health.statuses()
+                for s in all_statuses(self.health)
             ],
         }
 

@@ -22,6 +22,7 @@ from std_srvs.srv import SetBool, Trigger
 from ctr_dynamics import __version__
 from ctr_dynamics.errors import InputError
 from ctr_dynamics.estimation.estimator import Estimator
+from ctr_dynamics.estimation.monitoring.statuses import all_statuses, snap_ahead
 from ctr_dynamics.io.atomic_files import atomic_file, check_targets
 from ctr_dynamics.io.bag_writer import LiveRecorder
 from ctr_dynamics.io.messages import topics
@@ -241,7 +242,7 @@ class EstimatorNode(Node):
         monotonic_ns = time.monotonic_ns()
         if self.ring_buffer is not None:
             self.ring_buffer.alarm(self._estimator.health.inconsistent, monotonic_ns)
-        before, now = self._shown, (self.outputs.valid, self._estimator.health.snap_ahead)
+        before, now = self._shown, (self.outputs.valid, snap_ahead(self._estimator.health))
         due_ns = self._next_diagnostics_ns + (0 if idle else DIAGNOSTICS_WAIT_NS)
         if now == before and monotonic_ns < due_ns:
             return
@@ -255,7 +256,7 @@ class EstimatorNode(Node):
         self.outputs.diagnostics(max(now_ns, 0), self._statuses(now_ns))
 
     def _statuses(self, now_ns: int) -> list[Any]:
-        health = self._estimator.health.statuses()
+        health = all_statuses(self._estimator.health)
         if self.ring_buffer is not None:
             health = [self.ring_buffer.describe(s) if s.name == "misfit" else s for s in health]
         return [

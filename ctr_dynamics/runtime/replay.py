@@ -21,6 +21,7 @@ import numpy as np
 
 from ctr_dynamics import __version__
 from ctr_dynamics.errors import InputError
+from ctr_dynamics.estimation.monitoring.statuses import all_statuses, snap_ahead
 from ctr_dynamics.io.atomic_files import atomic_file, check_targets
 from ctr_dynamics.io.bag_reader import Bag, InputMessage, open_bag
 from ctr_dynamics.io.bag_writer import BagWriter, write_bag
@@ -336,7 +337,9 @@ def _run(
         if log is not None:
             log.step(out)
         if writer is not None:
-            for message in encoder.encode(out, estimator.health.statuses, estimator.health.snap_ahead):
+            for message in encoder.encode(
+                out, lambda: all_statuses(estimator.health), snap_ahead(estimator.health)
+            ):
                 writer.write(message.topic, message.stamp_ns, message.data)
         if progress is not None and steps % 50 == 0:
             progress(min(1.0, (last_ns - first_ns) / span_ns) if span_ns > 0 else 1.0, steps)

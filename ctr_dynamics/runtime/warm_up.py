@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 from ctr_dynamics.estimation.estimator import Estimator
+from ctr_dynamics.estimation.monitoring.statuses import all_statuses
 from ctr_dynamics.parameters import Settings
 from ctr_dynamics.robot import Robot
 from ctr_dynamics.runtime.step_encoder import StepEncoder
@@ -46,7 +47,7 @@ def warm_up(robot: Robot, settings: Settings) -> int:
         steps_now = estimator.advance(stamp_ns + JOINT_PERIOD_NS // 2, spare_s)
         steps += len(steps_now)
         for out in steps_now:
-            encoder.encode(out, estimator.health.statuses)
+            encoder.encode(out, lambda: all_statuses(estimator.health))
         if tick not in BUSY:
             estimator.do_idle_work()
         if steps_now and steps_now[-1].valid:

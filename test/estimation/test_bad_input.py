@@ -17,6 +17,7 @@ from estimation_cases import (
     truth_error,
 )
 
+from ctr_dynamics.estimation.monitoring.statuses import all_statuses, snap_ahead
 from ctr_dynamics.estimation.runs import MAX_FAILURES
 from ctr_dynamics.io.messages.topics import DIAGNOSTICS
 from ctr_dynamics.robot_files import load_robot
@@ -32,7 +33,7 @@ def still(until, rate=100.0):
 
 
 def status(run, name):
-    return next(s for s in run.estimator.health.statuses() if s.name == name)
+    return next(s for s in all_statuses(run.estimator.health) if s.name == name)
 
 
 def noted(run, group, kind):
@@ -295,7 +296,7 @@ def test_snap_is_announced_in_the_diagnostics_before_it_happens():
         for out in made.advance(START_NS + k * 10_000_000):
             outputs.append(out)
             at = (out.stamp_ns - START_NS) * 1e-9
-            for message in encoder.encode(out, made.health.statuses, made.health.snap_ahead):
+            for message in encoder.encode(out, lambda: all_statuses(made.health), snap_ahead(made.health)):
                 if message.topic == DIAGNOSTICS and b"a snap is ahead in" in message.data:
                     warned.append(at)
             if not out.valid:
@@ -306,7 +307,7 @@ def test_snap_is_announced_in_the_diagnostics_before_it_happens():
     print(f"warned of at {warned[0]:.3f} s, failed {failed}")
     assert outputs[-1].valid
     assert made.health.restarts == (len(failed) == MAX_FAILURES)  # or a step behind the snap succeeds
-    [stability] = [s for s in made.health.statuses() if s.name == "stability"]
+    [stability] = [s for s in all_statuses(made.health) if s.name == "stability"]
     assert stability.message.startswith("stable")
 
 
@@ -425,7 +426,7 @@ def test_tracker_that_starts_after_the_joints_and_pauses():
         outputs += made.advance(START_NS + m.arrival)
         for at in (1.8, 2.9, 4.9, 5.9):
             if at not in seen and m.stamp >= at * 1e9:
-                seen[at] = next(s for s in made.health.statuses() if s.name == "tracker")
+                seen[at] = next(s for s in all_statuses(made.health) if s.name == "tracker")
     assert all(out.valid for out in outputs)
     assert [seen[at].level for at in (1.8, 2.9, 4.9, 5.9)] == [1, 0, 1, 0]
     assert "no usable measurement for 1.8 s, limit 1 s" in seen[1.8].message

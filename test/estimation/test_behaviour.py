@@ -21,6 +21,7 @@ from tracker_twin import expected
 
 from ctr_dynamics.effects import make_plant
 from ctr_dynamics.estimation.estimator import EstimatorOptions
+from ctr_dynamics.estimation.monitoring.statuses import all_statuses
 from ctr_dynamics.io.messages.topics import STEP_NS
 from ctr_dynamics.kernels.rotations import conjugate, from_vector, matrix, multiply
 from ctr_dynamics.parameters import PARAMETERS
@@ -103,7 +104,7 @@ def test_lasting_contradiction_is_said(release):
         assert not out.valid or np.sqrt(np.trace(out.tip_covariance[:3, :3])) <= limit
     invalid = [out for out in run.outputs if not out.valid]
     assert any("tracker contradicts the model" in out.reason for out in invalid)
-    status = next(s for s in run.estimator.health.statuses() if s.name == "tracker")
+    status = next(s for s in all_statuses(run.estimator.health) if s.name == "tracker")
     assert status.level == 2
     assert "limit half" in status.message
 
@@ -165,13 +166,13 @@ def test_a_contradiction_ends_with_the_samples_that_showed_it():
     assert since
     assert all(out.valid for out in since), {out.reason for out in since}
     assert not run.estimator.health.rejecting
-    status = next(s for s in run.estimator.health.statuses() if s.name == "tracker")
+    status = next(s for s in all_statuses(run.estimator.health) if s.name == "tracker")
     assert "no usable measurement" in status.message
 
 
 def test_samples_that_are_not_fused_contradict_nothing(release):
     run = play([m for m in release if m.stamp < 2e9], {"filter.enabled": False})
-    status = next(s for s in run.estimator.health.statuses() if s.name == "tracker")
+    status = next(s for s in all_statuses(run.estimator.health) if s.name == "tracker")
     assert status.level == 0
     run.estimator.set_fusion(True)
     assert not run.estimator.health.rejecting

@@ -9,11 +9,11 @@ from typing import Any, NamedTuple
 
 from scipy.stats import chi2
 
-from ctr_dynamics.estimation.monitoring import statuses
 from ctr_dynamics.estimation.monitoring.consistency_monitor import ConsistencyMonitor
-from ctr_dynamics.estimation.step_output import FUSION_OFF, OK, Innovation, Status
+from ctr_dynamics.estimation.step_output import FUSION_OFF, Innovation
 from ctr_dynamics.model.stability import Stability
 
+TRACKER_LIMIT_S = 1.0  # without a usable measurement for longer the status says so: 40 are missing at 40 Hz
 RECENT = 40  # measurements that the tracker is judged by: one second at 40 Hz
 FEWEST_RECENT = 20  # of them, below which nothing is said of a contradiction
 WAITING = "waiting for the first complete joint state"
@@ -153,7 +153,7 @@ class Health:
     @property
     def tracker_alive(self) -> bool:
         """Whether usable measurements come."""
-        return self.tracker_age_s <= statuses.TRACKER_LIMIT_S
+        return self.tracker_age_s <= TRACKER_LIMIT_S
 
     @property
     def inconsistent(self) -> bool:
@@ -170,15 +170,6 @@ class Health:
         """Whether measurements come and most of the last lay outside the gate: the tracker and the model do not describe the same robot."""
         enough = len(self.recent) >= FEWEST_RECENT
         return self.tracker_alive and enough and self.outside > 0.5 * len(self.recent)
-
-    @property
-    def snap_ahead(self) -> bool:
-        """Whether the equilibrium is lost or unstable, or its loss is foretold: news that cannot wait."""
-        return statuses.stability(self).level > OK
-
-    def statuses(self) -> list[Status]:
-        """One status a part, for /diagnostics."""
-        return statuses.all_of(self)
 
     # -- the summary of a replay --
 

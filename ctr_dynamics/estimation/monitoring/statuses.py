@@ -3,18 +3,14 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
 
+from ctr_dynamics.estimation.monitoring.health import TRACKER_LIMIT_S, Counter, Health
 from ctr_dynamics.estimation.step_output import ERROR, OK, WARN, Status
 
-if TYPE_CHECKING:
-    from ctr_dynamics.estimation.monitoring.health import Counter, Health
-
-TRACKER_LIMIT_S = 1.0  # without a usable measurement for longer the status says so: 40 are missing at 40 Hz
 SNAP_WARNING_S = 1.0  # a snap that is nearer than this is warned of: time to stop an actuator by hand
 
 
-def all_of(health: Health) -> list[Status]:
+def all_statuses(health: Health) -> list[Status]:
     """One status a part."""
     return [
         output(health),
@@ -26,6 +22,11 @@ def all_of(health: Health) -> list[Status]:
         health.consistency.status(),
         stability(health),
     ]
+
+
+def snap_ahead(health: Health) -> bool:
+    """Whether the equilibrium is lost or unstable, or its loss is foretold: news that cannot wait."""
+    return stability(health).level > OK
 
 
 def output(health: Health) -> Status:
