@@ -40,6 +40,7 @@ from ctr_dynamics.ros.parameter_declaration import declare, watch
 from ctr_dynamics.ros.publishers import Outputs
 from ctr_dynamics.ros.topic_names import NAME, NAMESPACE, message_class, node_topic
 from ctr_dynamics.runtime import node_diagnostics
+from ctr_dynamics.runtime.input_gate import InputGate
 from ctr_dynamics.runtime.memory import keep_memory
 from ctr_dynamics.runtime.recorder import Recorder
 from ctr_dynamics.runtime.ring_buffer_recording import RingBufferRecording
@@ -73,6 +74,7 @@ class EstimatorNode(Node):
         except Stopped:
             self.destroy_node()  # so that others hear of the end
             raise
+        self._gate = InputGate(self._estimator)
         self._prepared: tuple[Settings, set[str], Estimator | None] | None = None
         self._use_sim_time = bool(self.get_parameter("use_sim_time").value)
 
@@ -200,16 +202,19 @@ class EstimatorNode(Node):
         except CdrError as error:
             self._note_undecodable(topics.JOINT_STATES, error)
             return
+        given = self._gate.joint_state(message, arrival_ns)
+        if given is None:
+            return
         if arrival_ns <= 0:  # before the first /clock: the arrival tells nothing of the stamps' clock
-            self._estimator.add_joint_state(message.stamp_ns, message.names, message.positions)
+            self._estimator.add_joint_state(given.stamp_ns, given.names, given.positions)
             return
         clock = self.loop.clock_offset
-        if not clock.sample(message.stamp_ns, arrival_ns):
-            rejection = clock.rejection(message.stamp_ns, arrival_ns)
+        if not clock.sample(given.stamp_ns, arrival_ns):
+            rejection = clock.rejection(given.stamp_ns, arrival_ns)
             self._estimator.health.note("joints", "far ahead", rejection)
             return
-        self.timing.arrived(message.stamp_ns, clock.at(arrival_ns))
-        self._estimator.add_joint_state(message.stamp_ns, message.names, message.positions)
+        self.timing.arrived(given.stamp_ns, clock.at(arrival_ns))
+        self._estimator.add_joint_state(given.stamp_ns, given.names, given.positions)
 
     def _take_tracker(self, data: bytes, arrival_ns: int) -> None:
         try:
@@ -217,9 +222,11 @@ class EstimatorNode(Node):
         except CdrError as error:
             self._note_undecodable(topics.TRACKER_TIP, error)
             return
-        self._estimator.add_tracker_pose(
-            message.stamp_ns, message.position, message.quaternion_xyzw, message.frame_id
-        )
+        pose = self._gate.pose(message, arrival_ns)
+        if pose is not None:
+            self._estimator.add_tracker_pose(
+                pose.stamp_ns, pose.position, pose.quaternion_xyzw, pose.frame_id
+            )
 
     def _take_load(self, data: bytes, arrival_ns: int) -> None:
         try:
@@ -227,7 +234,9 @@ class EstimatorNode(Node):
         except CdrError as error:
             self._note_undecodable(topics.TIP_LOAD, error)
             return
-        self._estimator.add_tip_load(message.stamp_ns, message.force, message.torque, message.frame_id)
+        load = self._gate.load(message, arrival_ns)
+        if load is not None:
+            self._estimator.add_tip_load(load.stamp_ns, load.force, load.torque, load.frame_id)
 
     def _note_undecodable(self, topic: str, error: CdrError) -> None:
         count, _ = self._undecodable.get(topic, (0, ""))
@@ -360,6 +369,7 @@ class EstimatorNode(Node):
     def _swap(self, estimator: Estimator, settings: Settings) -> None:
         estimator.carry_load(self._estimator)
         self._estimator = estimator
+        self._gate = InputGate(estimator)
         self.timing.policy = settings["output.policy"]
         self.timing.input_timeout_ns = round(settings["input_timeout_s"] * 1e9)
         self.loop.swap(estimator)

@@ -31,7 +31,7 @@ BAGS = Path(__file__).parents[1] / "data" / "bags"
 
 
 class RestingRobot(threading.Thread):
-    """Publishes a robot at rest at 100 Hz, stamped now, and a tracker that agrees with the model at 40 Hz."""
+    """Publishes a robot at rest at 100 Hz, stamped now, and a tracker that agrees with the model but for its noise at 20 Hz."""
 
     def __init__(self, live: Live, shift_ns: int = 0) -> None:
         super().__init__(daemon=True)
@@ -41,6 +41,8 @@ class RestingRobot(threading.Thread):
         self.positions = [x for pair in rest for x in pair]
         self.live = live
         self.joints_on = self.tracker_on = True
+        self.tracker_frozen = False  # on: the last pose again and again
+        self.noise = np.random.default_rng(0)
         self.shift_ns = shift_ns  # of the stamps
         self.joint_stamps: list[int] = []
         profile = qos.profile("best_effort", 50)
@@ -74,7 +76,11 @@ class RestingRobot(threading.Thread):
                 self.joints(now)
             pose = self.agreeing_pose()
             if self.tracker_on and pose is not None and tick % 5 == 0:
-                self.tracker(now, pose.position, pose.quaternion_xyzw)
+                if not self.tracker_frozen:
+                    noise = self.noise.normal(0.0, (1e-4,) * 3 + (1e-4,) * 4)
+                    position = tuple((np.array(pose.position) + noise[:3]).tolist())
+                    quaternion = tuple((np.array(pose.quaternion_xyzw) + noise[3:]).tolist())
+                self.tracker(now, position, quaternion)
             tick += 1
             self.stopped.wait(0.01)
 

@@ -42,11 +42,23 @@ def test_poses_that_cannot_be_used(start):
         live.wait_for_status("tracker", 1, "'polaris'")
         stamp = time.time_ns()
         robot.tracker(stamp, p, q)
-        robot.tracker(stamp, p, q)
+        robot.tracker(stamp, (p[0] + 1e-3, *p[1:]), q)
         live.wait_for_status("tracker", 1, "duplicate stamp")
         robot.tracker(stamp - 60_000_000_000, p, q)
         live.wait_for_status("tracker", 1, "limit")
         robot.tracker_on = True
+        assert_goes_on(live)
+
+
+def test_a_frozen_tracker_is_left_out_and_named(start):
+    with start() as live:
+        robot = live.resting_robot()
+        live.wait_for_more(topics.INNOVATION, 2)
+        robot.tracker_frozen = True
+        status = live.wait_for_status("tracker", 1, "the tracker is frozen")
+        assert "frozen" in {value.key for value in status.values}
+        robot.tracker_frozen = False
+        live.wait_for_more(topics.INNOVATION, 5)
         assert_goes_on(live)
 
 
@@ -59,7 +71,7 @@ def test_joint_states_that_cannot_be_used(start):
         robot.joints(time.time_ns(), positions=[NAN, *robot.positions[1:]])
         live.wait_for_status("joints", 1, "not finite")
         robot.joints(time.time_ns(), positions=[robot.positions[0], -300.0, *robot.positions[2:]])
-        live.wait_for_status("joints", 1, "300")
+        live.wait_for_status("joints", 1, "299.7 m")
         stamp = robot.joint_stamps[-1]
         robot.joints(stamp)
         robot.joints(stamp)
@@ -67,7 +79,7 @@ def test_joint_states_that_cannot_be_used(start):
         robot.joints(time.time_ns() - 60_000_000_000)
         live.wait_for_status("joints", 1, "time ran backwards")
         robot.joints(time.time_ns() + 3_600_000_000_000)
-        live.wait_for_status("joints", 1, "far ahead")
+        live.wait_for_status("joints", 1, "stamp ahead")
         assert_goes_on(live)
         assert abs(live.stamps(topics.TIP_POSE)[-1] - time.time_ns()) < 60_000_000_000
 
