@@ -1,4 +1,4 @@
-"""Bags: finding and reading MCAP recordings (also cut ones), writing them, what is in them, and replay."""
+"""Bags and messages: MCAP recordings are found, read (also cut ones), described and written; topics and their encoding."""
 
 from ctr_dynamics.io.bag_reader import Bag, InputMessage, RawMessage, open_bag, sha256_of
 from ctr_dynamics.io.bag_writer import BagWriter, LiveRecorder, write_bag
