@@ -232,6 +232,7 @@ TERMS = (
         "pack",
         "packs?",
         "packs? of (?:lanes|eight)",
+        "kernels/(?!layout)|model/",
     ),
     Term(
         "slope discontinuity",

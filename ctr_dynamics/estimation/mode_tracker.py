@@ -12,7 +12,7 @@ from ctr_dynamics.estimation.step_output import Modes
 from ctr_dynamics.estimation.vibration_modes import ModalBasis, lanes_of, modal_parts
 from ctr_dynamics.kernels.structures import SweepBuffers
 from ctr_dynamics.model.mesh import Key
-from ctr_dynamics.model.mesh_interpolation import Transfer, transfer
+from ctr_dynamics.model.mesh_interpolation import MeshInterpolation, mesh_interpolation
 from ctr_dynamics.model.model import Model
 from ctr_dynamics.model.simulator import State
 from ctr_dynamics.model.statics import Equilibrium, Statics
@@ -54,7 +54,7 @@ class ModeTracker:
         self.model, self.every, self.options = model, every, RefreshOptions()
         nodes = self.options.nodes
         self.coarse = model if model.nodes <= nodes else Model(model.robot, nodes, model.base_cells)
-        self._interpolations: dict[tuple[Key, Key], Transfer] = {}
+        self._interpolations: dict[tuple[Key, Key], MeshInterpolation] = {}
         self._buffers: dict[Key, SweepBuffers] = {}
         self.clear()
 
@@ -64,7 +64,7 @@ class ModeTracker:
         self._age = self.every
         self._pending: Iterator[ModalBasis | None] | None = None
         self._own: Equilibrium | None = None
-        self._interpolation: Transfer | None = None
+        self._interpolation: MeshInterpolation | None = None
         self._alpha = np.zeros(self.model.n)  # where the modes were found
         self._reused = (
             self.options.most_reused
@@ -134,7 +134,7 @@ class ModeTracker:
                 return
             pair = (equilibrium.key, on.key)
             if pair not in self._interpolations:
-                self._interpolations[pair] = transfer(self.model.n, equilibrium.mesh, on.mesh)
+                self._interpolations[pair] = mesh_interpolation(self.model.n, equilibrium.mesh, on.mesh)
             self._interpolation = self._interpolations[pair]
         self._own, self._alpha, self._reused = equilibrium, now.alpha, self.options.most_reused
         if on.key not in self._buffers:

@@ -49,7 +49,7 @@ def run_many(
 
     Args:
         parameters: (B, NP) blocks of the cases. inputs: of each case, rows at times (k,) s as for :func:`ctr_dynamics.model.trajectory.run`.
-        tolerance: largest scaled imbalance at the tip.
+        tolerance: largest scaled residual at the tip.
     Returns:
         What :func:`~ctr_dynamics.model.trajectory.run` would return for each case, to within ``tolerance``; a case without an equilibrium to
         start from has a failure and no steps.

@@ -1,4 +1,4 @@
-"""Transfer of fields and node states between two meshes of the same sections, as sparse matrices that hold while the sections last."""
+"""Interpolation of fields and node states between two meshes of the same sections, as sparse matrices that hold while the sections last."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from ctr_dynamics.model.mesh import STAGES, Key, Mesh
 _STAGE_XI = np.array([0.0, 0.5, 0.5, 1.0])
 
 
-class Transfer(NamedTuple):
+class MeshInterpolation(NamedTuple):
     """Matrices between a fine and a coarse mesh.
 
     ``restrict`` (coarse fields, fine fields), ``prolong`` (fine fields, coarse fields), ``nodes`` (fine nodes, coarse nodes).
@@ -32,11 +32,11 @@ def coarse_key(key: Key, nodes: int) -> Key:
     return order, tuple(max(1, round(c * ratio)) for c in cells)
 
 
-def transfer(n: int, fine: Mesh, coarse: Mesh) -> Transfer:
+def mesh_interpolation(n: int, fine: Mesh, coarse: Mesh) -> MeshInterpolation:
     """Cubic interpolation inside each section, between the points that are nodes; fields behind the plate are the same on both meshes."""
     F = field_rows(n).size
     base = base_field_count(n, fine.base_cells)
-    return Transfer(
+    return MeshInterpolation(
         _fields(fine.sec_cells, coarse.sec_cells, F, base),
         _fields(coarse.sec_cells, fine.sec_cells, F, base),
         _nodes(coarse.sec_cells, fine.sec_cells),

@@ -124,7 +124,8 @@ class Model:
         parameters: np.ndarray | None = None,
         limit: int = SHOOTING_ITERATIONS,
     ) -> ShootingSolver:
-        """Buffers and options of a shooting problem on ``mesh``; ``parameters`` (NP,): an array to read instead of one of its own."""
+        """Buffers and options of a shooting problem on ``mesh``; ``parameters`` (NP,): an array to read instead of one of its own;
+        ``limit``: iterations."""
         single = self.sweep_buffers(mesh, 1)
         if parameters is not None:
             single = single._replace(parameters=parameters)

@@ -59,7 +59,7 @@ class PairedSteps:
             return self._part(a, b, t, self.first.scheme, inputs_a, inputs_b, record)
         trials = a.copy(), b.copy()
         for trial in trials:
-            trial.forget_course()
+            trial.forget_history()
         parts = []
         for begin, end in pairwise(times):
             for trial in trials:

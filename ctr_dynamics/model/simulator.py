@@ -119,7 +119,7 @@ class State:
             setattr(self, name, getattr(other, name))
         self.usable = False
 
-    def forget_course(self) -> None:
+    def forget_history(self) -> None:
         """Look for the next unknowns where the last step ended."""
         self.unknowns[:] = self.unknowns[-1]
         self.earlier[:] = self.unknowns[-1]
@@ -140,7 +140,7 @@ class Simulator:
     Args:
         model: the robot.
         scheme: time scheme with its step.
-        tolerance: largest scaled imbalance at the tip.
+        tolerance: largest scaled residual at the tip.
         parameters: (NP,) block instead of the robot file's; written to freely by its owner between steps.
 
     Example:
@@ -237,7 +237,7 @@ class Simulator:
         for count, start in retries:
             trial = state.copy()
             if start is None:
-                trial.forget_course()
+                trial.forget_history()
             scheme = make_scheme(self.scheme.name, self.scheme.dt / count) if count > 1 else self.scheme
             records: list[Record] = []
             for part in range(count):
@@ -268,7 +268,7 @@ class Simulator:
     ) -> StepResult | None:
         """The step in parts between ``times``; None where a part fails."""
         trial = state.copy()
-        trial.forget_course()
+        trial.forget_history()
         parts = []
         for begin, end in pairwise(times):
             scheme = make_scheme(self.scheme.name, end - begin)

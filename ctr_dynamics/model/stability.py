@@ -17,7 +17,7 @@ from ctr_dynamics.model.mesh import Mesh
 from ctr_dynamics.model.model import Model
 from ctr_dynamics.model.statics import StaticProblem
 
-TOLERANCE = 1e-6  # of the scaled imbalance: the measure then has five digits
+TOLERANCE = 1e-6  # of the scaled residual: the measure then has five digits
 HELD = 1e-4  # change of the measure between calls, relative, below which the robot counts as standing
 
 

@@ -181,7 +181,7 @@ class Statics:
     ) -> float:
         """det(d alpha / d psi_L) with the loads held, positive on stable branches (Gilbert et al. 2016, Ha et al. 2016).
 
-        psi_L and the tip's imbalance r are smooth functions of (x, alpha), and their joint Jacobian is regular where the
+        psi_L and the tip's residual r are smooth functions of (x, alpha), and their joint Jacobian is regular where the
         shooting one is not, so det(d alpha / d psi_L) = det(r_x) / det([r_x, r_alpha; psi_x, psi_alpha]) is exact through a fold.
         """
         layout = self.model.layout

@@ -9,7 +9,7 @@ from ctr_dynamics.estimation.filter.energy_norm import energy_rows, field_weight
 from ctr_dynamics.estimation.filter.parameter_priors import model_uncertainty
 from ctr_dynamics.kernels.layout import base_field_count
 from ctr_dynamics.model.mesh import build_mesh
-from ctr_dynamics.model.mesh_interpolation import coarse_key, transfer
+from ctr_dynamics.model.mesh_interpolation import coarse_key, mesh_interpolation
 from ctr_dynamics.model.model import Model
 from ctr_dynamics.model.simulator import Inputs, Simulator
 from ctr_dynamics.model.statics import Statics
@@ -31,7 +31,7 @@ def model(robot):
     return Model(robot, nodes=24)
 
 
-# -- transfer --
+# -- mesh_interpolation --
 
 
 def cubic(cells, rows, coefficients):
@@ -62,7 +62,7 @@ def test_transfer_is_exact_for_cubics_inside_each_section(robot):
     on_coarse, _ = cubic(coarse.sec_cells, F, coefficients)
     _, coarse_nodes = cubic(coarse.sec_cells, S, coefficients)
     _, fine_nodes = cubic(mesh.sec_cells, S, coefficients)
-    moved = transfer(fine.n, mesh, coarse)
+    moved = mesh_interpolation(fine.n, mesh, coarse)
     assert np.allclose(moved.restrict @ np.r_[on_fine.ravel(), behind], np.r_[on_coarse.ravel(), behind])
     assert np.allclose(moved.prolong @ np.r_[on_coarse.ravel(), behind], np.r_[on_fine.ravel(), behind])
     assert np.allclose(moved.nodes @ coarse_nodes, fine_nodes)

@@ -185,21 +185,21 @@ def test_a_finite_difference_renews_its_column():
     inverse = np.linalg.inv(wrong)[None].copy()
     column = 3
     for renewed in (3, 4, 5, 6, 0, 1, 2):
-        imbalance = np.zeros((m, 2))
-        imbalance[:, 1] = exact[:, renewed] * units[renewed]
-        column = renew_columns(Lanes(2, 2), imbalance.ravel(), column, units, inverse, np.empty((2, m)))
+        residual = np.zeros((m, 2))
+        residual[:, 1] = exact[:, renewed] * units[renewed]
+        column = renew_columns(Lanes(2, 2), residual.ravel(), column, units, inverse, np.empty((2, m)))
         wrong[:, renewed] = exact[:, renewed]
         assert np.allclose(np.linalg.inv(inverse[0]), wrong, atol=1e-9)
     assert column == 3
     assert np.allclose(np.linalg.inv(inverse[0]), exact, atol=1e-9)
 
 
-@pytest.mark.parametrize("imbalance", [np.nan, np.inf, 0.0], ids=["nan", "infinite", "singular"])
-def test_a_finite_difference_that_tells_nothing_changes_nothing(imbalance):
+@pytest.mark.parametrize("residual", [np.nan, np.inf, 0.0], ids=["nan", "infinite", "singular"])
+def test_a_finite_difference_that_tells_nothing_changes_nothing(residual):
     rng, m = np.random.default_rng(1), 7
     inverse = rng.normal(size=(1, m, m))
     before = inverse.copy()
     found = np.zeros((m, 2))
-    found[:, 1] = imbalance
+    found[:, 1] = residual
     assert renew_columns(Lanes(2, 2), found.ravel(), 0, np.full(m, 1e-6), inverse, np.empty((2, m))) == 1
     assert np.array_equal(inverse, before)

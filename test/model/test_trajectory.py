@@ -144,7 +144,7 @@ def test_sensitivities_of_a_plain_run():
 
 
 def test_sensitivities_with_strong_friction():
-    """Sixty times the stated friction between tubes bends the imbalance: a tangent by changes that are too large would grow from step to step."""
+    """Sixty times the stated friction between tubes makes the residual nonlinear: a tangent by too large changes would grow from step to step."""
     model = Model(ROBOT, nodes=12)
     model.parameters[model.layout["tube_coulomb"]] = 0.19
     unit = 0.02 * model.parameters[model.layout["bending_stiffness"]][0]

@@ -122,15 +122,15 @@ class Twin:
         p, c0 = self.oracle.p, self.c0
         h, h_rate = self.work.hist_drive[2 * i : 2 * i + 2]
 
-        def imbalance(give):
+        def torque_residual(give):
             rate = p["alpha_rate"][i] + c0 * give + h
             inertia = p["drive_inertia"][i] * (c0 * rate + h_rate)
             return give - p["drive_compliance"][i] * (torque - inertia), rate
 
         # linear in what the drive gives way
-        at_0, at_1 = imbalance(0.0)[0], imbalance(1.0)[0]
+        at_0, at_1 = torque_residual(0.0)[0], torque_residual(1.0)[0]
         give = -at_0 / (at_1 - at_0)
-        return p["alpha"][i] + give, imbalance(give)[1]
+        return p["alpha"][i] + give, torque_residual(give)[1]
 
     def base_slope(self, v, i, reference, hist):
         """(18) of tube i."""

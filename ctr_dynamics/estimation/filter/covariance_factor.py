@@ -30,7 +30,7 @@ from ctr_dynamics.kernels.structures import (
 )
 from ctr_dynamics.kernels.tangent import theta_tangent
 from ctr_dynamics.model.mesh import Key, Mesh, build_mesh
-from ctr_dynamics.model.mesh_interpolation import Transfer, coarse_key, transfer
+from ctr_dynamics.model.mesh_interpolation import MeshInterpolation, coarse_key, mesh_interpolation
 from ctr_dynamics.model.model import Model
 from ctr_dynamics.model.remeshing import remap_columns
 from ctr_dynamics.model.simulator import Record
@@ -51,7 +51,7 @@ class FactorState(NamedTuple):
 
     key: Key
     mesh: Mesh | None
-    interpolation: Transfer | None
+    interpolation: MeshInterpolation | None
     beta: Floats
     theta: Floats
     stored: Floats
@@ -83,8 +83,8 @@ class CovarianceFactor:
         self._effect = csr_array(uncertainty.effect)
         self._work: dict[tuple, tuple] = {}
         self._differences = FiniteDifferences(EPSILON, model.tangent_perturbation)
-        self._coarse: dict[Key, tuple[Key, Mesh, Transfer | None]] = {}
-        self.interpolation: Transfer | None = None
+        self._coarse: dict[Key, tuple[Key, Mesh, MeshInterpolation | None]] = {}
+        self.interpolation: MeshInterpolation | None = None
         self._norm = EnergyNorm(model)
         self.key: Key = ((), ())
         self.mesh: Mesh | None = None
@@ -145,7 +145,9 @@ class CovarianceFactor:
         """(fields, r) columns of the fields."""
         return self.stored[0]
 
-    def _coarse_sections(self, key: Key, mesh: Mesh, beta: Floats) -> tuple[Key, Mesh, Transfer | None]:
+    def _coarse_sections(
+        self, key: Key, mesh: Mesh, beta: Floats
+    ) -> tuple[Key, Mesh, MeshInterpolation | None]:
         """The factor's sections for the model's: key, mesh, and the interpolation between them (None where they are the same)."""
         if key not in self._coarse or self.model.moving_precurvature:
             own = coarse_key(key, FACTOR_NODES)
@@ -154,7 +156,11 @@ class CovarianceFactor:
                 return self._coarse[key]
             coarse = build_mesh(self.model.segments, beta, own, mesh.base_cells)
             known = self._coarse.get(key)
-            self._coarse[key] = own, coarse, known[2] if known else transfer(self.model.n, mesh, coarse)
+            self._coarse[key] = (
+                own,
+                coarse,
+                known[2] if known else mesh_interpolation(self.model.n, mesh, coarse),
+            )
         return self._coarse[key]
 
     def _remap(self, key: Key, mesh: Mesh, beta: Floats) -> None:
