@@ -108,7 +108,9 @@ def test_sdist_and_wheel_are_complete_and_the_wheel_works(source, tmp_path):
     modules = {file.relative_to(ROOT).as_posix() for file in (ROOT / "ctr_dynamics").rglob("*.py")}
     assert modules <= set(in_wheel)
     assert modules <= set(in_sdist)
-    assert not any(entry.startswith("test/") for entry in in_wheel)
+    assert {"py.typed", "__init__.pyi"} <= {entry.removeprefix("ctr_dynamics/") for entry in in_wheel}
+    assert not {entry.split("/")[0] for entry in in_wheel} & {"test", "tools", "studies", "examples"}
+    assert {"studies/__init__.py", "tools/tables.py", "examples/01_static_shape.py"} <= set(in_sdist)
     assert {"LICENSE", "package.xml", "requirements.txt", "resource/ctr_dynamics"} <= set(in_sdist)
 
     target = tmp_path / "site"
