@@ -105,8 +105,8 @@ def test_every_axis_of_the_tracker_has_its_own_deviation(robot):
 
 def test_an_equilibrium_that_cannot_be_linearised_begins_without_deviation(model, monkeypatch):
     def at_a_fold(*arguments):
-        *_, dx, fields, dnodes = arguments
-        dx[:], fields[:], dnodes[:] = np.nan, np.nan, np.nan
+        derivatives = arguments[-1]
+        derivatives.unknowns[:], derivatives.fields[:], derivatives.nodes[:] = np.nan, np.nan, np.nan
         return False
 
     monkeypatch.setattr(factor_module, "linearise", at_a_fold)
@@ -228,7 +228,7 @@ def test_a_checkpoint_of_the_factor_is_not_written_by_later_steps(model):
 
 @pytest.mark.parametrize("lent", [False, True])
 def test_the_factor_stays_where_a_step_cannot_be_linearised(model, monkeypatch, lent):
-    """A failure shows in a later pack of lanes only, when the first columns have been written."""
+    """A failure shows in a later batch of lanes only, when the first columns have been written."""
     start, _, records = simulated(model, model.parameters, (0.0, 0.0), 3)
     factor = CovarianceFactor(model, model_uncertainty(model), rank=24)
     factor.start(start.key, start.mesh, BETA, ALPHA, model.parameters, start.unknowns[-1])
@@ -238,8 +238,7 @@ def test_the_factor_stays_where_a_step_cannot_be_linearised(model, monkeypatch, 
         factor.checkpoint()
 
     def failing(*arguments):
-        result = arguments[15]
-        result[:, :, :8] = np.nan
+        arguments[-1].fields[:, :, :8] = np.nan
         return False
 
     with monkeypatch.context() as patch:
