@@ -101,6 +101,7 @@ class StageCoefficients(NamedTuple):
     weights: np.ndarray
 
 
+@structure
 class RunArrays(NamedTuple):
     """What one run carries from step to step: parameters (NP,), stored fields ``bank`` (3 + stages, fields), ``unknowns`` (stages, 5 + N) of the
     last step and of the ``earlier`` ones (EARLIER, stages, 5 + N), the ``inverse`` (5 + N, 5 + N) Jacobian, and states at the ``nodes``."""

@@ -122,14 +122,24 @@ class Model:
         mesh: Mesh,
         tolerance: float,
         parameters: np.ndarray | None = None,
+        jacobian: SweepBuffers | None = None,
         limit: int = SHOOTING_ITERATIONS,
     ) -> ShootingSolver:
-        """Buffers and options of a shooting problem on ``mesh``; ``parameters`` (NP,): an array to read instead of one of its own;
-        ``limit``: iterations."""
-        single = self.sweep_buffers(mesh, 1)
+        """Buffers and options of a shooting problem on ``mesh``.
+
+        Args:
+            tolerance: largest scaled residual. limit: most iterations.
+            parameters: (NP,) array to read instead of one of its own.
+            jacobian: buffers of at least the Jacobian's lanes, of which it takes the first part.
+        """
+        single, lanes = self.sweep_buffers(mesh, 1), unknown_lanes(self.kind).count
+        if jacobian is None:
+            wide = self.sweep_buffers(mesh, lanes)
+        else:
+            wide = SweepBuffers(
+                *(shared[: len(own) * lanes] for shared, own in zip(jacobian, single, strict=True))
+            )
         if parameters is not None:
             single = single._replace(parameters=parameters)
-        jacobian = self.sweep_buffers(mesh, unknown_lanes(self.kind).count)
-        return ShootingSolver(
-            single, jacobian, ShootingOptions(self.scale, self.perturbation, tolerance, limit)
-        )
+        options = ShootingOptions(self.scale, self.perturbation, tolerance, limit)
+        return ShootingSolver(single, wide, options)

@@ -105,6 +105,7 @@ class State:
     usable: bool
     nodes: np.ndarray
     inputs: Inputs
+    _arrays: RunArrays | None = field(default=None, repr=False, compare=False)
 
     def copy(self) -> State:
         """An independent copy; meshes are shared, they are never written."""
@@ -125,8 +126,11 @@ class State:
         self.earlier[:] = self.unknowns[-1]
 
     def arrays(self, parameters: np.ndarray) -> RunArrays:
-        """The arrays for the kernels, with the ``parameters`` (NP,) of the run."""
-        return RunArrays(parameters, self.bank, self.unknowns, self.earlier, self.inverse, self.nodes)
+        """The arrays for the kernels, with the ``parameters`` (NP,) of the run; the same object while they are the same."""
+        arrays = parameters, self.bank, self.unknowns, self.earlier, self.inverse, self.nodes
+        if self._arrays is None or any(a is not b for a, b in zip(self._arrays, arrays, strict=True)):
+            self._arrays = RunArrays(*arrays)
+        return self._arrays
 
     @property
     def fields(self) -> np.ndarray:

@@ -232,10 +232,10 @@ class StaticProblem:
 
     def __init__(self, model: Model, mesh: Mesh, beta: np.ndarray, tolerance: float) -> None:
         self.model, self.mesh = model, mesh
-        self._solver = model.shooting_solver(mesh, tolerance)
-        self.single = self._solver.single
         self._lanes = lanes_for(1 + model.unknown_count + model.n)  # base case, unknowns, alpha
         self._many = model.sweep_buffers(mesh, self._lanes.count)
+        self._solver = model.shooting_solver(mesh, tolerance, jacobian=self._many)
+        self.single = self._solver.single
         self._inverse = np.zeros((model.unknown_count, model.unknown_count))
         self.move(beta)
 
