@@ -19,6 +19,7 @@ from ctr_dynamics import __version__
 from ctr_dynamics.cli.main import main
 from ctr_dynamics.cli.replay_command import settings_for_replay
 from ctr_dynamics.errors import InputError
+from ctr_dynamics.estimation.monitoring.health import Health
 from ctr_dynamics.io.bag_reader import InputMessage, open_bag, sha256_of
 from ctr_dynamics.io.bag_writer import write_bag
 from ctr_dynamics.io.messages import cdr, topics
@@ -50,14 +51,8 @@ class StandIn:
         self.innovations: list = []
         self.invalid = range(0)
         self.noted: list[tuple[str, str, str]] = []
-        self.health = SimpleNamespace(
-            snap_ahead=False,
-            note=lambda *what: self.noted.append(what[:3]),
-            dropped=0,
-            statuses=lambda: [
-                SimpleNamespace(name="solver", level=0, message="ok", values={"steps": str(self.k)})
-            ],
-        )
+        self.health = Health()
+        self.health.note = lambda *what: self.noted.append(what[:3])  # type: ignore[method-assign]
 
     def add_joint_state(self, stamp_ns, names, positions) -> None:
         self.calls.append(("joint", stamp_ns))
