@@ -21,7 +21,7 @@ def structure(cls: type[T]) -> type[T]:
         "__qualname__": cls.__qualname__,
         "__doc__": cls.__doc__,
     }
-    names["__getstate__"] = lambda self: None  # the type is found again where it is unpickled
+    names["__getstate__"] = lambda self: None  # the type is found again where it is loaded
     made: Any = type(cls.__name__, (cls,), names)
 
     @typeof_impl.register(made)
