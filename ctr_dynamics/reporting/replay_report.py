@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
 
+from ctr_dynamics import chi_square
 from ctr_dynamics.io.messages.cdr import PoseIn
 from ctr_dynamics.parameters import PARAMETERS
 from ctr_dynamics.reporting.animation import add_animation
@@ -262,7 +262,7 @@ def _innovations(page: Page, found: list[Innovation], first_ns: int) -> None:
     nis = np.array([usable[k].nis / usable[k].dof for k in order])
     accepted = np.array([usable[k].accepted for k in order])
     dof = round(float(np.median([item.dof for item in usable])))
-    limits = [(chi2.ppf(p, dof) / dof, label) for p, label in ((0.025, "95 %"), (0.975, ""))]
+    limits = [(chi_square.quantile(p, dof) / dof, label) for p, label in ((0.025, "95 %"), (0.975, ""))]
     panel = Panel("NIS / dof", limits=limits, log=True)
     panel.line(t[accepted], nis[accepted], "fused", "open_loop", dots=True)
     if not accepted.all():

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
 
+from ctr_dynamics import chi_square
 from ctr_dynamics.diagnosis.inference.fit_problem import Problem
 from ctr_dynamics.diagnosis.inference.map_fit import Fit
 
@@ -58,10 +58,10 @@ def whiteness(problem: Problem, fit: Fit) -> Whiteness:
         r = np.array([float(x[k:] @ x[:-k]) / power for k in range(1, lags + 1)])
         q += n * (n + 2) * float(np.sum(r**2 / (n - np.arange(1, lags + 1))))
         dof += lags
-    p_correlation = float(chi2.sf(q, max(dof - free // 3, 1))) if dof else 1.0
+    p_correlation = chi_square.upper_tail(q, max(dof - free // 3, 1)) if dof else 1.0
     m = max(len(fit.whitened) - free, 1)
     power = float(fit.whitened @ fit.whitened)
-    p_power = float(chi2.sf(power, m))
+    p_power = chi_square.upper_tail(power, m)
     p = min(1.0, 2.0 * min(p_correlation, p_power))
     return Whiteness(p, power / m, p_power, p_correlation)
 

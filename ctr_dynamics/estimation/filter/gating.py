@@ -11,8 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
 
+from ctr_dynamics import chi_square
 from ctr_dynamics.estimation.filter.force_variance import ForceVariance
 
 Floats = NDArray[np.float64]
@@ -47,7 +47,7 @@ class Gate:
 
     def __init__(self, options: GateOptions) -> None:
         self.options = options
-        self.limits = {dof: float(chi2.ppf(options.probability, dof)) for dof in range(1, 7)}
+        self.limits = {dof: chi_square.quantile(options.probability, dof) for dof in range(1, 7)}
         self.rejections = 0
 
     def outside(self, nis: float, dof: int) -> bool:

@@ -7,8 +7,7 @@ from collections import deque
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
-from scipy.stats import chi2
-
+from ctr_dynamics import chi_square
 from ctr_dynamics.estimation.monitoring.consistency_monitor import ConsistencyMonitor
 from ctr_dynamics.estimation.step_output import FUSION_OFF, Innovation
 from ctr_dynamics.model.stability import Stability
@@ -190,7 +189,7 @@ class Health:
         if not self.nis_dof:
             return {"mean": None, "dof": 0, "lower95": None, "upper95": None, "within": None}
         mean = self.nis_sum / self.nis_dof
-        lower, upper = (float(chi2.ppf(p, self.nis_dof)) / self.nis_dof for p in (0.025, 0.975))
+        lower, upper = (chi_square.quantile(p, self.nis_dof) / self.nis_dof for p in (0.025, 0.975))
         return {
             "mean": mean,
             "dof": self.nis_dof,
