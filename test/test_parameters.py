@@ -94,7 +94,7 @@ def test_bad_parameter_files_are_one_line(tmp_path, text, part):
 
 
 def test_missing_parameter_file(tmp_path):
-    with pytest.raises(InputError, match="cannot read: No such file"):
+    with pytest.raises(InputError, match="no such file"):
         Settings(read_parameter_file(tmp_path / "none.yaml"))
 
 

@@ -329,7 +329,7 @@ def test_binary_file_is_rejected(tmp_path):
     file.write_bytes(b"\x89MCAP0\r\n\xff")
     with pytest.raises(InputError, match="not UTF-8"):
         load_robot(file)
-    with pytest.raises(InputError, match="nor a file"):
+    with pytest.raises(InputError, match="is a folder"):
         load_robot(tmp_path)
 
 

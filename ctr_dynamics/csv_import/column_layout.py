@@ -10,6 +10,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError
 
 from ctr_dynamics.errors import InputError
+from ctr_dynamics.io.text_files import decode_text, read_bytes
 from ctr_dynamics.io.yaml_files import read_yaml
 from ctr_dynamics.units import factor, units_of
 
@@ -94,15 +95,7 @@ def read_layout(path: Path) -> Layout:
     Raises:
         InputError: unreadable, an unknown key or value, or a unit that is none.
     """
-    try:
-        text = path.read_text(encoding="utf-8")
-    except UnicodeDecodeError as error:
-        raise InputError(
-            f"not UTF-8 at byte {error.start}", do="save as UTF-8 text", where=str(path)
-        ) from None
-    except OSError as error:
-        raise InputError(f"cannot be read ({error.strerror})", where=str(path)) from None
-    data = read_yaml(text, str(path))
+    data = read_yaml(decode_text(read_bytes(path), str(path)), str(path))
     try:
         layout = Layout.model_validate(data)
     except ValidationError as error:

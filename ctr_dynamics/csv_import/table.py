@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TextIO
 
 from ctr_dynamics.errors import InputError
+from ctr_dynamics.io.text_files import check_regular
 
 MAX_LINE = 100_000  # characters; longer is no log
 _DELIMITERS = ",;\t"
@@ -55,6 +56,7 @@ class CsvTable:
             )
 
     def _open(self) -> TextIO:
+        check_regular(self.path, "give a CSV file")
         try:
             return self.path.open(encoding="utf-8-sig", newline="")
         except OSError as error:

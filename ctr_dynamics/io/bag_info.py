@@ -121,6 +121,7 @@ def inspect(path: str | Path) -> BagReport:
     ends = [t.log[-1] for t in times.values()]
     start_ns = min(starts, default=0)
     problems = [Finding("warning", "", note) for note in bag.notes]
+    problems += [Finding("note", "", note) for note in bag.unchecked]
     reports = [
         _topic_report(known[name].ros_type, name, times.get(name), start_ns, problems) for name in known
     ]

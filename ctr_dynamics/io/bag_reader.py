@@ -24,6 +24,10 @@ DECODERS: dict[str, Callable[[bytes], Decoded]] = {
 }
 
 
+MAX_HELD_BYTES = 128 * 2**20  # two of the largest chunks
+_ENTRY_BYTES = 256  # what a message takes beside its bytes while it waits for its turn
+
+
 class RawMessage(NamedTuple):
     """A message as recorded: topic, log time (arrival) and serialised bytes."""
 
@@ -86,6 +90,15 @@ class Bag:
                 )
         return dict(sorted(found.items()))
 
+    @property
+    def unchecked(self) -> list[str]:
+        """A note for every file that was read and holds no checksums."""
+        return [
+            f"{file.path.name}: written without checksums (CRC 0), a damaged value would not be noticed"
+            for file in self.files
+            if file.unchecked
+        ]
+
     def metadata(self, name: str) -> dict[str, str]:
         """The metadata record of that name, empty when there is none."""
         return next((file.metadata[name] for file in self.files if name in file.metadata), {})
@@ -124,6 +137,9 @@ class Bag:
 
         Args:
             only: topics wanted; None for all.
+
+        Raises:
+            InputError: so many chunks overlap that their messages would not fit into ``MAX_HELD_BYTES``, or a file cannot be read.
         """
         with ExitStack() as stack:
             streams: list[IO[bytes]] = []
@@ -136,10 +152,12 @@ class Bag:
                 blocks += [(block.start_ns, number, block.offset, block) for block in file.blocks]
             blocks.sort()
             queue: list[tuple[int, str, int, int, int, bytes]] = []
+            held = 0
             for _, number, offset, block in blocks:
                 # Everything before this block's first message can go; what is equal may tie with it.
                 while queue and queue[0][0] < block.start_ns:
                     log_ns, topic, *_, data = heapq.heappop(queue)
+                    held -= len(data) + _ENTRY_BYTES
                     yield RawMessage(topic, log_ns, data)
                 file = self.files[number]
                 try:
@@ -150,6 +168,13 @@ class Bag:
                         elif only is None or channel.topic in only:
                             entry = (message.log_ns, channel.topic, number, offset, place, message.data)
                             heapq.heappush(queue, entry)
+                            held += len(message.data) + _ENTRY_BYTES
+                            if held > MAX_HELD_BYTES:
+                                raise InputError(
+                                    f"{len(queue)} messages overlap in time at {message.log_ns} ns, more than {MAX_HELD_BYTES} bytes",
+                                    where=str(file.path),
+                                    do="write them in the order of time: `mcap sort`",
+                                )
                 except OSError as error:
                     file.note(f"byte {block.offset} cannot be read ({error.strerror})")
             while queue:

@@ -26,7 +26,8 @@ from mcap.records import Channel, ChunkIndex, Header, Metadata, MetadataIndex, S
 from ctr_dynamics.errors import InputError
 
 MAGIC = b"\x89MCAP0\r\n"
-MAX_CHUNK_BYTES = 512 * 2**20
+# Recorders write chunks of 1 to 8 MB; a larger one holds one large message. What a chunk claims is bounded before it is unpacked.
+MAX_CHUNK_BYTES = 64 * 2**20
 _PLAIN_BLOCK_BYTES = 2**20  # messages outside chunks are grouped to blocks of this size
 _RECORD = struct.Struct("<BQ")
 _MESSAGE = struct.Struct("<HIQQ")
@@ -56,11 +57,13 @@ class StoredMessage(NamedTuple):
 
 @dataclass
 class McapFile:
-    """What a file holds. `complete` is False when its closing summary is missing or unusable."""
+    """What a file holds. `complete` is False when its closing summary is missing or unusable; `unchecked` is True once a chunk
+    without a checksum was read."""
 
     path: Path
     size: int
     complete: bool = True
+    unchecked: bool = False
     library: str = ""
     profile: str = ""
     schemas: dict[int, Schema] = field(default_factory=dict)
@@ -76,22 +79,22 @@ class McapFile:
             self.notes.append(line)
 
     def load(self, stream: IO[bytes], block: Block) -> Iterator[StoredMessage]:
-        """Messages of one block in the order of the file. What is damaged is left out and noted."""
+        """Messages of one block in the order of the file. What is damaged, or larger than ``MAX_CHUNK_BYTES``, is left out and noted."""
         if block.length > MAX_CHUNK_BYTES:
             self.note(
                 f"chunk at byte {block.offset} has {block.length} bytes, at most {MAX_CHUNK_BYTES} are read"
             )
             return
         stream.seek(block.offset)
-        data = stream.read(block.length)
+        data: bytes | bytearray = stream.read(block.length)
         if block.chunk:
             data = self._chunk_content(data, block.offset)
         for opcode, start, end in _records(data):
             if opcode == Opcode.MESSAGE and end - start >= _MESSAGE.size:
                 channel_id, _, log_ns, _ = _MESSAGE.unpack_from(data, start)
-                yield StoredMessage(channel_id, log_ns, data[start + _MESSAGE.size : end])
+                yield StoredMessage(channel_id, log_ns, bytes(data[start + _MESSAGE.size : end]))
             elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-                self._define(opcode, data[start:end])
+                self._define(opcode, bytes(data[start:end]))
 
     def _define(self, opcode: int, content: bytes) -> None:
         """Take in a schema or channel; the first definition of an id stays."""
@@ -105,7 +108,7 @@ class McapFile:
         except _PARSE_ERRORS:
             self.note("holds a damaged schema or channel record, which is left out")
 
-    def _chunk_content(self, record: bytes, offset: int) -> bytes:
+    def _chunk_content(self, record: bytes | bytearray, offset: int) -> bytes | bytearray:
         """Records inside a chunk; of a cut chunk, those before the cut."""
         where = f"chunk at byte {offset}"
         head = _RECORD.size + _CHUNK.size
@@ -134,13 +137,14 @@ class McapFile:
         data, whole = _decompress(content, compression, size)
         if cut:
             return data
+        self.unchecked = self.unchecked or crc == 0
         if not whole or (crc != 0 and zlib.crc32(data) != crc):
             self.note(f"{where} is damaged ({len(record)} bytes) and left out")
             return b""
         return data
 
 
-def _decompress(content: bytes, compression: str, size: int) -> tuple[bytes, bool]:
+def _decompress(content: bytes | bytearray, compression: str, size: int) -> tuple[bytes | bytearray, bool]:
     """Content of a chunk, at most `size` bytes, as far as it can be had, and whether it is all there."""
     if compression == "":
         return content[:size], len(content) == size
@@ -159,11 +163,11 @@ def _decompress(content: bytes, compression: str, size: int) -> tuple[bytes, boo
                 piece = decompressor.decompress(b"", max_length=size - len(data))
                 data += piece
     except (zstandard.ZstdError, RuntimeError, EOFError, MemoryError, ValueError):
-        return bytes(data), False
-    return bytes(data), len(data) == size
+        return data, False
+    return data, len(data) == size
 
 
-def _records(data: bytes) -> Iterator[tuple[int, int, int]]:
+def _records(data: bytes | bytearray) -> Iterator[tuple[int, int, int]]:
     """Opcode, start and end of the content of every whole record in `data`."""
     position = 0
     while position + _RECORD.size <= len(data):

@@ -9,9 +9,18 @@ import yaml
 
 from ctr_dynamics.errors import InputError
 
+# A robot file has some hundred values. Aliases and merges multiply what a short text holds, so that the limit is on what they stand for.
+MAX_NODES = 100_000
+
 
 class _Loader(yaml.SafeLoader):
-    """SafeLoader that reads 52e9 as a number and rejects a key given twice."""
+    """SafeLoader that reads 52e9 as a number, rejects a key given twice, and bounds what aliases and merges stand for."""
+
+    def compose_document(self) -> yaml.Node | None:
+        node = super().compose_document()
+        if node is not None:
+            _expanded_size(node, {})
+        return node
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
         seen = set()
@@ -27,6 +36,36 @@ class _Loader(yaml.SafeLoader):
                 )
             seen.add(key)
         return super().construct_mapping(node, deep)
+
+
+def _expanded_size(node: yaml.Node, known: dict[int, int]) -> int:
+    """Nodes of a document in which every alias is written out.
+
+    Args:
+        known: sizes of the nodes met so far by their ``id``; 0 for those that are being counted.
+
+    Raises:
+        yaml.constructor.ConstructorError: over ``MAX_NODES``, or a node that holds itself.
+    """
+    if id(node) in known:
+        if not known[id(node)]:
+            raise yaml.constructor.ConstructorError(
+                None, None, "a node holds itself by an alias", node.start_mark
+            )
+        return known[id(node)]
+    known[id(node)] = 0
+    parts: list[yaml.Node] = []
+    if isinstance(node, yaml.SequenceNode):
+        parts = node.value
+    elif isinstance(node, yaml.MappingNode):
+        parts = [part for pair in node.value for part in pair]
+    size = 1 + sum(_expanded_size(part, known) for part in parts)
+    if size > MAX_NODES:
+        raise yaml.constructor.ConstructorError(
+            None, None, f"aliases and merges stand for {size} values, limit {MAX_NODES}", node.start_mark
+        )
+    known[id(node)] = size
+    return size
 
 
 # YAML 1.1 takes 52e9 and 1e-3 for text; files of this package follow YAML 1.2.

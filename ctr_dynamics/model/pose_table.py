@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctr_dynamics.errors import InputError
+from ctr_dynamics.io.text_files import check_regular
 from ctr_dynamics.model.model import Model
 from ctr_dynamics.model.statics import Statics
 
@@ -110,6 +111,7 @@ def read_poses(path: Path, model: Model) -> tuple[list[Pose], list[str]]:
         InputError: the file cannot be read or its columns are not these.
     """
     where = str(path)
+    check_regular(path, "give a CSV file")
     try:
         with path.open(newline="", encoding="utf-8-sig") as stream:
             reader = csv.reader(stream, strict=True)

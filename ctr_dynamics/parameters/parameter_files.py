@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from ctr_dynamics.errors import InputError
+from ctr_dynamics.io.text_files import decode_text, read_bytes
 from ctr_dynamics.io.yaml_files import read_yaml
 from ctr_dynamics.parameters.parameter_table import parameter
 from ctr_dynamics.parameters.parameter_types import Value
@@ -23,13 +24,7 @@ def read_parameter_file(file: Path) -> dict[str, Value]:
         InputError: unreadable, no block for the estimator, unknown name, wrong type or out of range.
     """
     where = str(file)
-    try:
-        text = Path(file).read_text(encoding="utf-8")
-    except UnicodeDecodeError as error:
-        raise InputError(f"not UTF-8 at byte {error.start}", do="save as UTF-8 text", where=where) from None
-    except OSError as error:
-        raise InputError(f"cannot read: {error.strerror}", do="check path and rights", where=where) from None
-    data = read_yaml(text, where)
+    data = read_yaml(decode_text(read_bytes(Path(file)), where), where)
     if data is None:
         return {}
     if not isinstance(data, dict):

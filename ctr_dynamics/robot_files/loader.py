@@ -16,11 +16,10 @@ from pydantic import BaseModel, ValidationError
 
 from ctr_dynamics.effects.extension_check import check_extensions
 from ctr_dynamics.errors import InputError
+from ctr_dynamics.io.text_files import decode_text, read_bytes
 from ctr_dynamics.io.yaml_files import read_yaml
 from ctr_dynamics.robot.quantity import Quantity, VectorQuantity
 from ctr_dynamics.robot.schema import Robot
-
-MAX_BYTES = 1_000_000
 
 
 def robot_names() -> tuple[str, ...]:
@@ -54,31 +53,17 @@ def load_robot(name_or_path: str | Path) -> Robot:
         data = (resources.files("ctr_dynamics") / "config" / "robots" / f"{name}.yaml").read_bytes()
         return _from_bytes(data, f"robot {name}", name)
     path = Path(name_or_path)
-    if not path.is_file():
+    if not path.exists():
         shipped = robot_names()
         near = get_close_matches(name, shipped, 1)
         hint = f"did you mean '{near[0]}'?" if near else "give a shipped name or the path of a YAML file"
         known = ", ".join(shipped)
         raise InputError(f"robot '{name}' is neither a shipped robot ({known}) nor a file", do=hint)
-    try:
-        if path.stat().st_size > MAX_BYTES:
-            raise InputError(
-                f"robot file has {path.stat().st_size} bytes, more than {MAX_BYTES} bytes",
-                do="give a robot file in YAML",
-                where=name,
-            )
-        data = path.read_bytes()
-    except OSError as error:
-        raise InputError(f"cannot read: {error.strerror}", do="check path and rights", where=name) from None
-    return _from_bytes(data, name, name)
+    return _from_bytes(read_bytes(path), name, name)
 
 
 def _from_bytes(data: bytes, where: str, source: str) -> Robot:
-    try:
-        text = data.decode("utf-8")
-    except UnicodeDecodeError as error:
-        raise InputError(f"not UTF-8 at byte {error.start}", do="save as UTF-8 text", where=where) from None
-    robot = robot_from_dict(read_yaml(text, where), where)
+    robot = robot_from_dict(read_yaml(decode_text(data, where), where), where)
     robot._source = source
     robot._sha256 = hashlib.sha256(data).hexdigest()
     return robot

@@ -266,12 +266,8 @@ def replay(
         log = _report_log(estimator, opened) if report_part is not None else None
         stack.enter_context(rare_garbage_collection())
         numbers, times_s = _run(opened, estimator, robot, settings, writer, progress, log)
-        notes = [
-            *opened.notes,
-            *_without(opened, settings),
-            *_input_notes(numbers["input_problems"]),
-            *_left_out(numbers),
-        ]
+        notes = [*opened.notes, *opened.unchecked, *_without(opened, settings)]
+        notes += [*_input_notes(numbers["input_problems"]), *_left_out(numbers)]
         content = plain({**numbers, **provenance, "notes": notes})
         if summary_part is not None:
             text = json.dumps(content, indent=1, allow_nan=False, ensure_ascii=False)

@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 from pydantic import Field, FiniteFloat, PrivateAttr, ValidationError, model_validator
 
 from ctr_dynamics.errors import InputError
+from ctr_dynamics.io.text_files import decode_text, read_bytes
 from ctr_dynamics.io.yaml_files import read_yaml
 from ctr_dynamics.simulation.motion_primitives import AnyPrimitive, Axis, Block, Seconds
 
 Floats = NDArray[np.float64]
-MAX_BYTES = 10_000_000
 Vector = Annotated[list[FiniteFloat], Field(min_length=3, max_length=3)]
 Sigma = Annotated[FiniteFloat, Field(ge=0)]
 Rate = Annotated[FiniteFloat, Field(gt=0, le=1000)]
@@ -183,21 +183,14 @@ def load_scenario(name_or_path: str | Path) -> Scenario:
     path = Path(name_or_path)
     if name in scenario_names():
         data = (resources.files("ctr_dynamics") / "config" / "scenarios" / f"{name}.yaml").read_bytes()
-    elif path.is_file():
-        if path.stat().st_size > MAX_BYTES:
-            raise InputError(
-                f"scenario has {path.stat().st_size} bytes, more than {MAX_BYTES} bytes", where=name
-            )
-        data = path.read_bytes()
+    elif path.exists():
+        data = read_bytes(path)
     else:
         known = ", ".join(scenario_names())
         raise InputError(
             f"scenario '{name}' is neither a shipped one ({known}) nor a file", do="check the path"
         )
-    try:
-        content = read_yaml(data.decode("utf-8"), name)
-    except UnicodeDecodeError as error:
-        raise InputError(f"not UTF-8 at byte {error.start}", do="save as UTF-8 text", where=name) from None
+    content = read_yaml(decode_text(data, name), name)
     if not isinstance(content, dict):
         raise InputError("scenario is not a mapping", do="see config/scenarios for examples", where=name)
     try:
