@@ -395,7 +395,7 @@ class Estimator:
             "problem": self.health.problem,
             "parameters": ekf.parameters(known=self.runs.running),
             "tracker_bias": [float(x) for x in ekf.bias],
-            "tip_force_drive_N": ekf.force_variance.sigma,
+            "tip_force_drive_N": ekf.adapted.sigma,
             "statuses": [
                 {"name": s.name, "level": s.level, "message": s.message, "values": s.values}
                 for s in all_statuses(self.health)

@@ -97,7 +97,8 @@ class FusedRun:
                     measurement.late_s, update.reason, update.white, motion, residual,
                 )
             )  # fmt: skip
-        self._health.force_sigma = self.ekf.force_variance.sigma
+        self._health.force_sigma = self.ekf.adapted.sigma
+        self._health.shift_m, self._health.noise_ratio = self.ekf.tracker_fault()
 
     def residuals(
         self, time_s: float, position: Floats, quaternion: Floats, open_loop: OpenLoopRun

@@ -21,7 +21,7 @@ compiled = njit(cache=True, nogil=True, error_model="numpy")
 @compiled
 def registration_error(rotation, bias):
     """Estimated error of the registration in base axes: quaternion (4,) and shift (3,) m, from the nominal ``rotation`` (4,) and the tracker states
-    ``bias`` (13,); and the registration's inverse (3, 3)."""
+    ``bias`` (16,); and the registration's inverse (3, 3)."""
     back = matrix(conjugate(rotation))
     return from_vector(applied(back, bias[0:3])), applied(back, bias[3:6]), back
 
@@ -30,7 +30,7 @@ def registration_error(rotation, bias):
 def registered_pose(mean, rotation, lever, bias, pose):
     """Fill ``pose`` (7,) with that of :func:`ctr_dynamics.sensing.tracker.TrackerModel.registered`.
 
-    ``mean`` (13,): the tip; ``rotation`` (4,), ``lever`` (3,): nominal geometry; ``bias`` (13,): tracker states. Returns the rotation of the
+    ``mean`` (13,): the tip; ``rotation`` (4,), ``lever`` (3,): nominal geometry; ``bias`` (16,): tracker states. Returns the rotation of the
     tip, that of the registration's estimated error in base axes, and the registration's inverse, (3, 3) each.
     """
     turn, shift, N = registration_error(rotation, bias)
@@ -43,12 +43,12 @@ def registered_pose(mean, rotation, lever, bias, pose):
 
 @compiled
 def fused_tip(mean, columns, rotation, lever, bias, pi, force_rows, pose, covariance):
-    """Pose (7,) of :func:`registered_pose` and the covariance (12, 12) of pose and twist (base axes) under ``pi`` (r + 13, r + 13).
+    """Pose (7,) of :func:`registered_pose` and the covariance (12, 12) of pose and twist (base axes) under ``pi`` (r + 16, r + 16).
 
     ``columns`` (12, r): of the tip; ``force_rows`` (3, r): of the tip force. Returns that force's deviations (3,), and whether all is finite.
     """
     r = columns.shape[1]
-    size = r + 9  # delay and drift are left out
+    size = r + 9  # delay, drift and shift are left out
     R, C, N = registered_pose(mean, rotation, lever, bias, pose)
     arm = applied(R, bias[6:9])  # extra arm beyond the nominal lever moves the pose when the tip turns
     armx, army, armz = arm[0], arm[1], arm[2]
@@ -92,7 +92,7 @@ def expected_measurement(mean, rotation, translation, lever, bias):
     registration = multiply(from_vector(bias[0:3]), rotation)
     point = mean[0:3] + applied(matrix(mean[3:7]), lever + bias[6:9])
     pose = np.empty(7)
-    pose[0:3] = applied(matrix(registration), point) + translation + bias[3:6] + bias[10:13]
+    pose[0:3] = applied(matrix(registration), point) + translation + bias[3:6] + bias[10:13] + bias[13:16]
     pose[3:7] = multiply(registration, mean[3:7])
     return pose
 
@@ -126,7 +126,7 @@ def pose_in_base(position, quaternion, rotation, translation, lever):
 
 @compiled
 def sensitivity_rows(mean, columns, rotation, lever, bias, H):
-    """Derivative H (6, r + 13) of the expected measurement; see :func:`ctr_dynamics.sensing.tracker.TrackerModel.innovation`."""
+    """Derivative H (6, r + 16) of the expected measurement; see :func:`ctr_dynamics.sensing.tracker.TrackerModel.innovation`."""
     r = columns.shape[1]
     R, Q = matrix(mean[3:7]), matrix(multiply(from_vector(bias[0:3]), rotation))
     position, velocity, rate = mean[0:3], mean[7:10], mean[10:13]
@@ -148,6 +148,7 @@ def sensitivity_rows(mean, columns, rotation, lever, bias, H):
             H[i, r + 6 + k] = Q[i, 0] * R[0, k] + Q[i, 1] * R[1, k] + Q[i, 2] * R[2, k]
         H[i, r + 3 + i] = 1.0
         H[i, r + 10 + i] = 1.0
+        H[i, r + 13 + i] = 1.0
         d[i] = velocity[i] + rate[(i + 1) % 3] * arm[(i + 2) % 3] - rate[(i + 2) % 3] * arm[(i + 1) % 3]
     H[0, r + 1], H[0, r + 2] = pz, -py
     H[1, r], H[1, r + 2] = -pz, px

@@ -4,7 +4,7 @@ A measurement of stamp t shows the time t / (1 + skew) - delay, averaged over a 
 
     position = R_reg scale (p + R lever) + t_reg + drift t,        rotation = R_reg R,
 
-and then passes the corrections. The estimator carries errors of registration, lever arm, delay and drift as states of its own
+and then passes the corrections. The estimator carries errors of registration, lever arm, delay, drift and shift as states of its own
 (``STATE_NAMES``). Its kernels know registration and lever arm alone; the rest is taken off a measurement before
 (:meth:`TrackerModel.undistorted`).
 """
@@ -39,10 +39,14 @@ STATE_NAMES = (
     ("lever_arm", 3),
     ("delay", 1),
     ("drift", 3),
+    ("shift", 3),
 )
-"""Errors of the tracker that the estimator carries: name and number of axes, in their order."""
-STATES = 13
-ROTATION, TRANSLATION, LEVER, DELAY, DRIFT = slice(0, 3), slice(3, 6), slice(6, 9), 9, slice(10, 13)
+"""Errors of the tracker that the estimator carries: name and number of axes, in their order.
+
+The drift is the slow one that the robot file states. The shift is a fault: it is 0 until the innovations show one."""
+STATES = 16
+ROTATION, TRANSLATION, LEVER, DELAY = slice(0, 3), slice(3, 6), slice(6, 9), 9
+DRIFT, SHIFT = slice(10, 13), slice(13, 16)
 
 # Gauss and Legendre's rule of five points on [0, 1]: the mean over the averaging window
 AVERAGE_POINTS = np.array([0.04691008, 0.23076534, 0.5, 0.76923466, 0.95308992])
@@ -78,7 +82,7 @@ class TrackerModel:
     Attributes:
         rotation: (4,) wxyz of R_reg; translation: (3,) m; lever: (3,) m in the tip frame; delay: s, > 0 when a pose is older than its stamp.
         mask: (6,) measured axes: position x, y, z in the tracker's frame, then rotation about the sensor's x, y, z.
-        variance: (6,) white noise. state_sigma: (13,) prior deviations of ``STATE_NAMES``.
+        variance: (6,) white noise. state_sigma: (16,) prior deviations of ``STATE_NAMES``.
         scale: reported over true distance; drift: (3,) m/s; skew: s/s, stamp = true time (1 + skew).
         averaging: s, length of the window over which poses are averaged. corrections: further links, in order.
     """
@@ -115,6 +119,7 @@ class TrackerModel:
                     file.lever_arm.tolerance,
                     [file.delay.tolerance],
                     np.full(3, noise.drift.value),
+                    np.zeros(3),
                 ]
             ),
         )
@@ -295,12 +300,12 @@ class TrackerModel:
     def innovation(
         self, bias: Floats, tip: Tip, pi: Floats, *measurement: Floats
     ) -> tuple[Floats, Floats, Floats, Floats]:
-        """An undistorted ``measurement`` (position (3,) m, quaternion (4,) wxyz) against what the ``tip`` and the states ``bias`` (13,) predict.
+        """An undistorted ``measurement`` (position (3,) m, quaternion (4,) wxyz) against what the ``tip`` and the states ``bias`` (16,) predict.
 
         Returns:
-            On the k measured axes: innovation (k,), position in the tracker's axes, rotation vector in the sensor's; H (k, r + 13), the
+            On the k measured axes: innovation (k,), position in the tracker's axes, rotation vector in the sensor's; H (k, r + 16), the
             derivative of the expected measurement by the columns' coefficients and the tracker states; its covariance S (k, k) under ``pi``
-            (r + 13, r + 13); and the innovation whitened by the Cholesky root of S.
+            (r + 16, r + 16); and the innovation whitened by the Cholesky root of S.
 
         Where one rotation axis is not measured, the sensor's turn about it is arbitrary and often large. It is taken off first, or it would turn
         the other two components.
@@ -318,7 +323,7 @@ class TrackerModel:
         """(7,) tip pose in ``ctr_base`` as the tracker realises it: position in m, quaternion wxyz.
 
         The base frame of a real robot is known through its registration only, so the estimated registration and lever-arm errors are part of the
-        pose: it is where a perfect tracker with the nominal geometry would see the tip. Drift and delay are left out.
+        pose: it is where a perfect tracker with the nominal geometry would see the tip. Drift, shift and delay are left out.
         """
         pose = np.empty(7)
         registered_pose(tip.mean, self.rotation, self.lever, bias, pose)

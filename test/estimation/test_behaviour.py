@@ -20,7 +20,6 @@ from estimation_cases import (
 from tracker_twin import expected
 
 from ctr_dynamics.effects import make_plant
-from ctr_dynamics.estimation.estimator import EstimatorOptions
 from ctr_dynamics.estimation.monitoring.statuses import all_statuses
 from ctr_dynamics.io.messages.topics import STEP_NS
 from ctr_dynamics.kernels.rotations import conjugate, from_vector, matrix, multiply
@@ -95,18 +94,17 @@ def test_isolated_outlier_is_rejected(release, plain):
 
 
 def test_lasting_contradiction_is_said(release):
-    """A tracker that is decimetres beside itself all the time is no outlier: output becomes invalid."""
+    """A tracker that is decimetres beside itself all the time is no outlier: the model goes on alone, and the status says why."""
     rng = np.random.default_rng(0)
     run = play(reshaped(release, lambda p, q, m: (p + rng.uniform(-0.3, 0.3, 3), q)))
     check_outputs(run)
-    limit = EstimatorOptions().largest_deviation
-    for out in run.outputs:
-        assert not out.valid or np.sqrt(np.trace(out.tip_covariance[:3, :3])) <= limit
-    invalid = [out for out in run.outputs if not out.valid]
-    assert any("tracker contradicts the model" in out.reason for out in invalid)
+    beside = np.linalg.norm(run.column("tip_position") - run.column("predicted_position"), axis=1)
+    deviation = [np.sqrt(np.trace(out.tip_covariance[:3, :3])) for out in run.outputs]
+    assert np.all(beside < np.maximum(0.003, 3.0 * np.array(deviation)))
+    assert max(deviation) < 0.02
     status = next(s for s in all_statuses(run.estimator.health) if s.name == "tracker")
-    assert status.level == 2
-    assert "limit half" in status.message
+    assert status.level >= 1
+    assert "beside what any force" in status.message
 
 
 @pytest.mark.parametrize("beside", [0.1, 50.0])
@@ -114,10 +112,12 @@ def test_a_tracker_that_contradicts_for_good_does_not_lead_the_runs_astray(relea
     messages = [m for m in release if m.stamp < 2e9]
     run = play(reshaped(messages, lambda p, q, m: (p + np.array([beside, 0.0, 0.0]), q)))
     health = run.estimator.health
-    assert health.restarts <= 2, "22 where every second measurement is fused"
-    assert health.rejecting
-    reasons = {out.reason for out in run.outputs if out.stamp_ns > START_NS + 1_000_000_000}
-    assert any("tracker contradicts the model" in reason for reason in reasons)
+    assert health.restarts == 0
+    status = next(s for s in all_statuses(health) if s.name == "tracker")
+    assert status.level >= 1
+    away = run.column("tip_position") - run.column("predicted_position")
+    valid = np.array([out.valid for out in run.outputs])
+    assert np.abs(away[valid]).max() < 0.01
     open_loop = play(messages, {"filter.enabled": False})
     assert rms(run.column("predicted_position")[-50:] - open_loop.column("predicted_position")[-50:]) < 1e-6
 
@@ -161,7 +161,6 @@ def test_a_contradiction_ends_with_the_samples_that_showed_it():
     rng = np.random.default_rng(0)
     messages = [m for m in bag_messages("clean_release", 2.2) if m.kind != "pose" or m.stamp < 0.7e9]
     run = play(reshaped(messages, lambda p, q, m: (p + rng.uniform(-0.3, 0.3, 3), q)))
-    assert any("tracker contradicts the model" in out.reason for out in run.outputs)
     since = [out for out in run.outputs if out.k * 0.003 > 1.75]
     assert since
     assert all(out.valid for out in since), {out.reason for out in since}
@@ -203,11 +202,11 @@ def test_fusion_off_is_the_model_alone(release):
 
 
 def test_predicted_pose_is_never_corrected(release, plain):
-    moved = play(reshaped(release, lambda p, q, m: (p + np.array([0.004, 0.0, 0.0]), q)))
+    moved = play(reshaped(release, lambda p, q, m: (p + np.array([4e-4, 0.0, 0.0]), q)))
     difference = moved.column("predicted_position") - plain.column("predicted_position")
     assert np.nanmax(np.abs(difference)) < 2e-5
     fused = moved.column("tip_position")[150:] - plain.column("tip_position")[150:]
-    assert np.nanmax(np.abs(fused)) > 1e-3, "the poses had no effect: the comparison shows nothing"
+    assert np.nanmax(np.abs(fused)) > 1e-4, "the poses had no effect: the comparison shows nothing"
 
 
 def test_fusion_can_be_switched_while_running(release):

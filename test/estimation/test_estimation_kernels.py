@@ -19,7 +19,7 @@ def covariance(size):
 @pytest.mark.parametrize("count", [3, 8, 15])
 def test_variances_are_those_of_the_columns(r, count):
     """Rows fill packs of eight, or not; coefficients are summed four at a time, or not."""
-    rows, pi = RNG.normal(size=(count, r)), covariance(r + 13)
+    rows, pi = RNG.normal(size=(count, r)), covariance(r + 16)
     wanted, found = rows @ pi[:r, :r] @ rows.T, np.empty((count, count))
     variance_kernels.covariance_of(rows, pi, found)
     np.testing.assert_allclose(found, wanted, rtol=1e-12, atol=1e-12 * np.abs(wanted).max())
@@ -33,7 +33,7 @@ def test_variances_are_those_of_the_columns(r, count):
 
 def test_position_deviations_are_those_of_the_columns():
     r = 5
-    states, pi = RNG.normal(size=(4, 22, r)), covariance(r + 13)
+    states, pi = RNG.normal(size=(4, 22, r)), covariance(r + 16)
     wanted = [np.sqrt(np.trace(node[:3] @ pi[:r, :r] @ node[:3].T) / 3) for node in states]
     found = variance_kernels.position_deviations(states.reshape(-1, r), 22, pi)
     np.testing.assert_allclose(found, wanted, rtol=1e-12)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from ctr_dynamics.estimation.filter.force_variance import ForceVariance
+from ctr_dynamics.estimation.filter.adapted_variances import FORCE_PART, AdaptedVariances, ForceRange
 from ctr_dynamics.estimation.filter.gating import Gate, GateOptions
 
 R = 1e-6 * np.eye(2)
@@ -16,7 +16,7 @@ def gate():
 
 
 def force_of(part, most=1.0):
-    force = ForceVariance(1e-3, most, 20.0)
+    force = AdaptedVariances(ForceRange(1e-3, most, 20.0), 2e-4, 0.1)
     force.start(np.diag([part, 0.0, 0.0]), slice(0, 1))
     return force
 
@@ -56,7 +56,7 @@ def test_an_inflation_makes_the_measurement_plausible_and_leaves_the_tracker_sta
     assert inflated[2, 2] == pi[2, 2]
     ratio = inflated[0, 0] / pi[0, 0]
     assert inflated[1, 1] / pi[1, 1] == pytest.approx(ratio)
-    assert force.part[0, 0] == pytest.approx(1e-6 * ratio)
+    assert force.parts[FORCE_PART, 0, 0] == pytest.approx(1e-6 * ratio)
 
 
 def test_the_force_is_raised_first(gate):
@@ -66,7 +66,7 @@ def test_the_force_is_raised_first(gate):
     assert nis(nu, inflated) <= gate.limits[2]
     assert inflated[1, 1] == pi[1, 1]
     assert force.sigma > 1e-3
-    np.testing.assert_allclose(inflated - pi, force.part - np.diag([1e-6, 0.0, 0.0]), atol=1e-12)
+    np.testing.assert_allclose(inflated - pi, force.parts[FORCE_PART] - np.diag([1e-6, 0.0, 0.0]), atol=1e-12)
 
 
 def test_a_measurement_beyond_the_size_of_a_robot_changes_nothing(gate):
@@ -75,4 +75,4 @@ def test_a_measurement_beyond_the_size_of_a_robot_changes_nothing(gate):
     assert gate.inflate(np.array([300.0, 0.0]), H, R, pi, 2, force) is None
     np.testing.assert_array_equal(pi, np.diag([1e-6, 1e-6, 1e-6]))
     assert force.sigma == before.sigma
-    np.testing.assert_array_equal(force.part, before.part)
+    np.testing.assert_array_equal(force.parts, before.parts)

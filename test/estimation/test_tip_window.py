@@ -169,7 +169,7 @@ def test_registered_pose_and_covariance_equal_finite_differences():
 
 def test_registered_pose_is_what_a_perfect_tracker_with_nominal_geometry_sees():
     tip, tracker, bias = random_tip(), random_tracker(), bias_of(1e-2)
-    bias[10:13] = 0.0
+    bias[10:16] = 0.0
     position, quaternion = tracker.to_base(*expected(tracker, bias, tip))
     pose, covariance = np.empty(7), np.empty((12, 12))
     mean = np.concatenate([tip.position, tip.quaternion, tip.velocity, tip.rate])

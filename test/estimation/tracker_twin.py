@@ -5,14 +5,15 @@ import math
 import numpy as np
 
 from ctr_dynamics.kernels.rotations import conjugate, from_vector, matrix, multiply, to_vector
-from ctr_dynamics.sensing.tracker import DRIFT, LEVER, ROTATION, TRANSLATION
+from ctr_dynamics.sensing.tracker import DRIFT, LEVER, ROTATION, SHIFT, TRANSLATION
 
 
 def expected(model, bias, tip):
-    """Reading (position (3,) m, quaternion (4,) wxyz) that the tip and the tracker states (13,) predict."""
+    """Reading (position (3,) m, quaternion (4,) wxyz) that the tip and the tracker states (16,) predict."""
     registration = multiply(from_vector(bias[ROTATION]), model.rotation)
     point = tip.position + matrix(tip.quaternion) @ (model.lever + bias[LEVER])
-    position = matrix(registration) @ point + model.translation + bias[TRANSLATION] + bias[DRIFT]
+    position = matrix(registration) @ point + model.translation + bias[TRANSLATION]
+    position = position + bias[DRIFT] + bias[SHIFT]
     return position, multiply(registration, tip.quaternion)
 
 

@@ -12,6 +12,7 @@ import numpy as np
 from filterpy.kalman import ExtendedKalmanFilter
 from numpy.typing import NDArray
 
+from ctr_dynamics.estimation.filter.adapted_variances import AdaptedVariances, ForceRange
 from ctr_dynamics.estimation.filter.covariance_factor import CovarianceFactor
 from ctr_dynamics.estimation.filter.factor_reduction import reduced
 from ctr_dynamics.estimation.filter.factor_schedule import FactorSchedule
@@ -22,7 +23,6 @@ from ctr_dynamics.estimation.filter.filter_records import (
     TipEstimate,
     Update,
 )
-from ctr_dynamics.estimation.filter.force_variance import ForceVariance
 from ctr_dynamics.estimation.filter.gating import Gate
 from ctr_dynamics.estimation.filter.parameter_priors import model_uncertainty
 from ctr_dynamics.estimation.filter.process_noise import ProcessNoise
@@ -33,7 +33,7 @@ from ctr_dynamics.kernels.tracker_measurement import fused_tip
 from ctr_dynamics.model.model import Model
 from ctr_dynamics.model.simulator import Inputs, Simulator, State, StepResult
 from ctr_dynamics.sensing import Tip, TrackerModel
-from ctr_dynamics.sensing.tracker import DELAY, STATES
+from ctr_dynamics.sensing.tracker import DELAY, SHIFT, STATES
 
 Floats = NDArray[np.float64]
 
@@ -50,8 +50,8 @@ class RodEkf:
         options: tuning.
 
     Attributes:
-        theta: (p,) estimated changes of the uncertain parameters. bias: (13,) tracker states b. pi: (r + 13, r + 13) Pi.
-        factor: V. tips: those of the last steps. force_variance: of the unknown tip force. gate: counts rejections.
+        theta: (p,) estimated changes of the uncertain parameters. bias: (16,) tracker states b. pi: (r + 16, r + 16) Pi.
+        factor: V. tips: those of the last steps. adapted: of the unknown tip force. gate: counts rejections.
         insertion_fraction: of beta's rate, what the model's velocities hold already.
     """
 
@@ -71,10 +71,10 @@ class RodEkf:
         dt = simulator.scheme.dt
         oldest = options.window + max(0.0, tracker.delay) + tracker.averaging
         self.tips = TipWindow(math.ceil(oldest / dt) + 5)
-        self.force_variance = ForceVariance(
-            options.force_sigma, options.force_sigma_max, options.force_change
-        )
-        self._noise = ProcessNoise(self.model.robot, dt, self._force, options.force_time, self.force_variance)
+        force = ForceRange(options.force_sigma, options.force_sigma_max, options.force_change)
+        noise = self.model.robot.tracker.noise.position.value
+        self.adapted = AdaptedVariances(force, noise, self.model.robot.tubes[0].length)
+        self._noise = ProcessNoise(self.model.robot, dt, self._force, options.force_time, self.adapted)
         self.schedule = FactorSchedule()
         self.gate = Gate(options.gate)
         self.insertion_fraction = insertion_fraction(self.model)
@@ -99,7 +99,7 @@ class RodEkf:
         for axis, size in enumerate(scale):
             i = self._force.start + axis
             self.pi[i, i] = (self.options.force_sigma / size) ** 2
-        self.force_variance.start(self.pi, self._force)
+        self.adapted.start(self.pi, self._force)
         self.tips.clear(r)
         self._reduce()
         self.schedule.start(state.key)
@@ -143,7 +143,7 @@ class RodEkf:
         # 3. Is the factor propagated now, or later over this step and the next?
         skipped, records = self.schedule.skipped, result.records
         propagate = self.schedule.plan_step(
-            records[0].key, records[-1].key, len(records) > 1, measured, idle, self.force_variance.fraction
+            records[0].key, records[-1].key, len(records) > 1, measured, idle, self.adapted.fraction
         )
         # 4. V <- A V over this step and those that were skipped. A step that is divided at a slope discontinuity of the load is followed in its
         #    parts. A step that was too hard to be taken at once is followed by its last part alone.
@@ -181,7 +181,7 @@ class RodEkf:
         scaled = (math.sqrt(unit) * self._parameter_weights) * factor.theta
         gram += scaled.T @ scaled
         self.pi, change, projection = reduced(self.pi, gram, factor.rank)
-        self.force_variance.project(projection)
+        self.adapted.project(projection)
         factor.change_basis(change)
         self.tips.change_basis(change, factor.theta.shape[1])
         self.schedule.since_reduction = 0
@@ -207,41 +207,67 @@ class RodEkf:
             position, quaternion: (3,) m and (4,) wxyz, in the tracker's frame.
         """
         # 1. Innovation against the tip of the measurement's own time.
+        self.adapted.jump(stamp, self.pi)
         compared = self._comparison(stamp, position, quaternion)
         if isinstance(compared, Update):
             return compared
         nu, H, S, record = compared
         dof, R = record.dof, self.tracker.noise
-        # 2. Gate: a single measurement outside is rejected.
+        # 2. What the innovation says of the sizes of tip force, tracker shift and tracker noise.
+        if not self.adapted.noisy:
+            S = S + (self.adapted.noise - 1.0) * R
+        self.pi += self.adapted.adapt(stamp, nu, H, S, R)
+        # 3. Gate: a single measurement outside is rejected, and so are all that the tracker's state explains.
         outside = self.gate.outside(record.nis, dof)
-        self.gate.count(outside)
-        if outside and not self.gate.recovers:
-            return record._replace(reason="outside the gate")
-        # 3. Adaptive process noise: what the innovation says of the tip force's variance.
-        self.pi += self.force_variance.adapt(stamp, nu, H, S)
-        # 4. After several rejections in a row, inflation until the measurement is plausible.
+        self.gate.count(outside and self.adapted.sound)
         if outside:
-            r = self.factor.theta.shape[1]
-            inflated = self.gate.inflate(nu, H, R, self.pi, r, self.force_variance)
+            if not (self.adapted.sound and self.gate.recovers):
+                return record._replace(reason="outside the gate")
+            # 4. After several rejections in a row, inflation until the measurement is plausible.
+            inflated = self.gate.inflate(nu, H, R, self.pi, self.factor.theta.shape[1], self.adapted)
             if inflated is None:
                 return record._replace(reason="outside the gate, farther than any covariance reaches")
             self.pi = inflated
             record = record._replace(
                 reason=f"outside the gate {self.gate.rejections} times in a row: fused with an inflated covariance"
             )
-        # 5. Gain and covariance (Joseph form).
-        size = len(self.pi)
+        # 5. Gain, covariance and correction; then what is left of a shift that is over.
+        self._fuse(state, nu, H, R)
+        self.schedule.since_correction = 0
+        self._end_shift(state)
+        return record._replace(accepted=True)
+
+    def _fuse(self, state: State, nu: Floats, H: Floats, R: Floats) -> None:
+        """Correct everything by an innovation ``nu`` (k,) of derivative ``H`` (k, r + 16) and stated noise ``R`` (k, k): Joseph form."""
+        size, dof = len(self.pi), len(nu)
         if (size, dof) not in self._filters:
             self._filters[size, dof] = ExtendedKalmanFilter(dim_x=size, dim_z=dof)
         ekf = self._filters[size, dof]
-        ekf.x, ekf.P, ekf.R = np.zeros((size, 1)), self.pi, R
+        ekf.x, ekf.P, ekf.R = np.zeros((size, 1)), self.pi, self.adapted.noise * R
         ekf.update(nu[:, None], HJacobian=lambda x: H, Hx=lambda x: np.zeros((dof, 1)))
         self.pi = 0.5 * (ekf.P + ekf.P.T)
-        self.force_variance.correct(ekf.K, H)
-        self.schedule.since_correction = 0
-        # 6. Correction of everything that follows from a and b.
+        self.adapted.correct(ekf.K, H, R)
         self._correct(state, ekf.x[:, 0])
-        return record._replace(accepted=True)
+
+    def _end_shift(self, state: State) -> None:
+        """Bring the tracker's shift back to zero where the tracker is sound and nothing speaks against it.
+
+        That is a measurement of the shift, zero within the noise of a position. Odds are by Bayes' rule: a shift could be anything up to the
+        robot's length, which is improbable beside none unless it is many of its deviations from zero.
+        """
+        r = self.factor.theta.shape[1]
+        rows = slice(r + SHIFT.start, r + SHIFT.stop)
+        variance, shift = self.pi[rows, rows], self.bias[SHIFT]
+        noise = self.tracker.variance[0]
+        if not self.adapted.sound or variance.trace() < 0.01 * noise:
+            return
+        against = shift @ np.linalg.solve(variance, shift)
+        _, size = np.linalg.slogdet(variance / self.adapted.reach**2)
+        if against > -size:
+            return
+        H = np.zeros((3, len(self.pi)))
+        H[:, rows] = np.eye(3)
+        self._fuse(state, -shift, H, noise * np.eye(3))
 
     def compare(self, stamp: float, position: Floats, quaternion: Floats) -> Update:
         """The innovation of a measurement that is not fused; arguments as of :meth:`update`."""
@@ -264,6 +290,9 @@ class RodEkf:
         nu, H, S, whitened = self.tracker.innovation(self.bias, tip, self.pi, position, quaternion)
         if not math.isfinite(nu.sum() + S.sum() + whitened.sum()):
             return Update.impossible("the innovation is not finite")
+        if self.adapted.noisy:
+            S += (self.adapted.noise - 1.0) * self.tracker.noise
+            whitened = np.linalg.solve(np.linalg.cholesky(S), nu)
         axes = self.tracker.axes
         residual, variance, white = np.full((3, 6), np.nan)
         residual[axes], variance[axes], white[axes] = nu, S.diagonal(), whitened
@@ -271,7 +300,7 @@ class RodEkf:
         return Comparison(nu, H, S, Update(residual, variance, nis, len(nu), False, "", white))
 
     def _correct(self, state: State, x: Floats) -> None:
-        """Move everything by the correction ``x`` = (a, b) (r + 13,)."""
+        """Move everything by the correction ``x`` = (a, b) (r + 16,)."""
         factor, u = self.factor, self.uncertainty
         r = factor.theta.shape[1]
         x = u.confined(x, self.theta, factor.theta, self.pi)
@@ -304,6 +333,13 @@ class RodEkf:
         )  # fmt: skip
         return TipEstimate(pose[:3], pose[3:], tip.mean[7:13].copy(), covariance, sigma, finite)
 
+    def tracker_fault(self) -> tuple[float, float]:
+        """By how much measured positions are shifted (m; 0 where that is within three deviations of their noise), and the tracker's noise by the
+        stated deviation (1 while nothing else is established)."""
+        shift = float(np.linalg.norm(self.bias[SHIFT]))
+        ratio = math.sqrt(self.adapted.noise) if self.adapted.noisy else 1.0
+        return shift if shift > 3.0 * math.sqrt(self.tracker.variance[0]) else 0.0, ratio
+
     def parameters(self, known: bool = True) -> dict[str, dict[str, float | None]]:
         """Value and deviation of every uncertain parameter by its name; no deviations unless they are ``known``."""
         rows = self.factor.theta if known else None
@@ -322,7 +358,7 @@ class RodEkf:
     def checkpoint(self) -> FilterState:
         """What :meth:`restore` returns to."""
         return FilterState(
-            self.theta.copy(), self.bias.copy(), self.pi.copy(), self.force_variance.checkpoint(), self.gate.rejections,
+            self.theta.copy(), self.bias.copy(), self.pi.copy(), self.adapted.checkpoint(), self.gate.rejections,
             self.schedule.checkpoint(), self.factor.checkpoint(), self.tips.checkpoint(),
         )  # fmt: skip
 
@@ -341,7 +377,7 @@ class RodEkf:
 
     def _restore_all_but_tips(self, state: FilterState) -> None:
         self.theta, self.bias, self.pi = state.theta.copy(), state.bias.copy(), state.pi.copy()
-        self.force_variance.restore(state.force_variance)
+        self.adapted.restore(state.adapted)
         self.gate.rejections = state.rejections
         self.schedule.restore(state.schedule)
         self.factor.restore(state.factor)

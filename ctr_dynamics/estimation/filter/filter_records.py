@@ -9,9 +9,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ctr_dynamics.estimation.filter.adapted_variances import AdaptedState
 from ctr_dynamics.estimation.filter.covariance_factor import FactorState
 from ctr_dynamics.estimation.filter.factor_schedule import ScheduleState
-from ctr_dynamics.estimation.filter.force_variance import ForceVarianceState
 from ctr_dynamics.estimation.filter.gating import GateOptions
 from ctr_dynamics.estimation.filter.tip_window import TipWindowState
 
@@ -62,7 +62,7 @@ class Update(NamedTuple):
 
 
 class Comparison(NamedTuple):
-    """A measurement against the tip of its time: innovation ``nu`` (k,), ``H`` (k, r + 13), ``S`` (k, k), and the record of it."""
+    """A measurement against the tip of its time: innovation ``nu`` (k,), ``H`` (k, r + 16), ``S`` (k, k), and the record of it."""
 
     nu: Floats
     H: Floats
@@ -88,7 +88,7 @@ class FilterState(NamedTuple):
     theta: Floats
     bias: Floats
     pi: Floats
-    force_variance: ForceVarianceState
+    adapted: AdaptedState
     rejections: int
     schedule: ScheduleState
     factor: FactorState

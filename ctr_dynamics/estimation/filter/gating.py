@@ -1,7 +1,8 @@
 """The gate: which measurements are fused, and what follows several rejections in a row.
 
-One measurement outside the gate is an outlier and is rejected. More of them in a row say that the filter has lost the robot. Then the covariance
-is inflated until the measurement is plausible, and it is fused.
+One measurement outside the gate is an outlier and is rejected. More of them in a row, while the tracker seems sound
+(:class:`~ctr_dynamics.estimation.filter.adapted_variances.AdaptedVariances`), say that the filter has lost the robot. Then the covariance is
+inflated until the measurement is plausible, and it is fused.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctr_dynamics import chi_square
-from ctr_dynamics.estimation.filter.force_variance import ForceVariance
+from ctr_dynamics.estimation.filter.adapted_variances import FORCE_PART, AdaptedVariances
 
 Floats = NDArray[np.float64]
 
@@ -69,7 +70,7 @@ class Gate:
         return n % self.options.longest == 0 or (n > 1 and n & (n - 1) == 0)
 
     def inflate(
-        self, nu: Floats, H: Floats, R: Floats, pi: Floats, columns: int, force_variance: ForceVariance
+        self, nu: Floats, H: Floats, R: Floats, pi: Floats, columns: int, adapted: AdaptedVariances
     ) -> Floats | None:
         """The covariance ``pi`` (n, n) inflated until an innovation is plausible; None where it never is, and then nothing has changed.
 
@@ -77,7 +78,7 @@ class Gate:
             nu, H, R: innovation (k,), its derivative (k, n) and the measurement noise (k, k).
             pi: of the coefficients and the tracker states.
             columns: number of coefficients.
-            force_variance: raised first, by what its range leaves.
+            adapted: raised first, by what its range leaves.
         """
         options, limit = self.options, self.limits[len(nu)]
         plausible = min(limit, max(0.5 * limit, float(len(nu))))
@@ -87,9 +88,9 @@ class Gate:
 
         # 1. The variance of the tip force: what the model has missed is most often a force.
         raised, inflated = 1.0, pi
-        while nis(inflated) > plausible and 2.0 * raised <= force_variance.headroom:
+        while nis(inflated) > plausible and 2.0 * raised <= adapted.headroom:
             raised *= 2.0
-            inflated = pi + (raised - 1.0) * force_variance.part
+            inflated = pi + (raised - 1.0) * adapted.parts[FORCE_PART]
         # 2. Where that does not do, the covariance of the coefficients (a fading memory).
         deviations, force_only = np.ones(len(pi)), inflated
         for _ in range(options.most_doublings):
@@ -99,5 +100,5 @@ class Gate:
             deviations[:columns] *= math.sqrt(2.0)
         if nis(inflated) > options.farthest * limit:
             return None
-        force_variance.scale(raised, deviations)
+        adapted.scale(raised, deviations)
         return inflated

@@ -12,9 +12,9 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from ctr_dynamics.estimation.filter.adapted_variances import AdaptedVariances
 from ctr_dynamics.estimation.filter.covariance_factor import CovarianceFactor
 from ctr_dynamics.estimation.filter.factor_reduction import APPENDED
-from ctr_dynamics.estimation.filter.force_variance import ForceVariance
 from ctr_dynamics.kernels.factor_operations import decay
 from ctr_dynamics.robot import Robot
 from ctr_dynamics.sensing.tracker import DRIFT, STATES
@@ -30,15 +30,15 @@ class ProcessNoise:
         dt: s, one step.
         force_rows: rows of the tip force among the uncertain parameters.
         force_time: s, time constant of the tip force.
-        force_variance: distribution of its variance.
+        adapted: variances of force and tracker.
     """
 
     def __init__(
-        self, robot: Robot, dt: float, force_rows: slice, force_time: float, force_variance: ForceVariance
+        self, robot: Robot, dt: float, force_rows: slice, force_time: float, adapted: AdaptedVariances
     ) -> None:
         self._noise, self.dt = robot.tracker.noise, dt
         self._rows, self._time = force_rows, force_time
-        self.force_variance = force_variance
+        self.adapted = adapted
         self._decay = math.exp(-dt / force_time)
 
     def decay_force(self, theta: Floats, factor: CovarianceFactor) -> None:
@@ -48,7 +48,7 @@ class ProcessNoise:
     def add(self, steps: int, pi: Floats, bias: Floats, factor: CovarianceFactor) -> Floats:
         """Process noise of the last ``steps`` steps.
 
-        The tracker states ``bias`` (13,) and the covariance ``pi`` (r + 13, r + 13) change in place. The factor gets a column for each axis of
+        The tracker states ``bias`` (16,) and the covariance ``pi`` (r + 16, r + 16) change in place. The factor gets a column for each axis of
         the force, and the covariance with them is returned.
         """
         self._drift(steps, pi, bias, factor)
@@ -62,7 +62,7 @@ class ProcessNoise:
         pi[rows, :] *= remains
         pi[:, rows] *= remains
         pi[rows, rows] += np.eye(3) * ((1 - remains**2) * self._noise.drift.value**2)
-        self.force_variance.decay(rows, remains)
+        self.adapted.decay(rows, remains)
 
     def _force(self, steps: int, pi: Floats, factor: CovarianceFactor) -> Floats:
         """The new columns move nothing but the force so far; their coefficients have the variance 1 - d^2."""
@@ -71,11 +71,11 @@ class ProcessNoise:
         wide = r + APPENDED
         theta = np.zeros((len(factor.theta), wide))
         theta[:, :r] = factor.theta
-        theta[self._rows, r:] = self.force_variance.sigma * np.eye(3)
+        theta[self._rows, r:] = self.adapted.sigma * np.eye(3)
         factor.theta = theta
         wider = np.zeros((wide + STATES, wide + STATES))
         wider[:r, :r], wider[:r, wide:] = pi[:r, :r], pi[:r, r:]
         wider[wide:, :r], wider[wide:, wide:] = pi[r:, :r], pi[r:, r:]
         np.fill_diagonal(wider[r:wide, r:wide], 1.0 - remains2)
-        self.force_variance.append(r, APPENDED, 1.0 - remains2)
+        self.adapted.append(r, APPENDED, 1.0 - remains2)
         return wider

@@ -58,6 +58,8 @@ class Health:
         recent: (nis / dof, within the gate) of the last of them.
         tracker_age_s: since the newest measurement that reached the gate, or the start.
         force_sigma: N, deviation of the tip force in the process noise.
+        shift_m: m, by which measured positions lie beside what any force on the robot explains; 0 where they do not.
+        noise_ratio: deviation of the tracker's noise by the stated one; 1 while nothing else is established.
         compared: measurements whose residuals are in the rms of both runs.
         consistency: watches the innovations. stability: of the equilibrium that belongs to the present actuators.
     """
@@ -83,6 +85,8 @@ class Health:
     corrected_steps: int = 0
     fusing: bool = True
     force_sigma: float = 0.0
+    shift_m: float = 0.0
+    noise_ratio: float = 1.0
     tracker_age_s: float = 0.0
     consistency: ConsistencyMonitor = field(default_factory=ConsistencyMonitor)
     stability: Stability | None = None

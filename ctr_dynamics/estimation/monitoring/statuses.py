@@ -71,6 +71,8 @@ def tracker(health: Health) -> Status:
         "late": str(health.late),
         "dropped": str(health.dropped),
         "fusion": "on" if health.fusing else "off",
+        "shift m": f"{health.shift_m:.4g}",
+        "noise by the stated": f"{health.noise_ratio:.2f}",
     }
     if health.rejecting:
         message = (
@@ -82,6 +84,18 @@ def tracker(health: Health) -> Status:
         message = (
             f"no usable measurement for {health.tracker_age_s:.1f} s, limit {TRACKER_LIMIT_S:g} s: "
             "the pose is the model's prediction since then"
+        )
+        return Status("tracker", WARN, message, values)
+    if health.shift_m:
+        message = (
+            f"positions lie {1e3 * health.shift_m:.1f} mm beside what any force on the robot explains and count little: "
+            "has the tracker, its reference or the sensor moved?"
+        )
+        return Status("tracker", WARN, message, values)
+    if health.noise_ratio > 1.0:
+        message = (
+            f"noise is {health.noise_ratio:.1f} times what the robot file states (limit 1): poses count less; "
+            "check the line of sight, the field and the stated noise"
         )
         return Status("tracker", WARN, message, values)
     return Status("tracker", status.level, status.message, values)

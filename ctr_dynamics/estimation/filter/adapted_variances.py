@@ -1,0 +1,292 @@
+"""How large three things are that no robot file can tell: the unknown tip force, the tracker's shift and its noise (docs/filter.md).
+
+Each of them makes innovations larger, but in another way. A force moves the tip, with its rotation and in the time that the robot takes. A
+shift moves the measured position alone, and stays. Noise is new with every measurement. So the sizes are inferred together: an innovation
+that noise explains does not raise the force.
+
+With the gains that the filter has used, its covariance is affine in the three variances: Pi = F + c D_force + d D_shift + n D_noise. F comes from
+the prior and the other noise, each D from the randomness of one of the three. The D go through the filter beside Pi. So the covariance of an
+innovation is known for all other variances, and with it their likelihood. Each variance is taken from a grid and changes now and then to one
+drawn from its prior: a filter for a hidden Markov chain (Rabiner 1989). The filter has their mean values, and Pi is at once what it would be had
+they been those all along.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ctr_dynamics.kernels.variance_likelihood import log_likelihood
+from ctr_dynamics.sensing.tracker import SHIFT, STATES
+
+Floats = NDArray[np.float64]
+FORCE_PART, SHIFT_PART, NOISE_PART = 0, 1, 2
+
+
+@dataclass(frozen=True)
+class AdaptationOptions:
+    """How the variances are adapted.
+
+    Attributes:
+        largest_change: times the force's variance, at one measurement, up or down. A force takes time to move the robot, so one measurement
+            says little of it.
+        largest_inflation: times the same, at one measurement, where several in a row have been outside the gate.
+        shortest_interval: s between two measurements, or a late one and its predecessor. Above 0, so that no variance is ever ruled out.
+        force_spacing: of the force's grid, in the logarithm of the variance. Less than one innovation can tell apart.
+        fault_spacing: the same of shift and noise, of which only the size counts.
+        memory_s: for how long randomness of the past counts as that of a shift or of noise of another size.
+        sound_s: mean time after which a sound tracker shifts or becomes noisy. fault_s: mean time after which such a fault ends or changes.
+        sound: probability that it ends.
+        established: probability from which on the tracker counts as noisy.
+        least_shift: by the stated deviation of the position's noise, the smallest jump of a shift. Less is not told from noise.
+        least_noise: the smallest noise that is a fault, by the stated variance.
+    """
+
+    largest_change: float = 10.0
+    largest_inflation: float = 1000.0
+    shortest_interval: float = 1e-3
+    force_spacing: float = 0.5
+    fault_spacing: float = 1.8
+    memory_s: float = 0.3
+    sound_s: float = 1000.0
+    fault_s: float = 1.0
+    sound: float = 0.5
+    established: float = 0.9
+    least_shift: float = 1.0
+    least_noise: float = 2.5
+
+
+class AdaptedState(NamedTuple):
+    """What a checkpoint stores of :class:`AdaptedVariances`; nothing in it is written to later."""
+
+    parts: Floats
+    weights: Floats
+    sigma: float
+    shift: float
+    noise: float
+    fraction: float
+    stamp: float
+
+
+class ForceRange(NamedTuple):
+    """The unknown tip force: deviations ``least`` and ``most`` between which its own lies, N per axis, and the mean time between two changes, s."""
+
+    least: float
+    most: float
+    change_s: float
+
+
+class AdaptedVariances:
+    """Joint distribution of the variances of tip force, tracker shift and tracker noise.
+
+    Args:
+        force: the range of the tip force.
+        position_noise: m per axis, deviation that the robot file states for a measured position.
+        reach: m, length of the robot: a shift or an error of a position is not larger.
+        options: how they are adapted.
+
+    Attributes:
+        sigma: deviation that the process noise of the force has now, N per axis.
+        shift: deviation of the shift's jump between two measurements, m per axis. noise: the tracker's variance by the stated one.
+        parts: (3, n, n) D: what of the filter's covariance is in proportion to the variances of force, shift and noise.
+        fraction: largest part of an innovation's variance that the force had at the last measurement, 0 to 1, along any direction.
+        reach: m. grids: of each variance, as it is: N^2, m^2, and by the stated one. priors: probabilities of their values.
+        weights: (a, b, c) their joint probabilities.
+    """
+
+    def __init__(
+        self, force: ForceRange, position_noise: float, reach: float, options: AdaptationOptions | None = None
+    ) -> None:
+        self.options = options = options or AdaptationOptions()
+        self.reach = reach
+        low, high = 2.0 * math.log(force.least), 2.0 * math.log(force.most)
+        grid = np.linspace(low, high, max(1, math.ceil((high - low) / options.force_spacing) + 1))
+        # a variance ten times as large is a tenth as likely before anything is measured
+        likely = np.exp(low - grid)
+        jump, largest = (options.least_shift * position_noise) ** 2, max(reach, 2.0 * position_noise) ** 2
+        none = 1e-6 * jump
+        shift = np.r_[none, self._faults(jump, largest)]
+        noise = np.r_[1.0, self._faults(options.least_noise, largest / position_noise**2)]
+        self.grids = (np.exp(grid), shift, noise)
+        self.priors = (likely / likely.sum(), self._prior(len(shift)), self._prior(len(noise)))
+        # s, mean time after which each value is left
+        self._every = (
+            np.array([force.change_s]),
+            *(np.r_[options.sound_s, np.full(len(g) - 1, options.fault_s)] for g in (shift, noise)),
+        )
+        self.parts = np.zeros((3, 0, 0))
+        self._likelihood = np.empty(tuple(len(g) for g in self.grids))
+        self._clear()
+
+    def _faults(self, least: float, most: float) -> Floats:
+        """Variances of a fault, evenly spaced in their logarithms."""
+        return np.geomspace(
+            least, most, max(2, math.ceil(math.log(most / least) / self.options.fault_spacing) + 1)
+        )
+
+    def _prior(self, count: int) -> Floats:
+        """Probabilities of no fault and of all its sizes: one is as likely as the other."""
+        return np.r_[self.options.sound, np.full(count - 1, (1.0 - self.options.sound) / (count - 1))]
+
+    def _clear(self) -> None:
+        force, shift, noise = self.grids
+        self.sigma, self.shift, self.noise = math.sqrt(force[0]), math.sqrt(shift[0]), float(noise[0])
+        self.weights = np.zeros(self._likelihood.shape)
+        self.weights[:, 0, 0] = self.priors[0]
+        self.fraction, self._stamp = 0.0, -math.inf
+
+    @property
+    def noisy(self) -> bool:
+        """Whether it is established that the tracker has more noise than stated; the gate goes by it then."""
+        return bool(self.weights[:, :, 0].sum() < 1.0 - self.options.established)
+
+    @property
+    def sound(self) -> bool:
+        """Whether the tracker is more likely than not to be steady, and not established to be noisy."""
+        return not self.noisy and bool(self.weights[:, 0, :].sum() > 0.5)
+
+    def start(self, pi: Floats, force: slice) -> None:
+        """Begin with the least force, which the coefficients ``force`` of the covariance ``pi`` (n, n) hold, and a sound tracker."""
+        self.parts = np.zeros((3, *pi.shape))
+        self.parts[FORCE_PART][force, force] = pi[force, force]
+        self._clear()
+
+    def append(self, at: int, count: int, variance: float) -> None:
+        """New randomness of the force: ``count`` coefficients of ``variance`` before the coefficient ``at``."""
+        n = self.parts.shape[1]
+        old = np.r_[:at, at + count : n + count]
+        parts = np.zeros((3, n + count, n + count))
+        parts[np.ix_(range(3), old, old)] = self.parts
+        np.fill_diagonal(parts[FORCE_PART, at : at + count, at : at + count], variance)
+        self.parts = parts
+
+    def decay(self, rows: slice, factor: float) -> None:
+        """The states ``rows`` have decayed by ``factor``."""
+        self.parts[:, rows, :] *= factor
+        self.parts[:, :, rows] *= factor
+
+    def project(self, projection: Floats) -> None:
+        """The first r coefficients a have become ``projection`` (k, r) a."""
+        k, r = projection.shape
+        old, n = self.parts, k + self.parts.shape[1] - r
+        parts = np.empty((3, n, n))
+        parts[:, :k, :k] = projection @ old[:, :r, :r] @ projection.T
+        parts[:, :k, k:] = projection @ old[:, :r, r:]
+        parts[:, k:, :k] = parts[:, :k, k:].transpose(0, 2, 1)
+        parts[:, k:, k:] = old[:, r:, r:]
+        self.parts = parts
+
+    def _elapsed(self, stamp: float) -> float:
+        """s since the last measurement; the least where there is none."""
+        least = self.options.shortest_interval
+        return max(least, stamp - self._stamp) if math.isfinite(self._stamp) else least
+
+    def jump(self, stamp: float, pi: Floats) -> None:
+        """The shift may have jumped since the last measurement, before one of the time ``stamp`` (s); ``pi`` (n, n) changes in place."""
+        # what the filter has fused while the tracker was sound is no error of a fault that begins now
+        remains = math.exp(-self._elapsed(stamp) / self.options.memory_s)
+        self.parts[SHIFT_PART] *= remains * (1.0 - self.weights[:, 0, :].sum())
+        self.parts[NOISE_PART] *= remains * (1.0 - self.weights[:, :, 0].sum())
+        first = len(pi) - STATES
+        for i in range(first + SHIFT.start, first + SHIFT.stop):
+            pi[i, i] += self.shift**2
+            self.parts[SHIFT_PART, i, i] += self.shift**2
+
+    def adapt(self, stamp: float, nu: Floats, H: Floats, S: Floats, R: Floats) -> Floats:
+        """Take in an innovation of the time ``stamp`` (s).
+
+        Args:
+            stamp: s from the first step.
+            nu, H, S: (k,), its derivative (k, n) and its covariance (k, k) by the present variances.
+            R: (k, k) the measurement noise that the robot file states.
+
+        Returns:
+            The change (n, n) of the filter's covariance that the new variances make.
+        """
+        options = self.options
+        # 1. Likelihood of all variances.
+        parts = H @ self.parts @ H.T
+        parts[NOISE_PART] += self.noise * R
+        present = (self.sigma**2, self.shift**2, self.noise)
+        ratios = [grid / value for grid, value in zip(self.grids, present, strict=True)]
+        log_likelihood(nu, S, parts, *(ratio - 1.0 for ratio in ratios), self._likelihood)
+        best = self._likelihood.max()
+        if not math.isfinite(best):
+            return np.zeros_like(self.parts[0])
+        # 2. Hidden Markov chain: each may have changed since the last innovation, then Bayes' rule.
+        elapsed = self._elapsed(stamp)
+        self._stamp = max(stamp, self._stamp)
+        weights = self.weights
+        for axis, (prior, every) in enumerate(zip(self.priors, self._every, strict=True)):
+            weights = np.moveaxis(weights, axis, -1)
+            leaves = weights * -np.expm1(-elapsed / every)
+            weights = np.moveaxis(weights - leaves + leaves.sum(axis=-1, keepdims=True) * prior, -1, axis)
+        weights *= np.exp(self._likelihood - best)
+        self.weights = weights = weights / weights.sum()
+        # 3. The filter goes over to the mean variances.
+        means = [
+            float(weights.sum(axis=tuple(a for a in range(3) if a != axis)) @ ratio)
+            for axis, ratio in enumerate(ratios)
+        ]
+        means[0] = min(max(means[0], 1.0 / options.largest_change), options.largest_change)
+        larger = S + np.einsum("i,ijk->jk", np.array(means) - 1.0, parts)
+        self.fraction = float(
+            np.clip(means[0] * largest_variance_fraction(parts[FORCE_PART], larger), 0.0, 1.0)
+        )
+        more = np.einsum("i,ijk->jk", np.array(means) - 1.0, self.parts)
+        self.parts *= np.array(means)[:, None, None]
+        self.sigma *= math.sqrt(means[0])
+        self.shift *= math.sqrt(means[1])
+        self.noise *= means[2]
+        return more
+
+    @property
+    def headroom(self) -> float:
+        """By how much the force's variance may grow where the filter has lost the robot."""
+        return float(min(self.options.largest_inflation, self.grids[0][-1] / self.sigma**2))
+
+    def scale(self, c: float, deviations: Floats) -> None:
+        """Have ``c`` times the force's variance, in the past too; ``deviations`` (n,): of the coefficients, by what they were."""
+        self.sigma *= math.sqrt(c)
+        self.parts[FORCE_PART] *= c
+        self.parts *= np.multiply.outer(deviations, deviations)
+
+    def correct(self, K: Floats, H: Floats, R: Floats) -> None:
+        """A measurement of noise ``R`` (k, k) by the robot file has been fused with gain ``K`` (n, k) and derivative ``H`` (k, n).
+
+        (I - K H) D (I - K H)^T is multiplied as it stands and made symmetric. Written out, rounding errors grow until Pi is no covariance.
+        """
+        left = np.eye(len(K)) - K @ H
+        parts = left @ self.parts @ left.T
+        parts[NOISE_PART] += self.noise * (K @ R @ K.T)
+        self.parts = 0.5 * (parts + parts.transpose(0, 2, 1))
+
+    def checkpoint(self) -> AdaptedState:
+        """What :meth:`restore` returns to."""
+        return AdaptedState(
+            self.parts.copy(),
+            self.weights,
+            self.sigma,
+            self.shift,
+            self.noise,
+            self.fraction,
+            self._stamp,
+        )
+
+    def restore(self, state: AdaptedState) -> None:
+        """Return to a checkpoint."""
+        parts, self.weights, self.sigma, self.shift, self.noise, self.fraction, self._stamp = state
+        self.parts = parts.copy()
+
+
+def largest_variance_fraction(part: Floats, whole: Floats) -> float:
+    """Largest fraction of the variance by ``whole`` (k, k) that ``part`` (k, k) has, along any direction."""
+    try:
+        root = np.linalg.inv(np.linalg.cholesky(whole))
+    except np.linalg.LinAlgError:
+        return 1.0
+    return float(np.linalg.eigvalsh(root @ part @ root.T)[-1])
