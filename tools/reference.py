@@ -215,8 +215,8 @@ def render() -> str:
         "",
         "## Commands",
         "",
-        "Exit codes: 0 finished; 1 finished, but some rows or steps failed, and they are named; 2 bad arguments or input, with one line that says",
-        "what; 130 interrupted.",
+        "Exit codes: 0 finished; 1 finished, but some rows or steps failed (they are named) or next to nothing was estimated; 2 bad",
+        "arguments or input, with one line that says what; 130 interrupted.",
         "",
     ]
     for name, command in commands():

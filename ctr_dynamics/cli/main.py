@@ -191,7 +191,7 @@ def main(argv: list[str] | None = None) -> int:
         argv: arguments without the program's name; None takes the process's.
 
     Returns:
-        0 finished, 1 finished but some rows or steps failed, 2 bad arguments or input, 130 interrupted.
+        0 finished, 1 finished but some rows or steps failed or next to nothing was estimated, 2 bad arguments or input, 130 interrupted.
     """
     for stream in (sys.stdout, sys.stderr):
         # terminals of few characters, and names of files that are not UTF-8

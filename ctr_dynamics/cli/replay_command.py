@@ -61,6 +61,11 @@ def _table(result: ReplayResult) -> list[tuple[str, str]]:
     """The short table shown at the end. Lengths in millimetres, and said so."""
     summary = result.summary
     residual, nis, step = summary["residual_rms_m"], summary["nis"], summary["step_ms"]
+    measurements = summary["measurements"]
+    apart_m = measurements["not_used_residual_rms_m"]["predicted"]
+    apart = (
+        f" (those not used lie {1e3 * apart_m:.1f} mm rms off the open loop)" if apart_m is not None else ""
+    )
     rows = [
         ("steps", f"{summary['steps']} of 3 ms, {summary['duration_s']:.2f} s"),
         ("run time", f"{summary['wall_s']:.2f} s, {summary['realtime_ratio']:.1f} times real time"),
@@ -74,8 +79,8 @@ def _table(result: ReplayResult) -> list[tuple[str, str]]:
         ),
         (
             "tracker measurements",
-            f"rejected {_count(summary['rejected'])}, late {_count(summary['late'])}, "
-            f"dropped {_count(summary['dropped'])}",
+            f"used {measurements['used']}, rejected {_count(summary['rejected'])}, late {_count(summary['late'])}, "
+            f"dropped {_count(summary['dropped'])}{apart}",
         ),
     ]
     if summary["invalid"]["steps"]:
@@ -131,7 +136,8 @@ def replay(
     """Run a recorded bag through the estimator, without a ROS graph.
 
     Messages are taken in the order of their log time. Twice the same bag, robot and parameters give the same
-    output, byte for byte. Exit code 1 when some steps failed.
+    output, byte for byte. Exit code 1 when some steps failed, or when next to nothing was estimated: less than
+    a tenth of the time is valid, or less than a tenth of the poses was fused.
     """
     check_targets({"output": output, "summary": summary, "report": report}, {"parameter file": params})
     settings = settings_for_replay(params, assignments or [], not no_fusion)
@@ -148,4 +154,6 @@ def replay(
     for label, path in (("output", output), ("summary", summary), ("report", report)):
         if path is not None:
             print(f"{label:<{width}}  {path}")
-    return 1 if result.failures else 0
+    if result.shortfall:
+        print(f"ctr-dynamics: {result.shortfall}", file=sys.stderr)
+    return 1 if result.failures or result.shortfall else 0

@@ -20,19 +20,19 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ctr_dynamics import __version__
-from ctr_dynamics.errors import InputError
 from ctr_dynamics.estimation.monitoring.statuses import all_statuses, snap_ahead
 from ctr_dynamics.io.atomic_files import atomic_file, check_targets
 from ctr_dynamics.io.bag_reader import Bag, InputMessage, open_bag
 from ctr_dynamics.io.bag_writer import BagWriter, write_bag
 from ctr_dynamics.io.messages.cdr import CdrError, JointStateIn, PoseIn, decode_stamp
-from ctr_dynamics.io.messages.topics import JOINT_STATES, STEP_NS, TRACKER_TIP
-from ctr_dynamics.parameters import PARAMETERS, Settings
+from ctr_dynamics.io.messages.topics import JOINT_STATES
+from ctr_dynamics.parameters import Settings
 from ctr_dynamics.robot import Robot
 from ctr_dynamics.robot_files import load_robot
 from ctr_dynamics.runtime.clock_offset import ClockOffset, RisingStamps
 from ctr_dynamics.runtime.garbage_collection import rare_garbage_collection
 from ctr_dynamics.runtime.input_gate import InputGate
+from ctr_dynamics.runtime.replay_notes import AFTER_NS, no_step, replay_notes, shortfall
 from ctr_dynamics.runtime.step_encoder import StepEncoder
 
 if TYPE_CHECKING:
@@ -41,17 +41,22 @@ if TYPE_CHECKING:
 
 MakeEstimator = Callable[[Robot, Settings], "Estimator"]
 Progress = Callable[[float, int], None]
-AFTER_NS = 1_000_000_000  # what arrives later than this after the last joint state changes no step
-LIVE_ONLY = ("qos.", "record.", "timing_report")  # parameters of a node
 _MAX_STRETCHES = 100
 
 
 @dataclass
 class ReplayResult:
-    """Outcome of a replay: the content of summary.json, and notes on unusual inputs, one line for each kind."""
+    """Outcome of a replay.
+
+    Attributes:
+        summary: the content of summary.json.
+        notes: on unusual inputs, one line for each kind.
+        shortfall: why next to nothing was estimated, in one line; empty where something was.
+    """
 
     summary: dict[str, Any]
     notes: list[str] = field(default_factory=list)
+    shortfall: str = ""
 
     @property
     def failures(self) -> int:
@@ -92,6 +97,8 @@ class Player:
         estimator.step_times_s = array("d")
         self.joint_names: set[str] = set()
         self.unused = 0  # messages that came too long after the last joints
+        self.joints_cover_ns = 0  # time between the joint states' arrivals, gaps over a second left out
+        self._joints_log_ns: int | None = None
         self._clock = ClockOffset(own=False)
         self._now_ns: int | None = None
         self._last_ns = 0  # the last joint stamp
@@ -124,6 +131,9 @@ class Player:
     def _add(self, item: InputMessage) -> None:
         message = item.message
         if isinstance(message, JointStateIn):
+            if self._joints_log_ns is not None and item.log_ns - self._joints_log_ns < 1_000_000_000:
+                self.joints_cover_ns += max(0, item.log_ns - self._joints_log_ns)
+            self._joints_log_ns = item.log_ns
             if len(self.joint_names) < 100:
                 self.joint_names.update(message.names[:100])
             given = self._gate.joint_state(message, item.log_ns)
@@ -266,8 +276,7 @@ def replay(
         log = _report_log(estimator, opened) if report_part is not None else None
         stack.enter_context(rare_garbage_collection())
         numbers, times_s = _run(opened, estimator, robot, settings, writer, progress, log)
-        notes = [*opened.notes, *opened.unchecked, *_without(opened, settings)]
-        notes += [*_input_notes(numbers["input_problems"]), *_left_out(numbers)]
+        notes = replay_notes(opened, settings, numbers)
         content = plain({**numbers, **provenance, "notes": notes})
         if summary_part is not None:
             text = json.dumps(content, indent=1, allow_nan=False, ensure_ascii=False)
@@ -278,7 +287,7 @@ def replay(
 
             page = replay_page(log, content, times_s).text()
             report_part.write_text(page, encoding="utf-8", errors="backslashreplace")
-    return ReplayResult(content, notes)
+    return ReplayResult(content, notes, shortfall(opened, settings, numbers))
 
 
 def _warm_estimator(robot: Robot, settings: Settings) -> MakeEstimator:
@@ -350,6 +359,7 @@ def _run(
         "withheld": withheld,
         "unused": player.unused,
         "duration_s": duration_s,
+        "joints_cover_s": player.joints_cover_ns * 1e-9,
         "wall_s": wall_s,
         "realtime_ratio": duration_s / wall_s,
         "step_ms": {"p50": p50, "p99": p99, "max": worst},
@@ -365,60 +375,3 @@ def _metadata(provenance: dict[str, Any]) -> dict[str, str]:
         key: value if isinstance(value, str) else json.dumps(plain(value), sort_keys=True)
         for key, value in provenance.items()
     }
-
-
-def _input_notes(problems: dict[str, dict[str, Any]]) -> list[str]:
-    """A line for each kind of unusual input that the estimator has noted, by group."""
-    return [
-        f"{group}: {kind} ({found['count']}), the last: {found['last']}"
-        for group, kinds in problems.items()
-        for kind, found in kinds.items()
-    ]
-
-
-def _without(bag: Bag, settings: Settings) -> list[str]:
-    """Notes on what has no effect: a missing tracker, and parameters of the live node."""
-    tracker = bag.topics.get(TRACKER_TIP)
-    notes = (
-        []
-        if tracker is not None and tracker.messages
-        else [f"no pose on {TRACKER_TIP}: the model runs in open loop"]
-    )
-    live = [p.name for p in PARAMETERS if p.name.startswith(LIVE_ONLY) and settings[p.name] != p.default]
-    if live:
-        notes.append(f"parameters of the live node alone, without effect here: {', '.join(live)}")
-    return notes
-
-
-def _left_out(numbers: dict[str, Any]) -> list[str]:
-    """Notes on messages and steps that are in no output."""
-    withheld, unused = numbers["withheld"], numbers["unused"]
-    notes = []
-    if withheld:
-        notes.append(
-            f"joints: their clock was set back; {withheld} steps of {STEP_NS * 1e-6:g} ms lie before what was out already "
-            "and are left out, as no stamp is published twice: cut it off with `mcap filter` and replay it by itself"
-        )
-    if unused:
-        notes.append(
-            f"{unused} messages came more than {AFTER_NS * 1e-9:g} s after the last joint state and are not used: a replay ends with the joints"
-        )
-    return notes
-
-
-def no_step(bag: Bag, robot: Robot, names: set[str], problems: dict[str, Any]) -> InputError:
-    """The error that explains why a replay took no step, from the joint ``names`` of the bag and the estimator's ``problems`` with them."""
-    expected = ", ".join(f"tube{i}_rotation, tube{i}_translation" for i in range(1, robot.n_tubes + 1))
-    found = ", ".join(sorted(names)[:12]) or "none"
-    odd = "".join(f"; {note}" for note in _input_notes({"joints": problems}))
-    return InputError(
-        f"no step was possible: no usable joint state of robot '{robot.name}' on {JOINT_STATES} (joints "
-        f"found: {found}; needed: {expected}; readable messages: {_readable(bag)}{odd})",
-        where=str(bag.path),
-        do="check joint names, units and robot with `ctr-dynamics info`",
-    )
-
-
-def _readable(bag: Bag) -> int:
-    topic = bag.topics.get(JOINT_STATES)
-    return (topic.messages if topic else 0) - bag.malformed.get(JOINT_STATES, 0)

@@ -301,7 +301,7 @@ def test_figures_of_poses_that_are_first_fused_on_a_way_back_count_once(sweep, i
     run = play(late, {"output.policy": "predict"}, tick=STEP, spare=lambda made: 0.0)
     h, reference = run.estimator.health, in_time.estimator.health
     assert h.corrected_steps > 100
-    assert (h.compared, h.nis_count) == (reference.compared, reference.nis_count)
+    assert (h.residuals.compared, h.nis_count) == (reference.residuals.compared, reference.nis_count)
     found, expected = h.residual_rms(), reference.residual_rms()
     assert found["predicted"] == pytest.approx(expected["predicted"], rel=1e-3)
     assert found["fused"] == pytest.approx(expected["fused"], rel=0.02)

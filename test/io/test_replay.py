@@ -116,6 +116,11 @@ class StandIn:
             "rejected": 0,
             "late": 0,
             "dropped": 0,
+            "measurements": {
+                "used": sum(call[0] == "tracker" for call in self.calls),
+                "not_used": 0,
+                "not_used_residual_rms_m": {"predicted": None, "fused": None},
+            },
             "input_problems": {"joints": {}, "tracker": {}, "load": {}},
             "solver": {"failures": 0, "reasons": {}},
         }

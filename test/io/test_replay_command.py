@@ -93,7 +93,8 @@ def test_what_was_odd_about_the_inputs_is_said(bags, tmp_path):
 
     start_of(bags / "clean_release.mcap", tmp_path / "in.mcap", elsewhere)
     done = command(tmp_path / "in.mcap", "--summary", tmp_path / "out.json")
-    assert done.returncode == 0, done.stderr
+    assert done.returncode == 1, done.stderr
+    assert "the tracker was not used: 0 of 12 poses fused" in done.stderr
     assert (
         "note: tracker: other frame (12), the last: pose in frame 'polaris', expected 'ctr_base'"
         in done.stderr

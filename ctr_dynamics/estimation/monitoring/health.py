@@ -18,6 +18,24 @@ FEWEST_RECENT = 20  # of them, below which nothing is said of a contradiction
 WAITING = "waiting for the first complete joint state"
 
 
+class Residuals(NamedTuple):
+    """Sums over ``compared`` measurements of the squared distance to the open-loop and the fused tip, m^2."""
+
+    compared: int = 0
+    open_loop: float = 0.0
+    fused: float = 0.0
+
+    def rms(self, fusing: bool) -> dict[str, float | None]:
+        """Root of the mean squares, m; None where nothing was compared, and for the fused run where the filter is off."""
+        if not self.compared:
+            return {"predicted": None, "fused": None}
+        open_loop, fused = math.sqrt(self.open_loop / self.compared), math.sqrt(self.fused / self.compared)
+        return {"predicted": open_loop, "fused": fused if fusing else None}
+
+
+NOTHING_COMPARED = Residuals()
+
+
 class MeasurementCounts(NamedTuple):
     """What is counted once a measurement, though it is fused again where its step is corrected; see :class:`Health`."""
 
@@ -27,8 +45,8 @@ class MeasurementCounts(NamedTuple):
     accepted: int
     rejected: int
     dropped: int
-    squares: tuple[float, float]
-    compared: int
+    residuals: Residuals
+    unused_residuals: Residuals
     recent: list[tuple[float, bool]]
 
 
@@ -60,7 +78,7 @@ class Health:
         force_sigma: N, deviation of the tip force in the process noise.
         shift_m: m, by which measured positions lie beside what any force on the robot explains; 0 where they do not.
         noise_ratio: deviation of the tracker's noise by the stated one; 1 while nothing else is established.
-        compared: measurements whose residuals are in the rms of both runs.
+        residuals: of the measurements that were used; unused_residuals: of those that were rejected or dropped.
         consistency: watches the innovations. stability: of the equilibrium that belongs to the present actuators.
     """
 
@@ -90,8 +108,8 @@ class Health:
     tracker_age_s: float = 0.0
     consistency: ConsistencyMonitor = field(default_factory=ConsistencyMonitor)
     stability: Stability | None = None
-    compared: int = 0
-    _squares: tuple[float, float] = (0.0, 0.0)  # m^2, open loop and fused
+    residuals: Residuals = NOTHING_COMPARED
+    unused_residuals: Residuals = NOTHING_COMPARED
 
     # -- counting --
 
@@ -108,23 +126,36 @@ class Health:
         self.failures += 1
         self.reasons[reason] = self.reasons.get(reason, 0) + 1
 
-    def measured(self, innovation: Innovation) -> None:
-        """Count a measurement: how far it lies from the outputs of its time, whether it reached the gate, lay within and was fused."""
+    def measured(self, innovation: Innovation, again: bool = False) -> None:
+        """Count a measurement: how far it lies from the outputs of its time, whether it reached the gate, lay within and was fused.
+
+        Args:
+            again: its time has been published before the clock was set back; its step is in no output, and neither is it in the totals.
+        """
+        within = innovation.reason == FUSION_OFF or (innovation.accepted and not innovation.reason)
+        if innovation.dof:
+            self.recent.append((innovation.nis / innovation.dof, within))
+        if again:
+            return
+        used = bool(innovation.dof) and (innovation.accepted or not self.fusing)
         if innovation.motion is not None and innovation.fused_residual is not None:
             open_loop, fused = innovation.motion.residual, innovation.fused_residual
-            self._squares = (
-                self._squares[0] + float(open_loop @ open_loop),
-                self._squares[1] + float(fused @ fused),
+            before = self.residuals if used else self.unused_residuals
+            after = Residuals(
+                before.compared + 1,
+                before.open_loop + float(open_loop @ open_loop),
+                before.fused + float(fused @ fused),
             )
-            self.compared += 1
+            if used:
+                self.residuals = after
+            else:
+                self.unused_residuals = after
         if not innovation.dof:
             self.dropped += 1
             return
         self.nis_count += 1
         self.nis_sum += innovation.nis
         self.nis_dof += innovation.dof
-        within = innovation.reason == FUSION_OFF or (innovation.accepted and not innovation.reason)
-        self.recent.append((innovation.nis / innovation.dof, within))
         if innovation.accepted:
             self.accepted += 1
         elif self.fusing:
@@ -134,14 +165,14 @@ class Health:
         """What has been counted of measurements, for :meth:`restore_counts`."""
         return MeasurementCounts(
             self.nis_count, self.nis_sum, self.nis_dof, self.accepted, self.rejected, self.dropped,
-            self._squares, self.compared, list(self.recent),
+            self.residuals, self.unused_residuals, list(self.recent),
         )  # fmt: skip
 
     def restore_counts(self, counts: MeasurementCounts) -> None:
         """Have counted of measurements what :meth:`measurement_counts` gave."""
         self.nis_count, self.nis_sum, self.nis_dof = counts.nis_count, counts.nis_sum, counts.nis_dof
         self.accepted, self.rejected, self.dropped = counts.accepted, counts.rejected, counts.dropped
-        self._squares, self.compared = counts.squares, counts.compared
+        self.residuals, self.unused_residuals = counts.residuals, counts.unused_residuals
         self.recent.clear()
         self.recent.extend(counts.recent)
 
@@ -184,9 +215,8 @@ class Health:
         }
 
     def residual_rms(self) -> dict[str, float | None]:
-        """m between measurements and outputs: open loop, and fused where the filter is on."""
-        open_loop, fused = (math.sqrt(s / self.compared) if self.compared else None for s in self._squares)
-        return {"predicted": open_loop, "fused": fused if self.fusing else None}
+        """m between the measurements that were used and the outputs: open loop, and fused where the filter is on."""
+        return self.residuals.rms(self.fusing)
 
     def nis_summary(self) -> dict[str, float | int | bool | None]:
         """Mean NIS per degree of freedom with the 95 % band of that mean for a consistent filter."""
@@ -207,6 +237,11 @@ class Health:
         return {
             "steps": self.steps,
             "residual_rms_m": self.residual_rms(),
+            "measurements": {
+                "used": self.accepted,
+                "not_used": self.rejected + self.dropped,
+                "not_used_residual_rms_m": self.unused_residuals.rms(self.fusing),
+            },
             "nis": self.nis_summary(),
             "rejected": self.rejected,
             "late": self.late,

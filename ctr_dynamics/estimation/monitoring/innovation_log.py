@@ -31,16 +31,19 @@ class InnovationLog:
         self._waiting: list[Innovation] = []  # for the next output
         self._reported: deque[Innovation] = deque(maxlen=REMEMBERED)
         self._unjudged: deque[Innovation] = deque()  # by the consistency monitor
+        self._newest_ns = self._published_ns = 0  # newest stamp of all, and of those before the last clearing
 
     def clear(self) -> None:
         """Forget everything; what has been counted stays."""
+        self._published_ns = self._newest_ns
         self._waiting.clear()
         self._reported.clear()
         self._unjudged.clear()
 
     def add(self, innovation: Innovation) -> None:
         """Take in the innovation of a measurement, fused or not."""
-        self._health.measured(innovation)
+        self._newest_ns = max(self._newest_ns, innovation.stamp_ns)
+        self._count(innovation)
         self._waiting.append(innovation)
 
     def take(self) -> list[Innovation]:
@@ -76,5 +79,8 @@ class InnovationLog:
         del self._waiting[mark.waiting :]
         self._health.restore_counts(mark.counts)
         for innovation in new:
-            self._health.measured(innovation)
+            self._count(innovation)
         self._waiting.extend(new)
+
+    def _count(self, innovation: Innovation) -> None:
+        self._health.measured(innovation, again=innovation.stamp_ns <= self._published_ns)
