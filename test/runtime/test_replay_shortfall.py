@@ -1,9 +1,13 @@
 """Replays that estimated next to nothing say so, and summaries count what was used."""
 
 from pathlib import Path
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
+from ctr_dynamics.estimation.monitoring.health import Health
+from ctr_dynamics.estimation.step_output import Innovation
 from ctr_dynamics.io.bag_reader import open_bag
 from ctr_dynamics.io.bag_writer import write_bag
 from ctr_dynamics.io.messages.cdr import decode_joint_state, decode_pose_stamped
@@ -61,17 +65,24 @@ def test_poses_in_another_frame(tmp_path):
     assert replay(bag, "till2020_tissue", {"filter.enabled": False}).shortfall == ""
 
 
-def test_a_tracker_that_contradicts_the_model(tmp_path):
-    """Its distance is shown apart from the residual of what was used."""
+def test_what_was_not_used_is_counted_apart():
+    def innovation(distance_m, accepted):
+        motion = SimpleNamespace(residual=np.array([distance_m, 0.0, 0.0]))
+        fused = np.array([0.0, 0.5 * distance_m, 0.0])
+        return Innovation(
+            1, np.zeros(6), np.ones(6), 6.0, 6, accepted, 0.0, "" if accepted else "gate", None, motion, fused
+        )
 
-    def moved(m):
-        x, y, z = m.position
-        return m._replace(position=(x + 0.02, y, z))
-
-    summary = replay(edited(tmp_path / "a.mcap", pose=moved), "till2020_tissue").summary
-    measurements = summary["measurements"]
-    assert measurements["not_used"] > 0.9 * 80
-    assert measurements["not_used_residual_rms_m"]["predicted"] == pytest.approx(0.02, rel=0.2)
+    health = Health()
+    for distance_m, accepted in ((0.001, True), (0.1, False), (0.001, True)):
+        health.measured(innovation(distance_m, accepted))
+    summary = health.summary()
+    assert summary["residual_rms_m"] == {"predicted": pytest.approx(0.001), "fused": pytest.approx(0.0005)}
+    assert summary["measurements"] == {
+        "used": 2,
+        "not_used": 1,
+        "not_used_residual_rms_m": {"predicted": pytest.approx(0.1), "fused": pytest.approx(0.05)},
+    }
 
 
 def test_a_bag_that_was_played_twice_counts_once(tmp_path, plain):
