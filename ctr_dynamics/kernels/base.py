@@ -3,6 +3,7 @@
 import math
 
 from ctr_dynamics.kernels.compiler import njit
+from ctr_dynamics.kernels.complex_rates import damped
 from ctr_dynamics.kernels.layout import state_rows, unknown_rows, workspace_rows
 from ctr_dynamics.kernels.physics import base_stretch, coulomb, drive
 from ctr_dynamics.kernels.sincos import sincos
@@ -13,14 +14,14 @@ def below_base(kind, W, c0, cells, ust_base, x, base_history, base_fields):
     """Torsion of the straight lengths behind the base plate, (18), and the coupling (19) into the state at s = 0-.
 
     ``x``: unknowns of the shooting problem. The rows from ``curvature`` on hold, for one tube after the other, state, stage and accumulated
-    increment (psi, psi_t, m_z each), step, compliance, and the factor on u*_z.
+    increment (psi, psi_t, m_z each), step, and the factor on u*_z.
     """
     n = kind.tubes
     at, state, unknown = workspace_rows(n), state_rows(n), unknown_rows(n)
     points = 4 * cells + 1
     Y, HI, OU = at.state, at.history, at.fields
     S, A, B = at.curvature, at.curvature + 3, at.curvature + 6
-    DS, CO, US = at.curvature + 9, at.curvature + 10, at.curvature + 11
+    DS, US = at.curvature + 9, at.curvature + 10
     P, H, Q, O = state.position, state.quaternion, state.velocity, state.angular_velocity  # noqa: E741
     N, M = state.force, state.moment_xy
     for i in range(n):
@@ -31,7 +32,7 @@ def below_base(kind, W, c0, cells, ust_base, x, base_history, base_fields):
         W[S] = psi
         W[S + 1] = psi_t
         W[DS] = -W[BE] / cells
-        W[CO] = 1.0 / (W[GJ] + c0 * W[BT])
+        gj, bt = W[GJ], W[BT]
         W[US] = W[GJ] * W[KS]
         for cell in range(cells):
             for r in range(3):
@@ -45,7 +46,7 @@ def below_base(kind, W, c0, cells, ust_base, x, base_history, base_fields):
                 W[HI] = base_history[point]
                 W[HI + 1] = base_history[point + 1]
                 psi_t = W[A + 1]
-                u = (W[A + 2] + W[US] * uz_ref - W[BT] * W[HI + 1]) * W[CO]
+                u = damped(c0, gj, bt, W[A + 2] + W[US] * uz_ref - bt * W[HI + 1])
                 kv = c0 * u + W[HI + 1] + base_stretch(kind, W, i, W[BE], u)
                 km = 2.0 * W[RI] * (c0 * psi_t + W[HI])
                 W[OU] = psi_t
@@ -64,11 +65,9 @@ def below_base(kind, W, c0, cells, ust_base, x, base_history, base_fields):
             W[S + 1] += h * W[B + 1]
             W[S + 2] += h * W[B + 2]
         end = (i * points + 4 * cells) * 2
-        gj, bt = W[GJ], W[BT]
         base_fields[end] = W[S + 1]
-        base_fields[end + 1] = (
-            W[S + 2] + gj * W[KS] * ust_base[i * points + 4 * cells] - bt * base_history[end + 1]
-        ) / (gj + c0 * bt)
+        load = W[S + 2] + gj * W[KS] * ust_base[i * points + 4 * cells] - bt * base_history[end + 1]
+        base_fields[end + 1] = damped(c0, gj, bt, load)
         W[Y + state.moment_z + i] = W[S + 2]
         if i == 0:
             half = 0.5 * W[S]

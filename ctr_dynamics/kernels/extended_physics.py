@@ -12,6 +12,7 @@ rates of beta, so that 0 is the plain model and 1 the full one.
 import math
 
 from ctr_dynamics.kernels.compiler import njit
+from ctr_dynamics.kernels.complex_rates import damped, oval_curvature, squared
 from ctr_dynamics.kernels.layout import base_end_rows, field_rows, state_rows, workspace_rows
 from ctr_dynamics.kernels.plain_physics import keep_fields, weight
 from ctr_dynamics.kernels.simd import largest, where_above
@@ -80,7 +81,7 @@ def curvature(kind, W, present, ust, u0, c0):
         W[Ti] = ks * (c * vx_ - s * vy_)
         W[Ti + 1] = ks * (s * vx_ + c * vy_)
         gj, hu = W[GJi], W[HI + field.curvature_z + i]
-        uz = (W[Y + state.moment_z + i] + gj * ks * vz_ - W[BTi] * hu) / (gj + c0 * W[BTi])
+        uz = damped(c0, gj, W[BTi], W[Y + state.moment_z + i] + gj * ks * vz_ - W[BTi] * hu)
         W[Ti + 2] = uz
         W[Ti + 3] = c0 * uz + hu
         # cos and sin of twice the angle of the major axis, times the ovality, in the frame of tube 1
@@ -95,7 +96,8 @@ def curvature(kind, W, present, ust, u0, c0):
         soft = max(soft, largest(W[at.softening + i]))
     ux, uy = 0.0, 0.0
     for _ in range(SOFTENING_ITERATIONS if soft > 0.0 else 1):
-        a11, a12, a21, a22 = 0.0, 0.0, 0.0, 0.0
+        none = 0.0 * W[at.bending_stiffness]  # a number of the lanes from the start, as the compiler wants it
+        k11_all, k12_all, k22_all, bb_all, turning = none, none, none, none, none
         rx, ry = W[Y + state.moment_xy], W[Y + state.moment_xy + 1]
         for i in range(present):
             Ti = T + 7 * i
@@ -103,14 +105,14 @@ def curvature(kind, W, present, ust, u0, c0):
             g = W[Y + state.gamma + i - 1] if i else 0.0
             k11, k12, k22 = ei * (1.0 + W[Ti + 4]), ei * W[Ti + 5], ei * (1.0 - W[Ti + 4])
             wx, wy = W[Ti], W[Ti + 1]
-            a11 += k11 + c0 * bb
-            a12 += k12 + bb * g
-            a21 += k12 - bb * g
-            a22 += k22 + c0 * bb
+            k11_all += k11
+            k12_all += k12
+            k22_all += k22
+            bb_all += bb
+            turning += bb * g
             rx += k11 * wx + k12 * wy - bb * hx
             ry += k12 * wx + k22 * wy - bb * hy
-        d = 1.0 / (a11 * a22 - a12 * a21)
-        ux, uy = (a22 * rx - a12 * ry) * d, (a11 * ry - a21 * rx) * d
+        ux, uy = oval_curvature(c0, k11_all, k12_all, k22_all, bb_all, turning, rx, ry)
         if soft > 0.0:
             for i in range(present):
                 Ti = T + 7 * i
@@ -261,7 +263,8 @@ def drive(kind, W, c0, i, torque, angle, rate, base_history, base_fields):
     c = W[at.drive_compliance + i]
     inertia = W[at.drive_inertia + i]
     h = base_history[row]
-    give = c * (torque - inertia * (c0 * (rate + h) + base_history[first])) / (1.0 + c * inertia * c0 * c0)
+    load = c * (torque - inertia * (c0 * (rate + h) + base_history[first]))
+    give = damped(squared(c0), 1.0, c * inertia, load)
     base_fields[row] = give
     return angle + give, rate + c0 * give + h
 

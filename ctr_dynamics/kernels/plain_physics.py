@@ -8,6 +8,7 @@ which are present, so that the rows of each tube are constants for the compiler.
 """
 
 from ctr_dynamics.kernels.compiler import njit
+from ctr_dynamics.kernels.complex_rates import across, damped, plane_curvature
 from ctr_dynamics.kernels.layout import field_rows, state_rows, workspace_rows
 from ctr_dynamics.kernels.sincos import sincos
 
@@ -37,25 +38,22 @@ def curvature(kind, W, present, ust, u0, c0):
                 s, c = sincos(W[at.stage + state.theta + i - 1])
                 wx, wy = c * wx - s * wy, s * wx + c * wy
             rx, ry = wx - W[BB] * W[hux], wy - W[BB] * W[huy]
-            a = W[EI] + c0 * W[BB]
-            uz = (
-                W[at.stage + state.moment_z + i] + (W[GJ] * W[KS]) * ust[u0 + 3 * i + 2] - W[BT] * W[HUZ]
-            ) * (1.0 / (W[GJ] + c0 * W[BT]))
+            load = W[at.stage + state.moment_z + i] + (W[GJ] * W[KS]) * ust[u0 + 3 * i + 2] - W[BT] * W[HUZ]
+            uz = damped(c0, W[GJ], W[BT], load)
             W[T], W[T + 1], W[T + 2], W[T + 3] = rx, ry, uz, c0 * uz + W[HUZ]
             if i == 0:
                 W[u + 2], W[u_t + 2] = uz, W[T + 3]
-                W[total], W[total + 1] = a, 0.0
-                W[total + 2], W[total + 3] = W[moment] + rx, W[moment + 1] + ry
+                W[total], W[total + 1], W[total + 2] = W[EI], W[BB], 0.0
+                load_x, load_y = W[moment] + rx, W[moment + 1] + ry
             else:
                 b = W[BB] * W[at.stage + state.gamma + i - 1]
                 W[T + 4] = b
-                W[total] += a
-                W[total + 1] += b
-                W[total + 2] += rx
-                W[total + 3] += ry
-    a, b, rx, ry = W[total], W[total + 1], W[total + 2], W[total + 3]
-    d = 1.0 / (a * a + b * b)
-    ux, uy = (a * rx - b * ry) * d, (a * ry + b * rx) * d
+                W[total] += W[EI]
+                W[total + 1] += W[BB]
+                W[total + 2] += b
+                load_x += rx
+                load_y += ry
+    ux, uy = plane_curvature(c0, W[total], W[total + 1], W[total + 2], load_x, load_y)
     W[u], W[u + 1] = ux, uy
     W[u_t], W[u_t + 1] = c0 * ux + W[hux], c0 * uy + W[huy]
 
@@ -92,7 +90,7 @@ def derivative(kind, W, present, ust, u0, c0):
         KM, KT, KG = K + state.moment_z + i, K + state.theta + i - 1, K + state.gamma + i - 1
         OUu, OUg = OU + field.curvature_z + i, OU + field.gamma + i - 1
         if i < present:
-            turn = ux * W[T + 1] - uy * W[T]
+            turn = ux * W[T + 1] - uy * W[T] - across(c0, W[at.bending_damping + i], ux, uy)
             if i == 0:
                 W[KM] = turn + (2.0 * W[RI]) * wz_t
                 W[total], W[total + 1] = W[RA], W[RI]

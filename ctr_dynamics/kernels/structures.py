@@ -205,3 +205,27 @@ class RunTangent(NamedTuple):
     bank: np.ndarray
     result: Derivatives
     tips: np.ndarray
+
+
+class PartialFractions(NamedTuple):
+    """A rational function R(z) = sum over poles of weight pole / (pole - z), with R(0) = 1.
+
+    One real pole (0 if there is none) and one pair of complex ones. Of these the one above the real axis is named, with the weight of both.
+    """
+
+    real_pole: float
+    real_weight: float
+    complex_pole: complex
+    complex_weight: complex
+
+
+@structure
+class RationalBuffers(NamedTuple):
+    """For columns by partial fractions: buffers of a ``single`` lane, of the ``real`` pole's lanes, of ``near`` and ``far`` lanes of the complex
+    pole; columns of the histories ``dhistory`` (fields, r)."""
+
+    single: SweepBuffers
+    real: SweepBuffers
+    near: SweepBuffers
+    far: SweepBuffers
+    dhistory: np.ndarray

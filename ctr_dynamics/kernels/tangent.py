@@ -7,6 +7,7 @@ stay in the cache.
 import numpy as np
 
 from ctr_dynamics.kernels.compiler import njit
+from ctr_dynamics.kernels.complex_linearise import add_complex
 from ctr_dynamics.kernels.kinds import ONE_BATCH, ONE_LANE, SIMD_WIDTH, unknown_lanes
 from ctr_dynamics.kernels.layout import RATE_NOW, RATES, Y_BEFORE, Y_NOW, input_row
 from ctr_dynamics.kernels.linearise import (
@@ -20,49 +21,64 @@ from ctr_dynamics.kernels.linearise import (
 )
 from ctr_dynamics.kernels.shooting import broadcast, lane_lengths
 from ctr_dynamics.kernels.simd import column_view, fma, view
-from ctr_dynamics.kernels.structures import Derivatives, Solution, SweepBuffers
+from ctr_dynamics.kernels.structures import Solution, SweepBuffers
 from ctr_dynamics.kernels.sweep import sweep
 from ctr_dynamics.kernels.time_step import fill_history
 
-THETA = 0.55  # of the one-stage tangent: nearly the trapezoidal rule, with a little damping of what the step does not resolve
+
+@njit(nogil=True, error_model="numpy")
+def _fields_of_rates(kind, mesh, parameters, unknowns, rates, b, fields):
+    """The ``fields`` (fields,) that belong to ``unknowns`` and ``rates`` on these sections.
+
+    Interpolated from other sections they differ a little, and c0 times the difference would be taken for accelerations.
+    """
+    main = len(b.history)
+    b.parameters[:], b.unknowns[:] = parameters, unknowns
+    b.history[:], b.base_history[:] = rates[:main], rates[main:]
+    lane_lengths(kind, ONE_LANE, mesh, b.parameters, b.section_lengths)
+    sweep(kind, ONE_LANE, 0.0, mesh, b)
+    fields[:main], fields[main:] = b.fields, b.base_fields
 
 
 @njit(nogil=True, error_model="numpy")
-def theta_tangent(kind, lanes, mesh, dt, done, dparameters, differences, buffers, before, result):
-    """Columns over one step of ``dt`` (s) by the one-stage theta method, linearised at the step's end: one sweep instead of one a stage.
+def rational_tangent(
+    kind, lanes, mesh, fraction, dt, done, dparameters, before, differences, buffers, result
+):
+    """Columns over ``dt`` (s) by a rational function of the linearised dynamics, frozen at the end of a solved step.
 
-    The covariance does not need the model's own time accuracy. ``done``: :class:`~ctr_dynamics.kernels.structures.SolvedStep`, of which the end
-    alone is read. ``dparameters`` (NP, r), ``differences``, ``lanes``: as for :func:`~ctr_dynamics.kernels.linearise.linearise`; ``buffers``:
-    :class:`~ctr_dynamics.kernels.structures.TangentBuffers`. ``before`` (2, fields, r): columns of the fields and of their rates before the step;
-    those after it go to the fields of ``result`` (:class:`~ctr_dynamics.kernels.structures.Derivatives`) in the same form, which may be the same
-    array. Returns False where the step's end cannot be linearised.
+    With A the derivative of the rates by the fields there, a column goes from dy to R(dt A) dy, with R the stability function of a collocation
+    method. In partial fractions the terms do not wait for each other:
+
+        R(dt A) dy = sum of w v over the poles,  (c0 - A) v = c0 dy + B dp,  c0 = pole / dt.
+
+    ``fraction``: :class:`~ctr_dynamics.kernels.structures.PartialFractions`. ``done``:
+    :class:`~ctr_dynamics.kernels.structures.SolvedStep`, of which inputs, unknowns and rates of the last stage are read. ``dparameters`` (NP, r),
+    ``differences``, ``lanes``: as for :func:`~ctr_dynamics.kernels.linearise.linearise`. ``before`` (fields, r): columns of the fields before the
+    step; those after it go to the ``result`` (:class:`~ctr_dynamics.kernels.structures.Derivatives`), another array. ``buffers``:
+    :class:`~ctr_dynamics.kernels.structures.RationalBuffers`. Returns False where the step's end cannot be linearised.
     """
-    hist, histb, dhist = buffers.history, buffers.base_history, buffers.dhistory
-    main, last = len(hist), len(done.rates) - 1
-    after, rate = done.after, done.rates[last]
-    c0 = 1.0 / (THETA * dt)
-    ratio = (1.0 - THETA) / THETA
-    for i in range(main):
-        hist[i] = rate[i] - c0 * after[i]
-    for i in range(len(histb)):
-        histb[i] = rate[main + i] - c0 * after[main + i]
-    dy, drate = before[0], before[1]
-    fields, columns = dy.shape
-    for i in range(fields):
-        for k in range(columns):
-            dhist[i, k] = -c0 * dy[i, k] - ratio * drate[i, k]
-    inputs = done.inputs[len(done.inputs) - 1]
+    rates, fields = done.rates[len(done.rates) - 1], np.empty(len(before))
+    inputs, unknowns = done.inputs[len(done.inputs) - 1], done.unknowns[len(done.unknowns) - 1]
     for i in range(len(inputs)):
         done.parameters[input_row(kind.tubes, i)] = inputs[i]
-    dy, drate = result.fields[0], result.fields[1]
-    solution = Solution(done.parameters, done.unknowns[len(done.unknowns) - 1], hist, histb)
-    found = Derivatives(result.inverse, result.unknowns, dy, result.nodes)
-    if not linearise(kind, lanes, c0, mesh, solution, dparameters, dhist, differences, buffers.sweep, found):
-        return False
-    for i in range(fields):
-        for k in range(columns):
-            drate[i, k] = c0 * dy[i, k] + dhist[i, k]
-    return True
+    _fields_of_rates(kind, mesh, done.parameters, unknowns, rates, buffers.single, fields)
+    share = 0.0
+    if fraction.real_pole != 0.0:
+        c0, share = fraction.real_pole / dt, fraction.real_weight
+        dhistory, main = buffers.dhistory, len(buffers.real.history) // lanes.count
+        history = rates - c0 * fields
+        for i in range(len(fields)):
+            for k in range(before.shape[1]):
+                dhistory[i, k] = -c0 * before[i, k]
+        solution = Solution(done.parameters, unknowns, history[:main], history[main:])
+        if not linearise(
+            kind, lanes, c0, mesh, solution, dparameters, dhistory, differences, buffers.real, result
+        ):
+            return False
+    return add_complex(
+        kind, mesh, fraction.complex_pole / dt, fraction.complex_weight, share, (done.parameters, unknowns, fields, rates),
+        dparameters, before, differences, (buffers.near, buffers.far), result,
+    )  # fmt: skip
 
 
 @njit(nogil=True, error_model="numpy")

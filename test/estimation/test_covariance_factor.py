@@ -1,5 +1,7 @@
 """The covariance factor: interpolation between meshes, and propagation against finite differences."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -13,7 +15,8 @@ from ctr_dynamics.model.mesh_interpolation import coarse_key, mesh_interpolation
 from ctr_dynamics.model.model import Model
 from ctr_dynamics.model.simulator import Inputs, Simulator
 from ctr_dynamics.model.statics import Statics
-from ctr_dynamics.robot_files import load_robot
+from ctr_dynamics.model.time_scheme import make_scheme
+from ctr_dynamics.robot_files import load_robot, robot_from_dict, robot_to_dict
 from ctr_dynamics.sensing import TrackerModel
 
 BETA, ALPHA, ZERO = np.array([-0.2521, -0.1977]), np.array([1.5708, 1.5708]), np.zeros(2)
@@ -113,12 +116,50 @@ def test_an_equilibrium_that_cannot_be_linearised_begins_without_deviation(model
     found = Statics(model).solve(BETA, ALPHA)
     factor = CovarianceFactor(model, model_uncertainty(model), rank=24)
     factor.start(found.key, found.mesh, BETA, ALPHA, model.parameters, found.x)
-    assert not factor.stored.any()
+    assert not factor.fields.any()
     assert not factor.dnodes.any()
     assert factor.theta.any()
 
 
 # -- propagation --
+
+
+def lighter():
+    """The tissue robot with a quarter of its payload: its slowest modes have 11 and 17 Hz."""
+    data = robot_to_dict(load_robot("till2020_tissue"))
+    data["tubes"][0]["end_body"]["mass"]["value"] *= 0.25
+    return Model(robot_from_dict(data), nodes=12)
+
+
+def test_columns_follow_a_fast_vibration():
+    """A small force that lets the tip go: the column of that force against runs in finer steps."""
+    model, steps = lighter(), 100
+    force = np.array([1e-3, 1e-3, 0.0])
+    still = Inputs(ALPHA, ZERO, BETA, ZERO, np.zeros(3), np.zeros(3))
+
+    def tips(pushed, dt):
+        simulator, found = Simulator(model, make_scheme("sdirk3", dt), tolerance=1e-10), []
+        state = simulator.rest(dataclasses.replace(still, force=pushed))
+        for k in range(round(steps * DT / dt)):
+            assert simulator.step(state, k * dt, lambda t: still).ok
+            found.append(state.nodes[-1, :3].copy())
+        return np.array(found)[round(DT / dt) - 1 :: round(DT / dt)]
+
+    expected = tips(force, DT / 3) - tips(np.zeros(3), DT / 3)
+    simulator, unc = Simulator(model), model_uncertainty(model)
+    state = simulator.rest(still)
+    factor = CovarianceFactor(model, unc, rank=24)
+    factor.start(state.key, state.mesh, BETA, ALPHA, model.parameters, state.unknowns[-1])
+    assert factor.theta[unc.force, unc.force].diagonal() == pytest.approx([1e-3] * 3)
+    factor.theta[unc.force] = 0.0  # the force is gone, and what it has done remains
+    found = []
+    for k in range(steps):
+        record = simulator.step(state, k * DT, lambda t: still, record="end").records[-1]
+        assert factor.propagate(record, model.parameters, DT)
+        found.append(factor.dnodes[-model_rows(model) :][:3, unc.force][:, :2].sum(axis=1))
+    error = np.linalg.norm(np.array(found) - expected, axis=1)
+    size = np.sqrt((expected**2).sum(axis=1).mean())
+    assert np.sqrt((error**2).mean()) < 0.01 * size
 
 
 def moving(t, turn=(0.0, 0.0)):
@@ -150,15 +191,14 @@ def test_the_factor_follows_finite_differences_of_the_simulation(robot, nodes, e
     par = model.parameters.copy()
     par[model.layout["force"]] = start.inputs.force
     factor.start(start.key, start.mesh, BETA, ALPHA, par, start.unknowns[-1])
-    for record in records[every - 1 :: every]:
-        assert factor.propagate(record, model.parameters, behind=(every - 1) * DT)
+    for done in records[every - 1 :: every]:
+        assert factor.propagate(done[-1], model.parameters, every * DT)
     weight = field_weights(model, factor.mesh, BETA)
     for name in (
         "youngs_modulus.tube1",
         "precurvature.tube2",
         "payload_mass.tube1",
         "density",
-        "base_viscous",
         "gravity_direction.1",
         "encoder_offset.tube2",
     ):
@@ -178,10 +218,10 @@ def test_the_factor_follows_finite_differences_of_the_simulation(robot, nodes, e
             expected = factor.interpolation.restrict @ expected
         difference = factor.fields[:, i] - expected
         error = np.sqrt((weight * difference**2).sum() / (weight * expected**2).sum())
-        assert error < 0.05, (name, error)
+        assert error < 0.04 * every, (name, error)  # the step is linearised at its end
         tip = factor.dnodes[-model_rows(model) :, i][:3]
         shift = ends[0].nodes[-1, :3] - ends[1].nodes[-1, :3]
-        assert np.linalg.norm(tip - shift) < 0.05 * np.linalg.norm(shift) + 1e-7, name
+        assert np.linalg.norm(tip - shift) < 0.04 * every * np.linalg.norm(shift) + 1e-7, name
 
 
 def test_energy_is_that_of_all_points(model):
@@ -190,8 +230,8 @@ def test_energy_is_that_of_all_points(model):
     start, _, records = simulated(model, model.parameters, (0.0, 0.0), 3)
     factor = CovarianceFactor(model, unc, rank=24)
     factor.start(start.key, start.mesh, BETA, ALPHA, model.parameters, start.unknowns[-1])
-    for record in records:
-        assert factor.propagate(record, model.parameters)
+    for done in records:
+        assert factor.propagate(done[-1], model.parameters, DT)
     weights = field_weights(model, factor.mesh, BETA)
     rows, roots = energy_rows(model, factor.mesh, BETA)
     assert len(rows) < 0.6 * np.count_nonzero(weights)
@@ -215,14 +255,14 @@ def test_a_checkpoint_of_the_factor_is_not_written_by_later_steps(model):
     factor.start(start.key, start.mesh, BETA, ALPHA, model.parameters, start.unknowns[-1])
     stored = factor.checkpoint()
     before = factor.fields.copy()
-    for record in records:
-        factor.propagate(record, model.parameters)
+    for done in records:
+        factor.propagate(done[-1], model.parameters, DT)
     factor.theta *= 0.5
     after = factor.fields.copy()
     factor.restore(stored)
     assert np.array_equal(factor.fields, before)
-    for record in records:
-        factor.propagate(record, model.parameters)
+    for done in records:
+        factor.propagate(done[-1], model.parameters, DT)
     assert np.array_equal(factor.fields, after)
 
 
@@ -232,19 +272,19 @@ def test_the_factor_stays_where_a_step_cannot_be_linearised(model, monkeypatch, 
     start, _, records = simulated(model, model.parameters, (0.0, 0.0), 3)
     factor = CovarianceFactor(model, model_uncertainty(model), rank=24)
     factor.start(start.key, start.mesh, BETA, ALPHA, model.parameters, start.unknowns[-1])
-    factor.propagate(records[0], model.parameters)
-    before = [np.copy(x) for x in (factor.stored, factor.dx, factor.dnodes)]
+    factor.propagate(records[0][-1], model.parameters, DT)
+    before = [np.copy(x) for x in (factor.fields, factor.dx, factor.dnodes)]
     if lent:
         factor.checkpoint()
 
     def failing(*arguments):
-        arguments[-1].fields[:, :, :8] = np.nan
+        arguments[-1].fields[:, :8] = np.nan
         return False
 
     with monkeypatch.context() as patch:
-        patch.setattr(factor_module, "theta_tangent", failing)
-        assert not factor.propagate(records[1], model.parameters)
-    for was, now in zip(before, (factor.stored, factor.dx, factor.dnodes), strict=True):
+        patch.setattr(factor_module, "rational_tangent", failing)
+        assert not factor.propagate(records[1][-1], model.parameters, DT)
+    for was, now in zip(before, (factor.fields, factor.dx, factor.dnodes), strict=True):
         assert np.array_equal(was, now)
-    assert factor.propagate(records[2], model.parameters)
-    assert np.isfinite(factor.stored).all()
+    assert factor.propagate(records[2][-1], model.parameters, DT)
+    assert np.isfinite(factor.fields).all()

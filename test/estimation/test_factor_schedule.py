@@ -12,6 +12,7 @@ KEY, OTHER = ((0,), (4,)), ((0, 1), (4, 4))
 def started():
     schedule = FactorSchedule()
     schedule.start(KEY)
+    schedule.most_skipped = 2
     return schedule
 
 

@@ -26,7 +26,7 @@ def run(policy, until=0.6, poses=True):
 def standing(made):
     """All numbers that both runs stand at."""
     ekf, open_loop = made.runs.fused.ekf, made.runs.open_loop
-    arrays = made.runs.fused.state.bank, open_loop.state.bank, ekf.pi, ekf.theta, ekf.bias, ekf.factor.stored
+    arrays = made.runs.fused.state.bank, open_loop.state.bank, ekf.pi, ekf.theta, ekf.bias, ekf.factor.fields
     tips = ekf.tips.last.mean, open_loop.tips.last.mean
     return [array.tobytes() for array in (*arrays, *tips)], made.inputs.measurements.fused()
 

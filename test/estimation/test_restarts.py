@@ -51,7 +51,7 @@ def test_a_reinitialised_filter_begins_with_the_parameters_of_the_file(running):
             ekf.theta[0] = ekf.uncertainty.highest[0]
             ekf.simulator.parameters += ekf.uncertainty.effect[:, 0] * ekf.theta[0]
         ekf.start(state.copy(), t)
-        factors.append(ekf.factor.stored.copy())
+        factors.append(ekf.factor.fields.copy())
     np.testing.assert_array_equal(*factors)
 
 

@@ -16,19 +16,23 @@ from scipy.sparse import csr_array
 from ctr_dynamics.estimation.filter.energy_norm import EnergyNorm
 from ctr_dynamics.estimation.filter.factor_reduction import BasisChange
 from ctr_dynamics.estimation.filter.parameter_priors import ModelUncertainty
+from ctr_dynamics.estimation.filter.rational_step import FRACTIONS
+from ctr_dynamics.kernels.complex_linearise import complex_unknown_lanes
+from ctr_dynamics.kernels.complex_rates import COMPLEX
 from ctr_dynamics.kernels.covariance import position_deviations
 from ctr_dynamics.kernels.factor_operations import sparse_product
-from ctr_dynamics.kernels.kinds import lanes_for, lanes_free
+from ctr_dynamics.kernels.kinds import SIMD_WIDTH, Lanes, lanes_for, lanes_free, unknown_lanes
 from ctr_dynamics.kernels.layout import input_rows, state_rows
 from ctr_dynamics.kernels.linearise import linearise
 from ctr_dynamics.kernels.structures import (
     Derivatives,
     FiniteDifferences,
+    PartialFractions,
+    RationalBuffers,
     Solution,
     SolvedStep,
-    TangentBuffers,
 )
-from ctr_dynamics.kernels.tangent import theta_tangent
+from ctr_dynamics.kernels.tangent import rational_tangent
 from ctr_dynamics.model.mesh import Key, Mesh, build_mesh
 from ctr_dynamics.model.mesh_interpolation import MeshInterpolation, coarse_key, mesh_interpolation
 from ctr_dynamics.model.model import Model
@@ -37,7 +41,7 @@ from ctr_dynamics.model.simulator import Record
 
 Floats = NDArray[np.float64]
 FACTOR_NODES = 12  # of the factor's sections: fused errors of a model with 100 nodes change by less than 1 um
-EPSILON = 5e-9  # of one standard deviation: small against the curvature of the step, large against rounding
+EPSILON = 1e-6  # of one standard deviation: small against the curvature of the step, large against rounding
 
 
 def carried(matrix: csr_array, values: Floats) -> Floats:
@@ -54,7 +58,7 @@ class FactorState(NamedTuple):
     interpolation: MeshInterpolation | None
     beta: Floats
     theta: Floats
-    stored: Floats
+    fields: Floats
     dnodes: Floats
     dx: Floats
 
@@ -68,7 +72,8 @@ class CovarianceFactor:
         rank: columns that V has at least after a reduction.
 
     Attributes:
-        stored: (2, fields, r) rows of the fields and of their rates.
+        fields: (fields, r) rows of the fields.
+        fraction: the rational function by which it follows the model.
         theta: (n_theta, r) rows of the parameters.
         dnodes: (nodes * S, r) rows of the node states after the last step.
         dx: (5 + N, r) rows of the shooting's unknowns after the last step.
@@ -81,7 +86,9 @@ class CovarianceFactor:
         # lanes that would idle beside them in the tangent's sweep carry columns too
         self.rank = rank + lanes_free(1 + model.unknown_count + rank)
         self._effect = csr_array(uncertainty.effect)
-        self._work: dict[tuple, tuple] = {}
+        self._work: dict[tuple[Key, int], RationalBuffers] = {}
+        self._lanes = Lanes(unknown_lanes(model.kind).count + SIMD_WIDTH, SIMD_WIDTH)
+        self.fraction: PartialFractions = FRACTIONS[3]
         self._differences = FiniteDifferences(EPSILON, model.tangent_perturbation)
         self._coarse: dict[Key, tuple[Key, Mesh, MeshInterpolation | None]] = {}
         self.interpolation: MeshInterpolation | None = None
@@ -90,8 +97,8 @@ class CovarianceFactor:
         self.mesh: Mesh | None = None
         self.beta = np.zeros(model.n)
         self._deviation: tuple[Floats, Floats, Floats] | None = None  # dnodes, pi, and what follows from them
-        self._lent = False  # whether a checkpoint holds `stored`
-        self._spare = self._nothing = np.empty((0, 0, 0))  # room for the next `stored`
+        self._lent = False  # whether a checkpoint holds `fields`
+        self._spare = self._nothing = np.empty((0, 0))  # room for the next `fields`
 
     def start(self, key: tuple, mesh: Mesh, beta: Floats, alpha: Floats, par: Floats, x: Floats) -> Floats:
         """The static equilibrium's derivative by every uncertain parameter times its deviation; returns Pi_aa (r, r).
@@ -132,18 +139,13 @@ class CovarianceFactor:
         wide = max(count, r)
         self.theta = np.zeros((count, wide))
         self.theta[:, :count] = np.diag(scale)
-        self.stored = np.zeros((2, main + base, wide))
-        self.stored[0, :, :count] = fields
+        self.fields = np.zeros((main + base, wide))
+        self.fields[:, :count] = fields
         self.dnodes, self.dx = np.zeros((len(dnodes), wide)), np.zeros((m, wide))
         self.dnodes[:, :count], self.dx[:, :count] = dnodes, dx
         variance = np.zeros(wide)
         variance[:count] = np.where(unc.sigma > 0, 1.0, 0.0)
         return np.diag(variance)
-
-    @property
-    def fields(self) -> Floats:
-        """(fields, r) columns of the fields."""
-        return self.stored[0]
 
     def _coarse_sections(
         self, key: Key, mesh: Mesh, beta: Floats
@@ -166,56 +168,47 @@ class CovarianceFactor:
     def _remap(self, key: Key, mesh: Mesh, beta: Floats) -> None:
         """Carry the fields' rows to another set of sections."""
         assert self.mesh is not None
-        self.stored = remap_columns(self.model.n, self.stored, self.mesh, self.beta, mesh, beta)
+        self.fields = remap_columns(self.model.n, self.fields[None], self.mesh, self.beta, mesh, beta)[0]
 
-    def propagate(self, records: tuple[Record, ...], par: Floats, behind: float = 0.0) -> bool:
-        """Move V with the tangent of the solved (sub)steps in ``records``; False where one cannot be linearised, and V then stays.
+    def propagate(self, record: Record, par: Floats, over_s: float) -> bool:
+        """Move V over ``over_s`` (s), with the dynamics linearised at the end of the solved (sub)step ``record``.
 
-        ``par`` (NP,): the parameter block. ``behind``: s, time before them that V has not followed yet.
+        ``par`` (NP,): the parameter block. Returns False where that cannot be linearised, and V then stays.
         """
-        model = self.model
-        m = model.unknown_count
-        dpar = carried(self._effect, self.theta)
-        for record in records:
-            beta = record.inputs[-1, input_rows(model.n)["beta"]]
-            key, mesh, interpolation = self._coarse_sections(record.key, record.mesh, beta)
-            if key != self.key:
-                self._remap(key, mesh, beta)
-            self.key, self.mesh, self.interpolation, self.beta = key, mesh, interpolation, beta
-            after, rate = record.after, record.rates[-1]
-            if interpolation is not None:
-                after, rate = carried(interpolation.restrict, after), carried(interpolation.restrict, rate)
-            columns = self.theta.shape[1]
-            work_key = (key, columns)
-            if work_key not in self._work:
-                lanes = lanes_for(1 + m + columns)
-                sweep = model.sweep_buffers(mesh, lanes.count)
-                main, base = len(sweep.history) // lanes.count, len(sweep.base_history) // lanes.count
-                buffers = TangentBuffers(
-                    sweep, np.zeros(main), np.zeros(base), np.zeros((0, 0)), np.zeros((0, 0)), np.zeros((main + base, columns))
-                )  # fmt: skip
-                self._work[work_key] = (
-                    lanes,
-                    buffers,
-                    np.zeros((m, m)),
-                    (len(sweep.nodes) // lanes.count, columns),
-                )
-            lanes, buffers, inverse, shape = self._work[work_key]
-            # not in place: where a stage cannot be linearised, V stays as it is
-            stored = self._spare if self._spare.shape == self.stored.shape else np.empty_like(self.stored)
-            dx, dnodes = np.empty((m, columns)), np.empty(shape)
-            done = SolvedStep(par.copy(), record.inputs, record.found, record.before, rate[None], after)
-            ok = theta_tangent(
-                model.kind, lanes, mesh, record.scheme.dt + behind, done, dpar, self._differences, buffers, self.stored,
-                Derivatives(inverse, dx, stored, dnodes),
-            )  # fmt: skip
-            if not ok:
-                self._spare = stored
-                return False
-            self._spare = self._nothing if self._lent else self.stored
-            self.stored, self.dx, self.dnodes, self._lent = stored, dx, dnodes, False
-            behind = 0.0
+        model, m = self.model, self.model.unknown_count
+        beta = record.inputs[-1, input_rows(model.n)["beta"]]
+        key, mesh, interpolation = self._coarse_sections(record.key, record.mesh, beta)
+        if key != self.key:
+            self._remap(key, mesh, beta)
+        self.key, self.mesh, self.interpolation, self.beta = key, mesh, interpolation, beta
+        rates = record.rates[-1]
+        if interpolation is not None:
+            rates = carried(interpolation.restrict, rates)
+        # not in place: where the step cannot be linearised, V stays as it is
+        fields = self._spare if self._spare.shape == self.fields.shape else np.empty_like(self.fields)
+        buffers, columns = self._buffers(key, mesh), self.fields.shape[1]
+        dx, dnodes = np.empty((m, columns)), np.empty((len(buffers.far.nodes) // COMPLEX.count, columns))
+        if not rational_tangent(
+            model.kind, self._lanes, mesh, self.fraction, over_s,
+            SolvedStep(par.copy(), record.inputs, record.found, record.before, rates[None], record.after),
+            carried(self._effect, self.theta), self.fields, self._differences, buffers,
+            Derivatives(np.empty((m, m)), dx, fields, dnodes),
+        ):  # fmt: skip
+            self._spare = fields
+            return False
+        self._spare = self._nothing if self._lent else self.fields
+        self.fields, self.dx, self.dnodes, self._lent = fields, dx, dnodes, False
         return True
+
+    def _buffers(self, key: Key, mesh: Mesh) -> RationalBuffers:
+        """Buffers of the tangent for the columns on the sections ``key``, ``mesh``."""
+        at = key, self.fields.shape[1]
+        if at not in self._work:
+            model = self.model
+            counts = 1, self._lanes.count, complex_unknown_lanes(model.kind).count, COMPLEX.count
+            single, real, near, far = (model.sweep_buffers(mesh, count) for count in counts)
+            self._work[at] = RationalBuffers(single, real, near, far, np.zeros(self.fields.shape))
+        return self._work[at]
 
     def fields_change(self, a: Floats) -> Floats:
         """(fields,) change of the model's fields by the coefficients ``a`` (r,)."""
@@ -242,8 +235,7 @@ class CovarianceFactor:
     def change_basis(self, change: BasisChange) -> None:
         """Go over to other coefficients."""
         self.theta = change(self.theta)
-        _, fields, columns = self.stored.shape
-        self.stored = change(self.stored.reshape(-1, columns)).reshape(2, fields, -1)
+        self.fields = change(self.fields)
         self.dnodes, self.dx = change(self.dnodes), change(self.dx)
 
     def energy(self) -> Floats:
@@ -260,13 +252,13 @@ class CovarianceFactor:
             self.interpolation,
             self.beta,
             self.theta.copy(),
-            self.stored,
+            self.fields,
             self.dnodes,
             self.dx,
         )
 
     def restore(self, state: FactorState) -> None:
         """Return to a checkpoint."""
-        self.key, self.mesh, self.interpolation, self.beta, theta, self.stored, self.dnodes, self.dx = state
+        self.key, self.mesh, self.interpolation, self.beta, theta, self.fields, self.dnodes, self.dx = state
         self._lent = True
         self.theta = theta.copy()

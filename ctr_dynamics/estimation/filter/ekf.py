@@ -26,6 +26,7 @@ from ctr_dynamics.estimation.filter.filter_records import (
 from ctr_dynamics.estimation.filter.gating import Gate
 from ctr_dynamics.estimation.filter.parameter_priors import model_uncertainty
 from ctr_dynamics.estimation.filter.process_noise import ProcessNoise
+from ctr_dynamics.estimation.filter.rational_step import ColumnStrides, exposed
 from ctr_dynamics.estimation.filter.tip_window import TipWindow, insertion_fraction
 from ctr_dynamics.estimation.step_output import FUSION_OFF
 from ctr_dynamics.kernels.factor_operations import move_unknowns
@@ -76,6 +77,7 @@ class RodEkf:
         self.adapted = AdaptedVariances(force, noise, self.model.robot.tubes[0].length)
         self._noise = ProcessNoise(self.model.robot, dt, self._force, options.force_time, self.adapted)
         self.schedule = FactorSchedule()
+        self._strides: ColumnStrides | None = None
         self.gate = Gate(options.gate)
         self.insertion_fraction = insertion_fraction(self.model)
         self._filters: dict[tuple[int, int], ExtendedKalmanFilter] = {}
@@ -89,6 +91,8 @@ class RodEkf:
         pi_aa = self.factor.start(
             state.key, state.mesh, inputs.beta, inputs.alpha, self._block(inputs), state.unknowns[-1]
         )
+        if self._strides is None:  # of the first start; the exposed length tells how they change
+            self._strides = ColumnStrides.of(self.model, state, self._block(inputs), self.simulator.scheme.dt)
         r = len(pi_aa)
         self.bias[:] = 0.0
         self.pi = np.zeros((r + STATES, r + STATES))
@@ -109,6 +113,7 @@ class RodEkf:
         par = self.simulator.parameters.copy()
         layout = self.model.layout
         par[layout["force"]], par[layout["torque"]] = inputs.force, inputs.torque
+        par[layout["alpha"]], par[layout["beta"]], par[layout["alpha_rate"]] = inputs.alpha, inputs.beta, 0.0
         return par
 
     def forget_parameters(self) -> None:
@@ -142,16 +147,19 @@ class RodEkf:
         self._noise.decay_force(self.theta, self.factor)
         # 3. Is the factor propagated now, or later over this step and the next?
         skipped, records = self.schedule.skipped, result.records
+        assert self._strides is not None
+        stride = self._strides.at(exposed(self.model, state))
+        self.schedule.most_skipped = stride.steps - 1
         propagate = self.schedule.plan_step(
             records[0].key, records[-1].key, len(records) > 1, measured, idle, self.adapted.fraction
         )
-        # 4. V <- A V over this step and those that were skipped. A step that is divided at a slope discontinuity of the load is followed in its
-        #    parts. A step that was too hard to be taken at once is followed by its last part alone.
+        # 4. V <- A V over this step and those that were skipped. A step that is divided, at a slope discontinuity of the load or because it was too
+        #    hard to be taken at once, is followed by its last part.
         ok = True
         if propagate:
-            followed = records if result.substeps > 1 else records[-1:]
-            behind = self.simulator.scheme.dt * (skipped + 1) - sum(record.scheme.dt for record in followed)
-            ok = self.factor.propagate(followed, self.simulator.parameters, behind)
+            self.factor.fraction = stride.fraction
+            over_s = self.simulator.scheme.dt * (skipped + 1)
+            ok = self.factor.propagate(records[-1], self.simulator.parameters, over_s)
         # 5. The tip of this step; those of skipped steps get columns between their neighbours'.
         self._append_tip(state, stamp)
         if propagate and skipped:

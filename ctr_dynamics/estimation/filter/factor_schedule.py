@@ -18,14 +18,12 @@ class ScheduleOptions:
     """Figures of the schedule, in steps.
 
     Attributes:
-        most_skipped: steps that the factor may skip. That moves the fused tip by 2 um on clean bags, and by 6 um at most.
         fewest: between two reductions, where a correction lies between.
         most: between two reductions, without a correction. The drift and the tip force change little meanwhile.
         apart: between a correction and a reduction where measurements leave that room. Of the steps that one joint state covers none does both.
         strong: fraction of an innovation's variance. Where the tip force has more, every step is propagated and reductions come twice as often.
     """
 
-    most_skipped: int = 2
     fewest: int = 14
     most: int = 28
     apart: int = 4
@@ -51,6 +49,7 @@ class FactorSchedule:
         skipped: steps that the factor has not followed yet.
         sections: those of the last step that it has followed.
         reduction_due: whether process noise is to be added and the factor reduced before the next step.
+        most_skipped: steps that the factor may skip (:mod:`ctr_dynamics.estimation.filter.rational_step`).
     """
 
     options: ScheduleOptions = field(default_factory=ScheduleOptions)
@@ -59,6 +58,7 @@ class FactorSchedule:
     skipped: int = 0
     sections: Key = ((), ())
     reduction_due: bool = False
+    most_skipped: int = 0
 
     def start(self, sections: Key) -> None:
         """Begin with a factor on ``sections`` that is reduced and follows all steps."""
@@ -94,7 +94,7 @@ class FactorSchedule:
         )
         propagate = (
             strong
-            or self.skipped >= options.most_skipped
+            or self.skipped >= self.most_skipped
             or measured
             or self.reduction_due
             or first != self.sections

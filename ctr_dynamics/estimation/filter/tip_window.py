@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctr_dynamics.estimation.filter.factor_reduction import BasisChange
+from ctr_dynamics.estimation.filter.rational_step import MOST_STEPS
 from ctr_dynamics.kernels.tip_kinematics import interpolate_columns, shift_tips, tip_between, tip_from_node
 from ctr_dynamics.model.model import Model
 from ctr_dynamics.sensing import Tip
@@ -41,7 +42,7 @@ class TipWindow:
     """
 
     MORE = 64  # rows of room: the window is then moved every 0.2 s
-    OPEN = 3  # newest rows whose columns may change yet: the factor skips two steps at most
+    OPEN = MOST_STEPS  # newest rows whose columns may change yet: the factor skips one step less at most
 
     def __init__(self, steps: int) -> None:
         self.size = steps
