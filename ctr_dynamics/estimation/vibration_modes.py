@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg.lapack import dgeev
 
-from ctr_dynamics.estimation.filter.energy_norm import field_weights
+from ctr_dynamics.estimation.energy_norm import field_weights
 from ctr_dynamics.estimation.step_output import Modes
 from ctr_dynamics.kernels.kinds import Lanes, lanes_for
 from ctr_dynamics.kernels.linearise import linearise

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import ctr_dynamics.estimation.filter.covariance_factor as factor_module
+from ctr_dynamics.estimation.energy_norm import energy_rows, field_weights
 from ctr_dynamics.estimation.filter.covariance_factor import CovarianceFactor
-from ctr_dynamics.estimation.filter.energy_norm import energy_rows, field_weights
 from ctr_dynamics.estimation.filter.parameter_priors import model_uncertainty
 from ctr_dynamics.kernels.layout import base_field_count
 from ctr_dynamics.model.mesh import build_mesh

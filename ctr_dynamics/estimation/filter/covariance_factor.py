@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
-from ctr_dynamics.estimation.filter.energy_norm import EnergyNorm
+from ctr_dynamics.estimation.energy_norm import EnergyNorm
 from ctr_dynamics.estimation.filter.factor_reduction import BasisChange
 from ctr_dynamics.estimation.filter.parameter_priors import ModelUncertainty
 from ctr_dynamics.estimation.filter.rational_step import FRACTIONS
