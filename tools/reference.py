@@ -216,7 +216,7 @@ def render() -> str:
         "## Commands",
         "",
         "Exit codes: 0 finished; 1 finished, but some rows or steps failed (they are named) or next to nothing was estimated; 2 bad",
-        "arguments or input, with one line that says what; 130 interrupted.",
+        "arguments or input, with one line that says what; 130 interrupted or terminated.",
         "",
     ]
     for name, command in commands():

@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import inspect
 import os
+import signal
 import sys
 import warnings
 from collections.abc import Callable, Sequence
@@ -12,6 +13,7 @@ from dataclasses import is_dataclass
 from importlib import import_module
 from importlib.util import find_spec
 from keyword import iskeyword
+from types import FrameType
 from typing import Annotated, Any, TextIO
 
 import typer
@@ -163,6 +165,21 @@ def _discard_output() -> None:
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
+def _interrupt_on_termination() -> None:
+    """Have SIGTERM end a command as Ctrl-C does, so that it leaves no parts of files behind."""
+    process = os.getpid()
+
+    def interrupt(number: int, frame: FrameType | None) -> None:
+        if os.getpid() != process:  # a worker that was forked later
+            os._exit(128 + number)
+        fail("terminated")
+        raise SystemExit(
+            INTERRUPTED
+        )  # a KeyboardInterrupt inside an import would have Python kill itself at exit
+
+    signal.signal(signal.SIGTERM, interrupt)
+
+
 def _unwritable(error: OSError) -> int:
     fail(f"standard output cannot be written ({error.strerror})")
     _discard_output()
@@ -191,12 +208,15 @@ def main(argv: list[str] | None = None) -> int:
         argv: arguments without the program's name; None takes the process's.
 
     Returns:
-        0 finished, 1 finished but some rows or steps failed or next to nothing was estimated, 2 bad arguments or input, 130 interrupted.
+        0 finished, 1 finished but some rows or steps failed or next to nothing was estimated, 2 bad input,
+        130 interrupted or terminated.
     """
     for stream in (sys.stdout, sys.stderr):
         # terminals of few characters, and names of files that are not UTF-8
         getattr(stream, "reconfigure", lambda **_: None)(errors="backslashreplace")
     one_blas_thread()
+    if argv is None:
+        _interrupt_on_termination()
     arguments = sys.argv[1:] if argv is None else argv
     requested = next((a for a in arguments if not a.startswith("-")), None)
     arguments = spread(arguments, MANY.get(requested or "", ()))

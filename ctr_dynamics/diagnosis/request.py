@@ -10,16 +10,18 @@ import yaml
 
 from ctr_dynamics.diagnosis.kernel_warm_up import warm_up
 from ctr_dynamics.diagnosis.next_experiment import NextExperiment, next_experiment
-from ctr_dynamics.diagnosis.output.findings import findings, write
+from ctr_dynamics.diagnosis.output.findings import EXTENDED, FINDINGS, RECALIBRATED, findings, write
 from ctr_dynamics.diagnosis.output.findings_report import write_report
 from ctr_dynamics.diagnosis.pipeline import diagnose_recordings
 from ctr_dynamics.diagnosis.recording import Recording, read_recording
 from ctr_dynamics.diagnosis.run_context import RunContext
 from ctr_dynamics.errors import InputError
-from ctr_dynamics.io.atomic_files import atomic_file, output_folder
+from ctr_dynamics.io.atomic_files import atomic_file, output_folder, replaced_files
 from ctr_dynamics.robot import Robot
 
-SCENARIO = "next_experiment.yaml"
+SCENARIO, REPORT = "next_experiment.yaml", "report.html"
+# All that a diagnosis may write; the findings, which name the others, take their place last.
+FILES = (RECALIBRATED, EXTENDED, SCENARIO, REPORT, FINDINGS)
 
 
 @dataclass(frozen=True)
@@ -57,11 +59,13 @@ def run(request: Request, context: RunContext | None = None) -> dict[str, Any]:
             "without a validation bag the gain is not measured, and a wrong cause that fits is not found out"
         )
     context.report("next experiment")
-    content = findings(diagnosis, request.command, _write_scenario(next_experiment(diagnosis), directory))
-    write(directory, diagnosis, content)
-    if request.report:
-        context.report("report")
-        write_report(directory / "report.html", diagnosis, content)
+    proposed = next_experiment(diagnosis)
+    with replaced_files(directory, FILES) as staged:
+        content = findings(diagnosis, request.command, _write_scenario(proposed, staged))
+        write(staged, diagnosis, content)
+        if request.report:
+            context.report("report")
+            write_report(staged / REPORT, diagnosis, content)
     return content
 
 

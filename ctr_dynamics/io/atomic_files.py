@@ -6,7 +6,7 @@ import contextlib
 import os
 import shutil
 import tempfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 from ctr_dynamics.errors import InputError
@@ -85,6 +85,32 @@ def atomic_file(path: Path) -> Iterator[Path]:
         raise InputError(f"cannot be written ({error.strerror})", where=str(path)) from None
     finally:
         temporary.unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def replaced_files(folder: Path, names: Sequence[str]) -> Iterator[Path]:
+    """A temporary folder inside ``folder``, whose files take the place of all of ``names`` there on success, in that order.
+
+    A name that was not written this time is removed from ``folder``: what stays belongs together. Other files are left alone. On failure
+    nothing has changed.
+
+    Raises:
+        InputError: ``folder`` cannot be made or written to.
+    """
+    folder = output_folder(Path(folder))
+    staged = folder / f".{os.getpid()}.part"
+    try:
+        staged.mkdir()
+        yield staged
+        for name in names:
+            if (staged / name).exists():
+                os.replace(staged / name, folder / name)
+            else:
+                (folder / name).unlink(missing_ok=True)
+    except OSError as error:
+        raise InputError(f"cannot be written ({error.strerror})", where=str(folder)) from None
+    finally:
+        shutil.rmtree(staged, ignore_errors=True)
 
 
 def check_targets(targets: Mapping[str, str | Path | None], read: Mapping[str, str | Path | None]) -> None:

@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+import time
 import types
 import warnings
 from pathlib import Path
@@ -155,3 +156,31 @@ def test_warnings_of_the_package_are_one_line_and_those_of_others_keep_their_pla
     )
     assert other.endswith("RuntimeWarning: of another")
     assert Path(__file__).name in other
+
+
+def test_termination_leaves_no_parts_of_files(tmp_path):
+    """SIGTERM in the middle of a simulation ends it as Ctrl-C does."""
+    command = [
+        sys.executable,
+        "-m",
+        "ctr_dynamics.cli.main",
+        "simulate",
+        "sweep",
+        "--robot",
+        "till2020_tissue",
+    ]
+    process = subprocess.Popen(
+        [*command, "--output", str(tmp_path / "out.mcap")], stderr=subprocess.PIPE, text=True
+    )
+    try:
+        deadline = time.monotonic() + 60.0
+        while not list(tmp_path.iterdir()) and process.poll() is None and time.monotonic() < deadline:
+            time.sleep(0.02)
+        assert [path.suffix for path in tmp_path.iterdir()] == [".part"]
+        process.terminate()
+        error = process.communicate(timeout=60.0)[1]
+    finally:
+        process.kill()
+    assert process.returncode == 130, error
+    assert error.endswith("ctr-dynamics: error: terminated\n")
+    assert list(tmp_path.iterdir()) == []

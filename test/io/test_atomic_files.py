@@ -6,7 +6,7 @@ import threading
 import pytest
 
 from ctr_dynamics.errors import InputError
-from ctr_dynamics.io.atomic_files import atomic_file, check_targets
+from ctr_dynamics.io.atomic_files import atomic_file, check_targets, replaced_files
 
 
 def put(path, text="new"):
@@ -67,3 +67,26 @@ def test_a_device_or_pipe_is_written_into(tmp_path):
     reader.join(10.0)
     assert heard == ["new"]
     assert [p.name for p in tmp_path.iterdir()] == ["pipe"]
+
+
+def test_a_set_of_files_is_replaced_whole(tmp_path):
+    for name in ("a.json", "b.yaml", "mine.txt"):
+        (tmp_path / name).write_text("old")
+    with replaced_files(tmp_path, ("b.yaml", "c.html", "a.json")) as staged:
+        (staged / "a.json").write_text("new")
+        (staged / "c.html").write_text("new")
+        assert (tmp_path / "a.json").read_text() == "old"
+    found = {path.name: path.read_text() for path in tmp_path.iterdir()}
+    assert found == {"a.json": "new", "c.html": "new", "mine.txt": "old"}
+
+
+def test_a_set_of_files_that_was_not_finished_changes_nothing(tmp_path):
+    (tmp_path / "a.json").write_text("old")
+
+    def interrupted(staged):
+        (staged / "a.json").write_text("new")
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt), replaced_files(tmp_path, ("a.json",)) as staged:
+        interrupted(staged)
+    assert {path.name: path.read_text() for path in tmp_path.iterdir()} == {"a.json": "old"}

@@ -25,7 +25,9 @@ from ctr_dynamics.runtime.replay import plain
 
 Floats = NDArray[np.float64]
 SCHEMA = "ctr_dynamics/findings/1"
-RECALIBRATED, EXTENDED = "recalibrated_robot.yaml", "extended_robot.yaml"
+RECALIBRATED: str = "recalibrated_robot.yaml"
+EXTENDED: str = "extended_robot.yaml"
+FINDINGS: str = "findings.json"
 
 
 def interval(q: EffectQuantity, value: float, sigma: float, width: float) -> list[float | None]:
@@ -154,9 +156,7 @@ def write(directory: Path, diagnosis: Diagnosis, content: dict[str, Any]) -> Non
         effects = ", ".join(c.effect for c in diagnosis.causes if c.effect in EFFECTS) or "no cause"
         extended = robot_with(robot, diagnosis.extended, f"{name}_extended", f"extended by {effects}")
         _text(directory / EXTENDED, robot_to_yaml(extended))
-    _text(
-        directory / "findings.json", json.dumps(content, indent=1, allow_nan=False, ensure_ascii=False) + "\n"
-    )
+    _text(directory / FINDINGS, json.dumps(content, indent=1, allow_nan=False, ensure_ascii=False) + "\n")
 
 
 def _text(path: Path, text: str) -> None:
