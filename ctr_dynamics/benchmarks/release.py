@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from ctr_dynamics.model import trajectory
 from ctr_dynamics.model.model import Model
 from ctr_dynamics.model.simulator import Inputs, Simulator
-from ctr_dynamics.model.time_scheme import make_scheme
+from ctr_dynamics.model.time_scheme import make_scheme, scheme_of
 from ctr_dynamics.robot import Robot
 from ctr_dynamics.robot_files import load_robot
 from ctr_dynamics.simulation import load_scenario
@@ -139,7 +139,7 @@ def divided(test: Release, dt: float, nodes: int, duration: float, tolerance: fl
 
 def run(test: Release, scheme: str, dt: float, nodes: int, duration: float, tolerance: float = 1e-7) -> Path:
     """Simulate the release at a fixed step, from Python one step at a time."""
-    simulator = Simulator(Model(release_robot(), nodes=nodes), make_scheme(scheme, dt), tolerance=tolerance)
+    simulator = Simulator(Model(release_robot(), nodes=nodes), scheme_of(scheme, dt), tolerance=tolerance)
     state = simulator.rest(test.at(0.0))
     tips = [state.nodes[-1, :3].copy()]
     sweeps = jacobians = 0

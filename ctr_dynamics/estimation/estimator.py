@@ -247,7 +247,7 @@ class Estimator:
             self._stability_due = False
             now = runs.fused.state.inputs
             self.health.stability = self._stability.update(
-                seconds(self.k), now.beta, now.alpha, now.force, now.torque, guess=runs.fused.state.unknowns[-1]
+                seconds(self.k), now.beta, now.alpha, now.force, now.torque, guess=runs.fused.state.unknowns_at_base
             )  # fmt: skip
         else:
             self._modes.refresh(runs.fused.state, runs.fused.simulator.parameters)

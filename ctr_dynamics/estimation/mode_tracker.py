@@ -110,7 +110,7 @@ class ModeTracker:
             now.alpha,
             now.force,
             now.torque,
-            guess=state.unknowns[-1],
+            guess=state.unknowns_at_base,
             parameters=parameters,
             key=state.key,
         )

@@ -19,10 +19,11 @@ from ctr_dynamics.estimation.monitoring.health import Health
 from ctr_dynamics.estimation.monitoring.innovation_log import InnovationLog
 from ctr_dynamics.estimation.open_loop import OpenLoopRun
 from ctr_dynamics.estimation.timeline import DT, seconds
+from ctr_dynamics.model.collocation_pair import CollocationPair
 from ctr_dynamics.model.model import Model
 from ctr_dynamics.model.paired_steps import PairedSteps
 from ctr_dynamics.model.simulator import Simulator, StepResult
-from ctr_dynamics.model.time_scheme import make_scheme
+from ctr_dynamics.model.time_scheme import Collocation, scheme_of
 from ctr_dynamics.parameters import Settings
 
 Floats = NDArray[np.float64]
@@ -47,10 +48,11 @@ class Runs:
         self, model: Model, settings: Settings, inputs: InputBuffer, health: Health, innovations: InnovationLog
     ) -> None:  # fmt: skip
         self._inputs, self._health = inputs, health
-        scheme = make_scheme(str(settings["model.scheme"]), DT, float(settings["model.alpha"]))
+        scheme = scheme_of(str(settings["model.scheme"]), DT, float(settings["model.alpha"]))
         tolerance = float(settings["model.tolerance"])
         corrected, nominal = Simulator(model, scheme, tolerance), Simulator(model, scheme, tolerance)
-        self._pair = PairedSteps(corrected, nominal)
+        paired = CollocationPair if isinstance(scheme, Collocation) else PairedSteps
+        self._pair: CollocationPair | PairedSteps = paired(corrected, nominal)
         self._interpolated = InterpolatedInputs(model, inputs)
         load = np.zeros(model.input_count)  # of the robot file
         load[3 * model.n : 3 * model.n + 3] = model.plant.tip_force

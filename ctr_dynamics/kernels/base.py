@@ -46,7 +46,7 @@ def below_base(kind, W, c0, cells, ust_base, x, base_history, base_fields):
                 W[HI] = base_history[point]
                 W[HI + 1] = base_history[point + 1]
                 psi_t = W[A + 1]
-                u = damped(c0, gj, bt, W[A + 2] + W[US] * uz_ref - bt * W[HI + 1])
+                u = damped(c0, i, gj, bt, W[A + 2] + W[US] * uz_ref - bt * W[HI + 1])
                 kv = c0 * u + W[HI + 1] + base_stretch(kind, W, i, W[BE], u)
                 km = 2.0 * W[RI] * (c0 * psi_t + W[HI])
                 W[OU] = psi_t
@@ -67,7 +67,7 @@ def below_base(kind, W, c0, cells, ust_base, x, base_history, base_fields):
         end = (i * points + 4 * cells) * 2
         base_fields[end] = W[S + 1]
         load = W[S + 2] + gj * W[KS] * ust_base[i * points + 4 * cells] - bt * base_history[end + 1]
-        base_fields[end + 1] = damped(c0, gj, bt, load)
+        base_fields[end + 1] = damped(c0, i, gj, bt, load)
         W[Y + state.moment_z + i] = W[S + 2]
         if i == 0:
             half = 0.5 * W[S]

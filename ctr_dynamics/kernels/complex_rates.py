@@ -1,4 +1,4 @@
-"""Time derivatives y_t = c0 y + h with a real or a complex c0, and the few equations in which c0 stands on the left.
+"""Time derivatives y_t = c0 y + h with a real or a complex c0 or with that of coupled stages, and the few equations in which c0 stands on the left.
 
 A linearised problem with a complex c0 needs a real and an imaginary part of every perturbation. Both are lanes of one sweep: a batch of
 ``COMPLEX`` lanes holds eight real parts and behind them their eight imaginary parts. All arithmetic stays that of real lanes, each about the same
@@ -12,6 +12,7 @@ from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic, models, overload, register_model
 
+from ctr_dynamics.kernels.coupling import Coupling, inverse_of
 from ctr_dynamics.kernels.kinds import SIMD_WIDTH, Lanes
 from ctr_dynamics.kernels.simd import SimdBatch, fma
 
@@ -19,6 +20,7 @@ COMPLEX = Lanes(2 * SIMD_WIDTH, 2 * SIMD_WIDTH)
 # Passes between both axes of bending. Each leaves of the error the square of what couples the axes, by the stiffness: less than 1e-4 for the turning
 # of damped tubes, and the square of the ovality for oval ones.
 TURNING_PASSES, OVAL_PASSES = 2, 6
+STAGE_PASSES = 12  # of coupled stages, whose inverse knows nothing of the ovality: each leaves a share of the error as large as that
 
 INLINED = {"error_model": "numpy", "forceinline": True}
 
@@ -114,6 +116,9 @@ def _squared(c0):
     return lambda c0: c0 * c0
 
 
+# ``number`` says which inverse of a :class:`~ctr_dynamics.kernels.coupling.Coupling` is meant.
+
+
 def across(c0, damping, x, y):
     """``damping`` (x c0 y - y c0 x), nothing where c0 is real: the damping's part in the cross product of a curvature and its moment."""
     return 0.0
@@ -121,21 +126,21 @@ def across(c0, damping, x, y):
 
 @overload(across, jit_options=INLINED)
 def _across(c0, damping, x, y):
-    if isinstance(c0, ComplexRate):
+    if isinstance(c0, ComplexRate) or (isinstance(c0, Coupling) and c0.damped):
         return lambda c0, damping, x, y: damping * (x * (c0 * y) - y * (c0 * x))
     return across
 
 
-def damped(c0, stiffness, damping, load):
+def damped(c0, number, stiffness, damping, load):
     """The x of ``stiffness`` x + ``damping`` c0 x = ``load``."""
     return load * (1.0 / (stiffness + c0 * damping))
 
 
 @overload(damped, jit_options=INLINED)
-def _damped(c0, stiffness, damping, load):
+def _damped(c0, number, stiffness, damping, load):
     if isinstance(c0, ComplexRate):
 
-        def solve(c0, stiffness, damping, load):
+        def solve(c0, number, stiffness, damping, load):
             real, imag = parts(c0)
             a, b = stiffness + damping * real, damping * imag
             other = exchanged(a)
@@ -143,10 +148,26 @@ def _damped(c0, stiffness, damping, load):
             return (other * scale) * load - (b * scale) * turned(load)
 
         return solve
-    return lambda c0, stiffness, damping, load: load * (1.0 / (stiffness + c0 * damping))
+    if isinstance(c0, Coupling):
+        if c0.damped:
+            return lambda c0, number, stiffness, damping, load: inverse_of(c0, number) * load
+        return lambda c0, number, stiffness, damping, load: load * (1.0 / stiffness)
+    return damped
 
 
-def plane_curvature(c0, stiffness, damping, turning, mx, my):
+def damped_twice(c0, number, inertia, load):
+    """The x of x + ``inertia`` c0 c0 x = ``load``."""
+    return damped(squared(c0), number, 1.0, inertia, load)
+
+
+@overload(damped_twice, jit_options=INLINED)
+def _damped_twice(c0, number, inertia, load):
+    if isinstance(c0, Coupling):
+        return lambda c0, number, inertia, load: inverse_of(c0, number) * load
+    return damped_twice
+
+
+def plane_curvature(c0, number, stiffness, damping, turning, mx, my):
     """(u_x, u_y) of (``stiffness`` + ``damping`` c0) (u_x, u_y) + ``turning`` (u_y, -u_x) = (``mx``, ``my``)."""
     a = stiffness + c0 * damping
     d = 1.0 / (a * a + turning * turning)
@@ -154,36 +175,55 @@ def plane_curvature(c0, stiffness, damping, turning, mx, my):
 
 
 @overload(plane_curvature, jit_options=INLINED)
-def _plane_curvature(c0, stiffness, damping, turning, mx, my):
-    if isinstance(c0, ComplexRate):
+def _plane_curvature(c0, number, stiffness, damping, turning, mx, my):
+    if isinstance(c0, Coupling) and not c0.damped:
+        return lambda c0, number, stiffness, damping, turning, mx, my: (
+            mx * (1.0 / stiffness),
+            my * (1.0 / stiffness),
+        )
+    if isinstance(c0, (ComplexRate, Coupling)):
 
-        def iterate(c0, stiffness, damping, turning, mx, my):
-            ux, uy = damped(c0, stiffness, damping, mx), damped(c0, stiffness, damping, my)
+        def iterate(c0, number, stiffness, damping, turning, mx, my):
+            ux, uy = damped(c0, number, stiffness, damping, mx), damped(c0, number, stiffness, damping, my)
             for _ in range(TURNING_PASSES):
-                ux = damped(c0, stiffness, damping, mx - turning * uy)
-                uy = damped(c0, stiffness, damping, my + turning * ux)
+                ux = damped(c0, number, stiffness, damping, mx - turning * uy)
+                uy = damped(c0, number, stiffness, damping, my + turning * ux)
             return ux, uy
 
         return iterate
     return plane_curvature
 
 
-def oval_curvature(c0, k11, k12, k22, damping, turning, mx, my):
-    """The same with the stiffness [``k11``, ``k12``; ``k12``, ``k22``]."""
+def oval_curvature(c0, number, stiffness, k11, k12, k22, damping, turning, mx, my):
+    """The same with the stiffness [``k11``, ``k12``; ``k12``, ``k22``]; the inverse ``number`` is that with ``stiffness``."""
     a11, a12, a21, a22 = k11 + c0 * damping, k12 + turning, k12 - turning, k22 + c0 * damping
     d = 1.0 / (a11 * a22 - a12 * a21)
     return (a22 * mx - a12 * my) * d, (a11 * my - a21 * mx) * d
 
 
 @overload(oval_curvature, jit_options=INLINED)
-def _oval_curvature(c0, k11, k12, k22, damping, turning, mx, my):
+def _oval_curvature(c0, number, stiffness, k11, k12, k22, damping, turning, mx, my):
+    if isinstance(c0, Coupling):
+
+        def iterate_in_stages(c0, number, stiffness, k11, k12, k22, damping, turning, mx, my):
+            ux, uy = damped(c0, number, stiffness, damping, mx), damped(c0, number, stiffness, damping, my)
+            for _ in range(STAGE_PASSES):
+                ux = damped(c0, number, stiffness, damping, mx - (k11 - stiffness) * ux - (k12 + turning) * uy)
+                uy = damped(c0, number, stiffness, damping, my - (k22 - stiffness) * uy - (k12 - turning) * ux)
+            return ux, uy
+
+        def solve_undamped(c0, number, stiffness, k11, k12, k22, damping, turning, mx, my):
+            d = 1.0 / (k11 * k22 - k12 * k12)
+            return (k22 * mx - k12 * my) * d, (k11 * my - k12 * mx) * d
+
+        return iterate_in_stages if c0.damped else solve_undamped
     if isinstance(c0, ComplexRate):
 
-        def iterate(c0, k11, k12, k22, damping, turning, mx, my):
-            ux, uy = damped(c0, k11, damping, mx), damped(c0, k22, damping, my)
+        def iterate(c0, number, stiffness, k11, k12, k22, damping, turning, mx, my):
+            ux, uy = damped(c0, number, k11, damping, mx), damped(c0, number, k22, damping, my)
             for _ in range(OVAL_PASSES):
-                ux = damped(c0, k11, damping, mx - (k12 + turning) * uy)
-                uy = damped(c0, k22, damping, my - (k12 - turning) * ux)
+                ux = damped(c0, number, k11, damping, mx - (k12 + turning) * uy)
+                uy = damped(c0, number, k22, damping, my - (k12 - turning) * ux)
             return ux, uy
 
         return iterate

@@ -12,7 +12,7 @@ rates of beta, so that 0 is the plain model and 1 the full one.
 import math
 
 from ctr_dynamics.kernels.compiler import njit
-from ctr_dynamics.kernels.complex_rates import damped, oval_curvature, squared
+from ctr_dynamics.kernels.complex_rates import damped, damped_twice, oval_curvature
 from ctr_dynamics.kernels.layout import base_end_rows, field_rows, state_rows, workspace_rows
 from ctr_dynamics.kernels.plain_physics import keep_fields, weight
 from ctr_dynamics.kernels.simd import largest, where_above
@@ -81,7 +81,7 @@ def curvature(kind, W, present, ust, u0, c0):
         W[Ti] = ks * (c * vx_ - s * vy_)
         W[Ti + 1] = ks * (s * vx_ + c * vy_)
         gj, hu = W[GJi], W[HI + field.curvature_z + i]
-        uz = damped(c0, gj, W[BTi], W[Y + state.moment_z + i] + gj * ks * vz_ - W[BTi] * hu)
+        uz = damped(c0, i, gj, W[BTi], W[Y + state.moment_z + i] + gj * ks * vz_ - W[BTi] * hu)
         W[Ti + 2] = uz
         W[Ti + 3] = c0 * uz + hu
         # cos and sin of twice the angle of the major axis, times the ovality, in the frame of tube 1
@@ -97,7 +97,7 @@ def curvature(kind, W, present, ust, u0, c0):
     ux, uy = 0.0, 0.0
     for _ in range(SOFTENING_ITERATIONS if soft > 0.0 else 1):
         none = 0.0 * W[at.bending_stiffness]  # a number of the lanes from the start, as the compiler wants it
-        k11_all, k12_all, k22_all, bb_all, turning = none, none, none, none, none
+        k11_all, k12_all, k22_all, bb_all, turning, stiffness = none, none, none, none, none, none
         rx, ry = W[Y + state.moment_xy], W[Y + state.moment_xy + 1]
         for i in range(present):
             Ti = T + 7 * i
@@ -109,10 +109,11 @@ def curvature(kind, W, present, ust, u0, c0):
             k12_all += k12
             k22_all += k22
             bb_all += bb
+            stiffness += W[at.bending_stiffness + i]
             turning += bb * g
             rx += k11 * wx + k12 * wy - bb * hx
             ry += k12 * wx + k22 * wy - bb * hy
-        ux, uy = oval_curvature(c0, k11_all, k12_all, k22_all, bb_all, turning, rx, ry)
+        ux, uy = oval_curvature(c0, n + present - 1, stiffness, k11_all, k12_all, k22_all, bb_all, turning, rx, ry)
         if soft > 0.0:
             for i in range(present):
                 Ti = T + 7 * i
@@ -264,7 +265,7 @@ def drive(kind, W, c0, i, torque, angle, rate, base_history, base_fields):
     inertia = W[at.drive_inertia + i]
     h = base_history[row]
     load = c * (torque - inertia * (c0 * (rate + h) + base_history[first]))
-    give = damped(squared(c0), 1.0, c * inertia, load)
+    give = damped_twice(c0, 2 * n + i, c * inertia, load)
     base_fields[row] = give
     return angle + give, rate + c0 * give + h
 

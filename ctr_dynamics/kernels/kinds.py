@@ -38,7 +38,7 @@ from numba.extending import (
     unbox,
 )
 
-from ctr_dynamics.kernels.layout import unknown_rows
+from ctr_dynamics.kernels.layout import state_rows, unknown_rows
 
 SIMD_WIDTH = 8  # lanes of a batch: a line of the cache, and the longest vector of today's processors
 
@@ -111,6 +111,21 @@ def unknown_lanes(kind: RobotKind) -> Lanes:
     return lanes_for(1 + unknown_rows(kind.tubes).size)
 
 
+def first_cut_row(kind: RobotKind) -> int:
+    """First row of the state that is unknown at a cut of the mesh: without the position, where nothing at the tip depends on it."""
+    return 0 if kind.physics is Physics.EXTENDED else state_rows(kind.tubes).quaternion
+
+
+def cut_size(kind: RobotKind) -> int:
+    """Rows of the state that are unknown at a cut."""
+    return state_rows(kind.tubes).size - first_cut_row(kind)
+
+
+def segment_lanes(kind: RobotKind) -> Lanes:
+    """Lanes with room for a base case and one perturbation of each unknown row of a state, of all segments at once."""
+    return lanes_for(1 + cut_size(kind))
+
+
 def by_physics(plain: Any, extended: Any) -> Callable[..., Any]:
     """A function for kernels whose first argument is a :class:`RobotKind`: the kernel ``plain`` or ``extended``, chosen when it is compiled."""
 
@@ -155,7 +170,14 @@ def _attribute(context: Any, builder: Any, kind: Any, value: Any, name: str) -> 
     return ir.Constant(ir.IntType(64), kind.constants[name])
 
 
-@overload(unknown_lanes, strict=False)
-def _unknown_lanes(kind: Any) -> Any:
-    lanes = unknown_lanes(RobotKind(kind.constants["tubes"]))
-    return lambda kind: lanes
+def _of_kind(function: Callable[[RobotKind], Any]) -> None:
+    """In compiled code a constant."""
+
+    @overload(function, strict=False)
+    def of_kind(kind: Any) -> Any:
+        value = function(RobotKind(kind.constants["tubes"], kind.physics))
+        return lambda kind: value
+
+
+for _function in (unknown_lanes, first_cut_row, cut_size, segment_lanes):
+    _of_kind(_function)

@@ -39,7 +39,7 @@ def curvature(kind, W, present, ust, u0, c0):
                 wx, wy = c * wx - s * wy, s * wx + c * wy
             rx, ry = wx - W[BB] * W[hux], wy - W[BB] * W[huy]
             load = W[at.stage + state.moment_z + i] + (W[GJ] * W[KS]) * ust[u0 + 3 * i + 2] - W[BT] * W[HUZ]
-            uz = damped(c0, W[GJ], W[BT], load)
+            uz = damped(c0, i, W[GJ], W[BT], load)
             W[T], W[T + 1], W[T + 2], W[T + 3] = rx, ry, uz, c0 * uz + W[HUZ]
             if i == 0:
                 W[u + 2], W[u_t + 2] = uz, W[T + 3]
@@ -53,7 +53,7 @@ def curvature(kind, W, present, ust, u0, c0):
                 W[total + 2] += b
                 load_x += rx
                 load_y += ry
-    ux, uy = plane_curvature(c0, W[total], W[total + 1], W[total + 2], load_x, load_y)
+    ux, uy = plane_curvature(c0, n + present - 1, W[total], W[total + 1], W[total + 2], load_x, load_y)
     W[u], W[u + 1] = ux, uy
     W[u_t], W[u_t + 1] = c0 * ux + W[hux], c0 * uy + W[huy]
 

@@ -238,19 +238,19 @@ def aligned_zeros(size: int) -> np.ndarray:
     return block[first : first + size]
 
 
-def sweep_buffers(n, mesh, points, nodes, lanes):
-    """Zeroed :class:`SweepBuffers` for ``lanes`` lanes, of a mesh with so many ``points`` and ``nodes``."""
+def sweep_buffers(n, mesh, points, nodes, lanes, more=0):
+    """Zeroed :class:`SweepBuffers` for ``lanes`` lanes, of a mesh with so many ``points`` and ``nodes``; ``more`` unknowns than 5 + N."""
     base = base_field_count(n, mesh.base_cells)
     sizes = SweepBuffers(
         workspace=workspace_rows(n).size,
         parameters=parameter_rows(n).size,
         section_lengths=len(mesh.sec_cells),
-        unknowns=unknown_rows(n).size,
+        unknowns=unknown_rows(n).size + more,
         history=points * field_rows(n).size,
         base_history=base,
         fields=points * field_rows(n).size,
         base_fields=base,
         nodes=nodes * state_rows(n).size,
-        residual=unknown_rows(n).size,
+        residual=unknown_rows(n).size + more,
     )
     return SweepBuffers(*(aligned_zeros(size * lanes) for size in sizes))

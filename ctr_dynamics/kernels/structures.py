@@ -41,6 +41,8 @@ class Mesh(NamedTuple):
     ``sec_cells``, ``sec_tubes`` (sections,): cells of a section and tubes present in it. ``bp_tube``, ``bp_offset`` (sections,): the
     section ends at s = beta[bp_tube] + bp_offset. ``ust`` (points * 3N,), ``ust0`` (3N,), ``ust_base`` (N * base points,):
     precurvature in each tube's own frame, 1/m, at the points of the main part, just behind the plate, and (z only) behind the base.
+    ``cut`` (cells,): number of the cut before each cell, or -1; ``owner`` (5 + N,): number of cuts before the place of each residual at the tubes'
+    ends.
     """
 
     sec_cells: np.ndarray
@@ -51,6 +53,8 @@ class Mesh(NamedTuple):
     ust0: np.ndarray
     ust_base: np.ndarray
     base_cells: int
+    cut: np.ndarray
+    owner: np.ndarray
 
 
 @structure
@@ -91,6 +95,21 @@ class ShootingSolver(NamedTuple):
     single: SweepBuffers
     jacobian: SweepBuffers
     options: ShootingOptions
+
+
+@structure
+class SegmentedSolver(NamedTuple):
+    """Multiple shooting of single stages: buffers of one lane and of those of the Jacobian (:func:`~ctr_dynamics.kernels.kinds.segment_lanes`);
+    ``units`` of the unknowns and ``scale`` of the residuals (mt,); ``step`` of the Jacobian's perturbations in those; largest scaled residual; most
+    iterations."""
+
+    single: SweepBuffers
+    wide: SweepBuffers
+    units: np.ndarray
+    scale: np.ndarray
+    step: float
+    tolerance: float
+    limit: int
 
 
 @structure
@@ -144,6 +163,71 @@ class Solution(NamedTuple):
     unknowns: np.ndarray
     history: np.ndarray
     base_history: np.ndarray
+
+
+class StagePoint(NamedTuple):
+    """Where a stage's Jacobian is taken: ``parameters`` (NP,), ``section_lengths`` (sections,), ``unknowns`` (mt,), ``fields`` and ``rates``
+    (fields,); ``units`` of the unknowns and ``residual_units`` (mt,), and the ``step`` of the perturbations in those."""
+
+    parameters: np.ndarray
+    section_lengths: np.ndarray
+    unknowns: np.ndarray
+    fields: np.ndarray
+    rates: np.ndarray
+    units: np.ndarray
+    residual_units: np.ndarray
+    step: float
+
+
+@structure
+class CollocationCoefficients(NamedTuple):
+    """Stages of a collocation step: y_t,i = sum over j of C_ij (y_j - y_n), ``C`` (stages, stages) 1/s; its eigenvalues ``rates`` (pairs,) of a
+    positive imaginary part; rows ``to_modes`` (pairs, stages) and columns ``from_modes`` (stages, pairs), doubled, of its eigenvectors."""
+
+    C: np.ndarray
+    rates: np.ndarray
+    to_modes: np.ndarray
+    from_modes: np.ndarray
+
+
+@structure
+class CollocationSolver(NamedTuple):
+    """For the stages of one or two runs: buffers of their lanes with the table of their ``coupling``; those of the complex Jacobian, ``wide``, with
+    its own ``table``, the Jacobian's ``matrix`` (2, mt, mt) and the ``point`` where it is taken; largest scaled residual; most sweeps."""
+
+    stages: SweepBuffers
+    coupling: np.ndarray
+    wide: SweepBuffers
+    matrix: np.ndarray
+    point: StagePoint
+    tolerance: float
+    limit: int
+
+
+@structure
+class CollocationRun(NamedTuple):
+    """What a run carries from step to step: parameters (NP,), fields and rates ``bank`` (3, fields), ``factors`` of its Jacobians, and states at the
+    ``nodes`` (rows,)."""
+
+    parameters: np.ndarray
+    bank: np.ndarray
+    factors: SystemFactors
+    nodes: np.ndarray
+
+
+class SystemFactors(NamedTuple):
+    """Inverses of multiple-shooting systems, one for each of E complex rates; axes of 2 are real and imaginary part, columns come before rows.
+
+    Condensed: ``along`` (E, cuts, 2, S, S), how the state at a cut follows from the start of its segment; ``from_base`` (E, cuts, 2, 5 + N, S), from
+    the unknowns at the base; ``ends`` (E, 2, 5 + N, S), the tubes' ends by the start of their segment, by rows; ``inverse`` (E, 2, 5 + N, 5 + N).
+    Or the ``whole`` inverse (E, 2, mt, mt), else of size 0.
+    """
+
+    along: np.ndarray
+    from_base: np.ndarray
+    ends: np.ndarray
+    inverse: np.ndarray
+    whole: np.ndarray
 
 
 class SolvedStep(NamedTuple):

@@ -1,7 +1,8 @@
 """One sweep along the tubes, from the actuators to the tip, for any number of lanes.
 
 The unknowns at s = 0+ are given; the sweep integrates the equations to the tip and says by how much the balance there and at the tubes' ends is
-missed.
+missed. Where the states at the mesh's cuts are unknowns as well (multiple shooting), the sweep goes on from each of them and says by how much
+the state that arrives there differs.
 
 Kernels are written for one number, which may stand for several lanes (:mod:`ctr_dynamics.kernels.simd`). Below :func:`sweep` arrays come as views: a
 compiled function that passes an array on counts references to it, and those counts, atomic as they are, cost as much as the arithmetic.
@@ -13,8 +14,16 @@ import numpy as np
 
 from ctr_dynamics.kernels.base import base_plate, below_base
 from ctr_dynamics.kernels.compiler import njit
-from ctr_dynamics.kernels.kinds import ONE_LANE
-from ctr_dynamics.kernels.layout import field_rows, parameter_rows, residual_rows, state_rows, workspace_rows
+from ctr_dynamics.kernels.kinds import ONE_LANE, first_cut_row
+from ctr_dynamics.kernels.layout import (
+    base_field_count,
+    field_rows,
+    parameter_rows,
+    residual_rows,
+    state_rows,
+    unknown_rows,
+    workspace_rows,
+)
 from ctr_dynamics.kernels.physics import (
     bending_moments,
     curvature,
@@ -62,11 +71,13 @@ def load_history(kind, W, v, point):
 
 
 @njit(forceinline=True, error_model="numpy")
-def cells_of_section(kind, W, v, present, cells, h, point, node, ust, c0):
-    """Runge-Kutta steps of length ``h`` through the ``cells`` of a section, from and to the state at the current node."""
+def cells_of_section(kind, W, v, present, first, last, cells, h, point, node, ust, c0):
+    """Runge-Kutta steps of length ``h`` through the cells ``first`` to ``last`` - 1 of a section's ``cells``, from and to the state at the current
+    node; ``point`` and ``node`` are the section's first."""
     n = kind.tubes
     S, F, at = state_rows(n).size, field_rows(n).size, workspace_rows(n)
-    for cell in range(cells):
+    point += 4 * first
+    for cell in range(first, last):
         for r in range(S):
             if v.nodes_kept:
                 v.nodes[(node + cell) * S + r] = W[at.state + r]
@@ -90,12 +101,24 @@ def cells_of_section(kind, W, v, present, cells, h, point, node, ust, c0):
             W[at.state + r] = fma(W[at.increment + r], h * (1.0 / 6.0), W[at.state + r])
 
 
+@njit(forceinline=True, error_model="numpy")
+def leave_cut(kind, W, v, cut):
+    """The state that arrives at the ``cut``, minus the unknown one that leaves it, into the residual; and the latter as the state."""
+    n = kind.tubes
+    S, first, at = state_rows(n).size, first_cut_row(kind), workspace_rows(n)
+    row = unknown_rows(n).size + cut * (S - first) - first
+    for r in range(S):
+        if r >= first:
+            v.residual[row + r] = W[at.state + r] - v.unknowns[row + r]
+            W[at.state + r] = v.unknowns[row + r]
+
+
 @njit(nogil=True, error_model="numpy")
-def section(kind, W, v, before, present, cells, length, point, node, ust, c0):
+def section(kind, W, v, before, present, cells, length, point, node, ust, cut, cell0, c0):
     """From the state on the near side of a section's start, where ``before`` tubes lie, to its end.
 
     Friction from the jump of the inner tubes' moments, Runge-Kutta steps through its ``cells``, and at the end fields, moments on the near side and
-    gravity in the frame of tube 1.
+    gravity in the frame of tube 1. ``cut``: of every cell of the mesh, as in it; ``cell0``: the section's first.
     """
     n = kind.tubes
     S, F, at = state_rows(n).size, field_rows(n).size, workspace_rows(n)
@@ -112,7 +135,15 @@ def section(kind, W, v, before, present, cells, length, point, node, ust, c0):
         if i >= present and i < before:
             v.residual[missed + i] = -V[moment + i]
             V[moment + i] = 0.0
-    cells_of_section(kind, V, v, present, cells, length / cells, point, node, ust, c0)
+    divided, first = len(v.unknowns) > unknown_rows(n).size, np.int64(0)
+    while first < cells:
+        if divided and cut[cell0 + first] >= 0.0:
+            leave_cut(kind, V, v, np.int64(cut[cell0 + first]))
+        last = first + 1
+        while last < cells and not (divided and cut[cell0 + last] >= 0.0):
+            last += 1
+        cells_of_section(kind, V, v, present, first, last, cells, length / cells, point, node, ust, c0)
+        first = last
     point += 4 * cells
     load_history(kind, V, v, point)
     for r in range(S):
@@ -144,20 +175,23 @@ def sweep_batch(kind, W, c0, mesh, v):
     for r in range(parameter_rows(n).size):
         W[first + r] = v.parameters[r]
     sec_cells, sec_tubes, ust = mesh.sec_cells, mesh.sec_tubes, view(ONE_LANE, mesh.ust, 0, 1)
+    cut = view(ONE_LANE, mesh.cut, 0, 1)
     start_motion(kind, W, c0, v.base_history, v.base_fields)
     below_base(
         kind, W, c0, mesh.base_cells, view(ONE_LANE, mesh.ust_base, 0, 1), v.unknowns, v.base_history, v.base_fields
     )  # fmt: skip
     base_plate(kind, W, view(ONE_LANE, mesh.ust0, 0, 1))
-    point, node = np.int64(0), np.int64(0)  # no literals, for which the sections would be compiled once more
+    # no literals, for which the sections would be compiled once more
+    point, node, cell = np.int64(0), np.int64(0), np.int64(0)
     before = n
     for k in range(len(sec_cells)):
         present = sec_tubes[k]
         start_section(kind, W, mesh.bp_tube, v.section_lengths, k)
         cells = sec_cells[k]
-        section(kind, W, v, before, present, cells, v.section_lengths[k], point, node, ust, c0)
+        section(kind, W, v, before, present, cells, v.section_lengths[k], point, node, ust, cut, cell, c0)
         point += 4 * cells + 1
         node += cells + 1
+        cell += cells
         before = present
         after = sec_tubes[k + 1] if k + 1 < len(sec_cells) else 0
         if after < present:
@@ -175,22 +209,28 @@ def sweep(kind, lanes, c0, mesh, b):
 
     ``kind``, ``lanes``: :mod:`ctr_dynamics.kernels.kinds`; ``mesh``, ``b``: :class:`~ctr_dynamics.kernels.structures.Mesh`,
     :class:`~ctr_dynamics.kernels.structures.SweepBuffers`. Unknowns: base torques of the tubes, n and m_xy at s = 0+. Residual: force (3), moment
-    m_xy (2) and m_z of every tube's end. c0 = 0 with zero history is the static model. With several lanes the history may be (points, F), which all
-    share, and ``fields`` and ``nodes`` may be empty: then they are not written.
+    m_xy (2) and m_z of every tube's end. With more unknowns these are the states at the mesh's cuts, from row
+    :func:`~ctr_dynamics.kernels.kinds.first_cut_row` on, and so are the residuals. c0 = 0 with zero history is the static model; c0 may be a
+    :class:`~ctr_dynamics.kernels.coupling.Coupling`. With several lanes the history may be (points, F), which all share, or that of one batch,
+    which all batches share, as the base history may be; ``fields`` and ``nodes`` may be empty: then they are not written.
     """
     L = lanes.count
-    own = len(b.history) == len(mesh.ust) // (3 * kind.tubes) * field_rows(kind.tubes).size * L
+    points = len(mesh.ust) // (3 * kind.tubes) * field_rows(kind.tubes).size
+    base = base_field_count(kind.tubes, mesh.base_cells)
+    own = len(b.history) > points or L == 1
+    H = L if len(b.history) == points * L else lanes.width
+    B = L if len(b.base_history) == base * L else lanes.width
     for first in range(0, L, lanes.width):
         views = Views(
             view(lanes, b.parameters, first, L),
             view(lanes, b.section_lengths, first, L),
             view(lanes, b.unknowns, first, L),
-            view(lanes, b.history, first, L),
+            view(lanes, b.history, first if H == L else 0, H),
             view(ONE_LANE, b.history, 0, 1),
             own,
-            view(lanes, b.base_history, first, L),
+            view(lanes, b.base_history, first if B == L else 0, B),
             view(lanes, b.fields, first, L),
-            view(lanes, b.base_fields, first, L),
+            view(lanes, b.base_fields, first if B == L else 0, B),
             view(lanes, b.nodes, first, L),
             len(b.fields) > 0,
             len(b.nodes) > 0,

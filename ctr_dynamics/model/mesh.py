@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ctr_dynamics.errors import InputError
+from ctr_dynamics.kernels.layout import unknown_rows
 from ctr_dynamics.kernels.sections import section_lengths
 from ctr_dynamics.kernels.structures import Mesh
 
@@ -135,6 +136,8 @@ def build_mesh(tubes: Tubes, beta: np.ndarray, key: Key, base_cells: int = 4) ->
         ust0=ust0.ravel(),
         ust_base=ust_base.ravel(),
         base_cells=base_cells,
+        cut=-np.ones(int(cells.sum())),
+        owner=np.zeros(unknown_rows(n).size, dtype=np.int64),
     )
 
 

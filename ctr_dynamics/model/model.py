@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from ctr_dynamics.effects import make_plant
-from ctr_dynamics.kernels.kinds import Physics, RobotKind, unknown_lanes
+from ctr_dynamics.kernels.kinds import Physics, RobotKind, cut_size, unknown_lanes
 from ctr_dynamics.kernels.layout import input_rows, unknown_rows
 from ctr_dynamics.kernels.shooting import sweep_buffers
 from ctr_dynamics.kernels.structures import ShootingOptions, ShootingSolver, SweepBuffers
@@ -53,6 +55,7 @@ class Model:
             grow from step to step.
         load_slope_limit: (6,) N and N m: a change of a load's slope that adds more than this within a step is worth dividing the step.
         nodes: requested nodes from plate to tip.
+        cuts: where :mod:`ctr_dynamics.model.segments` has cut each set of sections, so that all runs of a model share that.
     """
 
     def __init__(self, robot: Robot, nodes: int = 24, base_cells: int = 4, extended: bool = False) -> None:
@@ -81,6 +84,7 @@ class Model:
         self.perturbation = np.array([moment] * n + [force] * 3 + [moment] * 2) * 1e-6
         self.tangent_perturbation = 5e-5 * self.perturbation
         self._meshes: dict[Key, Mesh] = {}
+        self.cuts: dict[tuple[Key, complex], Any] = {}
         # precurvature that varies within a tube's segments, or twists it behind the plate, moves over the cells with the tube
         self.moving_precurvature = any(
             segment.coefficients.shape[1] > 1 or segment.coefficients[2, 0] != segments[0].coefficients[2, 0]
@@ -113,9 +117,10 @@ class Model:
             self._meshes[key] = build_mesh(self.segments, beta, key, self.base_cells)
         return key, self._meshes[key]
 
-    def sweep_buffers(self, mesh: Mesh, lanes: int) -> SweepBuffers:
-        """Zeroed buffers of a sweep with ``lanes`` lanes."""
-        return sweep_buffers(self.n, mesh, point_count(mesh), node_count(mesh), lanes)
+    def sweep_buffers(self, mesh: Mesh, lanes: int, cuts: int = 0) -> SweepBuffers:
+        """Zeroed buffers of a sweep with ``lanes`` lanes, and unknown states at so many ``cuts``."""
+        more = cuts * cut_size(self.kind)
+        return sweep_buffers(self.n, mesh, point_count(mesh), node_count(mesh), lanes, more)
 
     def shooting_solver(
         self,

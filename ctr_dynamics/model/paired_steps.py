@@ -29,7 +29,8 @@ class PairedSteps:
         assert first.model is second.model
         assert first.scheme is second.scheme
         assert first.tolerance == second.tolerance
-        self.first, self.second = first, second
+        assert isinstance(first.scheme, Scheme)
+        self.first, self.second, self._scheme = first, second, first.scheme
         self._times = first.scheme.times * first.scheme.dt
         self._key: Key = ((), ())  # sections that the buffers are for
         self._buffers: PairBuffers | None = None
@@ -56,7 +57,7 @@ class PairedSteps:
         """
         times = self.first.divisions(t, events)
         if len(times) == 2:
-            return self._part(a, b, t, self.first.scheme, inputs_a, inputs_b, record)
+            return self._part(a, b, t, self._scheme, inputs_a, inputs_b, record)
         trials = a.copy(), b.copy()
         for trial in trials:
             trial.forget_history()

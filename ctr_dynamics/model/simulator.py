@@ -3,139 +3,37 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
 from itertools import pairwise
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import numpy as np
 
 from ctr_dynamics.errors import InputError
-from ctr_dynamics.kernels.layout import RATES, Y_BEFORE, Y_NOW, input_rows, state_rows
-from ctr_dynamics.kernels.shooting import CONVERGED, NOT_FINITE
-from ctr_dynamics.kernels.structures import RunArrays, ShootingSolver
+from ctr_dynamics.kernels.layout import RATES, Y_BEFORE, Y_NOW, state_rows
+from ctr_dynamics.kernels.shooting import CONVERGED
+from ctr_dynamics.kernels.structures import ShootingSolver
 from ctr_dynamics.kernels.time_step import EARLIER, RENEW, advance_step, extrapolate, remember
+from ctr_dynamics.model.collocation_steps import CollocationSteps
 from ctr_dynamics.model.mesh import Mesh
 from ctr_dynamics.model.model import Model
 from ctr_dynamics.model.remeshing import remap_fields
+from ctr_dynamics.model.state import (
+    OUTCOMES,
+    Inputs,
+    InputsAt,
+    Record,
+    State,
+    StepResult,
+    divided,
+    stage_inputs,
+)
 from ctr_dynamics.model.statics import Statics
-from ctr_dynamics.model.time_scheme import Scheme, make_scheme
-
-OUTCOMES = {
-    CONVERGED: "ok",
-    1: "the shooting did not converge",
-    NOT_FINITE: "the shooting left the range of finite numbers",
-}
-
-
-@dataclass(slots=True)  # not frozen: those take three times as long to make
-class Inputs:
-    """Actuators and tip wrench at one time. Never written to once made: states and their copies share it.
-
-    Args:
-        alpha, alpha_rate: (N,) rad and rad/s, angles of the tubes at their bases, innermost first.
-        beta, beta_rate: (N,) m and m/s, translations of the bases, <= 0.
-        force, torque: (3,) N and N m on tube 1's tip, in the axes of ``ctr_base``.
-
-    Example:
-        >>> import numpy as np
-        >>> from ctr_dynamics import Inputs
-        >>> still = Inputs(np.array([1.57, 1.57]), np.zeros(2), np.array([-0.2521, -0.1977]), np.zeros(2))
-        >>> still.force
-        array([0., 0., 0.])
-    """
-
-    alpha: np.ndarray
-    alpha_rate: np.ndarray
-    beta: np.ndarray
-    beta_rate: np.ndarray
-    force: np.ndarray = field(default_factory=lambda: np.zeros(3))
-    torque: np.ndarray = field(default_factory=lambda: np.zeros(3))
-
+from ctr_dynamics.model.time_scheme import Collocation, Scheme, collocation, make_scheme
 
 # of a step: events closer than that to its ends, or to one another, do not divide it. They matter little there, and the shorter the part, the
 # worse is the shooting's condition
 SHORTEST_PART = 0.2
-
-InputsAt = Callable[[float], Inputs]
-"""Inputs at a time in s. One that also has ``stages(times)``, which returns what :func:`stage_inputs` does, is asked for all stages at once."""
-
-
-class StepResult(NamedTuple):
-    """What a step did. ``ok`` False leaves the state as it was; ``reason`` says why."""
-
-    ok: bool
-    reason: str
-    iterations: int
-    sweeps: int
-    jacobians: int
-    substeps: int = 1
-    records: tuple[Record, ...] = ()
-
-
-class Record(NamedTuple):
-    """What the tangent of a solved step needs.
-
-    ``after`` (fields,): fields at its end; ``inputs`` (stages, 3N + 6) and ``found`` (stages, 5 + N) at its stages. :func:`step_tangent
-    <ctr_dynamics.kernels.tangent.step_tangent>` also reads ``before`` (3, fields), the stored fields before the step, and all of
-    ``rates`` (stages, fields); without them ``before`` is empty and ``rates`` holds the last stage's alone.
-    """
-
-    scheme: Scheme
-    key: tuple
-    mesh: Mesh
-    before: np.ndarray
-    after: np.ndarray
-    rates: np.ndarray
-    inputs: np.ndarray
-    found: np.ndarray
-    times: np.ndarray
-
-
-@dataclass
-class State:
-    """Everything that lives between steps; :meth:`copy` makes an independent one."""
-
-    key: tuple
-    mesh: Mesh
-    bank: np.ndarray
-    unknowns: np.ndarray
-    earlier: np.ndarray
-    inverse: np.ndarray
-    usable: bool
-    nodes: np.ndarray
-    inputs: Inputs
-    _arrays: RunArrays | None = field(default=None, repr=False, compare=False)
-
-    def copy(self) -> State:
-        """An independent copy; meshes are shared, they are never written."""
-        return State(
-            self.key, self.mesh, self.bank.copy(), self.unknowns.copy(), self.earlier.copy(), self.inverse.copy(), self.usable,
-            self.nodes.copy(), self.inputs,
-        )  # fmt: skip
-
-    def become(self, other: State) -> None:
-        """Take over all that ``other`` holds, to go on with a fresh Jacobian."""
-        for name in ("key", "mesh", "bank", "unknowns", "earlier", "inverse", "nodes", "inputs"):
-            setattr(self, name, getattr(other, name))
-        self.usable = False
-
-    def forget_history(self) -> None:
-        """Look for the next unknowns where the last step ended."""
-        self.unknowns[:] = self.unknowns[-1]
-        self.earlier[:] = self.unknowns[-1]
-
-    def arrays(self, parameters: np.ndarray) -> RunArrays:
-        """The arrays for the kernels, with the ``parameters`` (NP,) of the run; the same object while they are the same."""
-        arrays = parameters, self.bank, self.unknowns, self.earlier, self.inverse, self.nodes
-        if self._arrays is None or any(a is not b for a, b in zip(self._arrays, arrays, strict=True)):
-            self._arrays = RunArrays(*arrays)
-        return self._arrays
-
-    @property
-    def fields(self) -> np.ndarray:
-        """(fields,) q, omega, u, gamma at every point: the state of the PDE. A view: writing changes the state."""
-        return self.bank[Y_NOW]
 
 
 class Simulator:
@@ -166,15 +64,20 @@ class Simulator:
     def __init__(
         self,
         model: Model,
-        scheme: Scheme | None = None,
+        scheme: Scheme | Collocation | None = None,
         tolerance: float = 1e-7,
         parameters: np.ndarray | None = None,
     ) -> None:
         self.model = model
-        self.scheme = scheme or make_scheme("sdirk3", 0.003)
+        self.scheme = scheme or collocation(0.003)
         self.tolerance = tolerance
         self.parameters = (model.parameters if parameters is None else parameters).copy()
         self._solvers: dict[tuple, ShootingSolver] = {}
+        self.collocation = (
+            CollocationSteps(model, self.scheme, tolerance, self.parameters)
+            if isinstance(self.scheme, Collocation)
+            else None
+        )
 
     def rest(self, inputs: Inputs, guess: np.ndarray | None = None) -> State:
         """State at rest in the static equilibrium at ``inputs``.
@@ -190,6 +93,8 @@ class Simulator:
                 f"no static equilibrium found at beta {np.round(inputs.beta, 4)} m, alpha {np.round(inputs.alpha, 3)} rad",
                 do="check the robot file, the joints and the load",
             )
+        if self.collocation is not None:
+            return self.collocation.rest(equilibrium, inputs)
         stages = self.scheme.stages
         bank = np.zeros((RATES + stages, len(equilibrium.fields)))
         bank[Y_NOW] = bank[Y_BEFORE] = equilibrium.fields
@@ -224,10 +129,13 @@ class Simulator:
         order only.
         """
         times = self.divisions(t, events)
+        if self.collocation is not None:
+            return self.collocation.step(state, times, inputs_at, record)
         if len(times) > 2:
             in_parts = self._divided(state, times, inputs_at, record)
             if in_parts is not None:
                 return in_parts
+        assert isinstance(self.scheme, Scheme)
         result = self._attempt(state, self.scheme, t, inputs_at, not state.usable, record)
         if result.ok:
             return result
@@ -339,33 +247,3 @@ class Simulator:
         if key not in self._solvers:
             self._solvers[key] = self.model.shooting_solver(mesh, self.tolerance, self.parameters)
         return self._solvers[key]
-
-
-def divided(parts: Sequence[StepResult]) -> StepResult:
-    """What a step in ``parts`` that have all succeeded comes to."""
-    return StepResult(
-        True,
-        "divided at an event",
-        sum(p.iterations for p in parts),
-        sum(p.sweeps for p in parts),
-        sum(p.jacobians for p in parts),
-        records=tuple(r for p in parts for r in p.records),
-    )
-
-
-def stage_inputs(model: Model, inputs_at: InputsAt, times: np.ndarray) -> tuple[np.ndarray, Inputs]:
-    """Rows (stages, inputs) of alpha, its rate, beta, tip force, torque, and beta's rate where the model reads it, at ``times`` (stages,) s;
-    and the inputs at the last of them."""
-    at_once = getattr(inputs_at, "stages", None)
-    if at_once is not None:
-        return at_once(times)
-    given = input_rows(model.n)
-    alpha, alpha_rate, beta, force, torque, beta_rate = (given[name] for name in given.names)
-    rows = np.empty((len(times), model.input_count))
-    for row, time in zip(rows, times, strict=True):
-        now = inputs_at(time)
-        row[alpha], row[alpha_rate], row[beta] = now.alpha, now.alpha_rate, now.beta
-        row[force], row[torque] = now.force, now.torque
-        if model.extended:
-            row[beta_rate] = now.beta_rate
-    return rows, now

@@ -11,10 +11,14 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from numpy.polynomial import polynomial
 
 from ctr_dynamics.errors import InputError
+from ctr_dynamics.kernels.coupling import STAGES
 from ctr_dynamics.kernels.layout import RATES, Y_NOW
-from ctr_dynamics.kernels.structures import StageCoefficients
+from ctr_dynamics.kernels.structures import CollocationCoefficients, StageCoefficients
+
+COLLOCATION = "radau"
 
 
 @dataclass(frozen=True)
@@ -50,6 +54,75 @@ class Scheme:
         return StageCoefficients(self.c0, self.weights)
 
 
+@dataclass(frozen=True)
+class Collocation:
+    """Radau IIA with four stages, of order seven, for one step size: all stages are solved together.
+
+    Stiffly accurate and L-stable: the last stage is the step's result, and what is too fast for the step follows its load as if at rest.
+
+    Attributes:
+        name: as in the parameter table.
+        dt: s.
+        times: (stages,) stage times as fractions of the step.
+        coefficients: for the kernels.
+    """
+
+    name: str
+    dt: float
+    times: np.ndarray
+    coefficients: CollocationCoefficients
+    one_step = True
+    order = 7
+
+    @property
+    def stages(self) -> int:
+        """Stages of a step."""
+        return len(self.times)
+
+    def parted(self, dt: float) -> Collocation:
+        """The same for a step of ``dt`` (s)."""
+        C, rates, to_modes, from_modes = self.coefficients
+        ratio = self.dt / dt
+        return Collocation(
+            self.name, dt, self.times, CollocationCoefficients(C * ratio, rates * ratio, to_modes, from_modes)
+        )
+
+    @property
+    def rate(self) -> float:
+        """1/s, by which the rates of the fields are measured: that of the last stage."""
+        return float(self.coefficients.C[-1, -1])
+
+
+def radau_nodes(stages: int) -> tuple[np.ndarray, np.ndarray]:
+    """Matrix A (stages, stages) and nodes c (stages,) of Radau IIA (Hairer and Wanner 1996, section IV.5).
+
+    c are the roots of the derivative of order s - 1 of x^(s - 1) (x - 1)^s; A integrates polynomials of degree s - 1 exactly.
+    """
+    p = polynomial.polymul(polynomial.polypow([0, 1], stages - 1), polynomial.polypow([-1, 1], stages))
+    c = np.sort(polynomial.polyroots(polynomial.polyder(p, stages - 1)).real)
+    powers = np.arange(1, stages + 1)
+    return c[:, None] ** powers / powers @ np.linalg.inv(np.vander(c, stages, increasing=True)), c
+
+
+def collocation(dt: float) -> Collocation:
+    """Radau IIA with four stages for the step ``dt`` (s)."""
+    A, c = radau_nodes(STAGES)
+    C = np.linalg.inv(A) / dt
+    rates, vectors = np.linalg.eig(C)
+    pairs = rates.imag > 0.0
+    return Collocation(
+        COLLOCATION,
+        dt,
+        c,
+        CollocationCoefficients(
+            np.ascontiguousarray(C),
+            rates[pairs],
+            np.ascontiguousarray(np.linalg.inv(vectors)[pairs]),
+            np.ascontiguousarray(2.0 * vectors[:, pairs]),  # each stands for its conjugate too
+        ),
+    )
+
+
 def _bdf_alpha(name: str, dt: float, alpha: float, order: int) -> Scheme:
     c0 = (1.5 + alpha) / ((1.0 + alpha) * dt)
     c1, c2, d1 = -2.0 / dt, (0.5 + alpha) / ((1.0 + alpha) * dt), alpha / (1.0 + alpha)
@@ -69,7 +142,7 @@ def _sdirk(name: str, dt: float, a: np.ndarray, order: int) -> Scheme:
 
 
 def make_scheme(name: str, dt: float, alpha: float = -0.45) -> Scheme:
-    """The scheme ``name`` for step ``dt`` (s); ``alpha`` is read by ``bdf_alpha`` only.
+    """The scheme ``name``, of those that solve one stage after the other, for step ``dt`` (s); ``alpha`` is read by ``bdf_alpha`` only.
 
     Raises:
         InputError: unknown name, dt not positive, or alpha outside [-0.5, 1].
@@ -100,3 +173,8 @@ def make_scheme(name: str, dt: float, alpha: float = -0.45) -> Scheme:
         f"time scheme '{name}' is not known",
         do="use backward_euler, bdf2, trapezoid, bdf_alpha, sdirk2 or sdirk3",
     )
+
+
+def scheme_of(name: str, dt: float, alpha: float = -0.45) -> Scheme | Collocation:
+    """Any time scheme by its name in the parameter table, as :func:`make_scheme`."""
+    return collocation(dt) if name == COLLOCATION else make_scheme(name, dt, alpha)

@@ -8,7 +8,7 @@ from difflib import get_close_matches
 from ctr_dynamics.errors import InputError
 from ctr_dynamics.parameters.parameter_types import Parameter, axes_mask
 
-SCHEMES = ("backward_euler", "bdf2", "trapezoid", "bdf_alpha", "sdirk2", "sdirk3")
+SCHEMES = ("backward_euler", "bdf2", "trapezoid", "bdf_alpha", "sdirk2", "sdirk3", "radau")
 RELIABILITY = ("best_effort", "reliable")
 ZEROS = (0.0, 0.0, 0.0)
 
@@ -31,7 +31,7 @@ PARAMETERS: tuple[Parameter, ...] = (
         10.0,
     ),
     Parameter(
-        "model.scheme", "str", "sdirk3", "", "Time integration scheme.", choices=SCHEMES, read_only=True
+        "model.scheme", "str", "radau", "", "Time integration scheme.", choices=SCHEMES, read_only=True
     ),
     Parameter(
         "model.alpha",
@@ -49,7 +49,7 @@ PARAMETERS: tuple[Parameter, ...] = (
     Parameter(
         "model.tolerance",
         "float",
-        1e-4,
+        1e-5,
         "",
         "Scaled residual at the tip below which the shooting has converged.",
         1e-11,

@@ -109,7 +109,7 @@ class TrackerTiming(Block):
 class Solver(Block):
     """Steps of the simulation itself, finer than an estimator's."""
 
-    scheme: Literal["backward_euler", "bdf2", "trapezoid", "bdf_alpha", "sdirk2", "sdirk3"] = "sdirk3"
+    scheme: Literal["backward_euler", "bdf2", "trapezoid", "bdf_alpha", "sdirk2", "sdirk3", "radau"] = "radau"
     dt_s: Annotated[FiniteFloat, Field(ge=1e-4, le=0.01)] = 0.001
     nodes: Annotated[int, Field(ge=8, le=1000)] = 60
 

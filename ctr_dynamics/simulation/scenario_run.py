@@ -22,7 +22,7 @@ from ctr_dynamics.kernels.rotations import from_vector, matrix, multiply
 from ctr_dynamics.model.model import Model
 from ctr_dynamics.model.simulator import Inputs, Simulator
 from ctr_dynamics.model.statics import Statics
-from ctr_dynamics.model.time_scheme import make_scheme
+from ctr_dynamics.model.time_scheme import scheme_of
 from ctr_dynamics.robot import Robot
 from ctr_dynamics.sensing import ActuatorModel
 from ctr_dynamics.simulation.scenario import Scenario
@@ -194,7 +194,7 @@ def simulate(scenario: Scenario, robot: Robot, progress: Progress | None = None)
     at, known = drives(scenario, robot, model)
     dt = scenario.solver.dt_s
     steps = math.ceil(scenario.duration_s / dt - 1e-9)
-    simulator = Simulator(model, make_scheme(scenario.solver.scheme, dt))
+    simulator = Simulator(model, scheme_of(scenario.solver.scheme, dt))
     # the tubes start from rest even when a motion begins with a jump of speed
     state = simulator.rest(at(0.0))
     tips = [state.nodes[-1, :7].copy()]

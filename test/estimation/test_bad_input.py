@@ -236,7 +236,7 @@ def test_actuator_jump(jump):
     ("bag", "turn", "begin", "end"), [("clean_sweep", 2.2, 1.5, 3.5), ("clean_protocol", 0.8, 6.0, 8.0)]
 )
 def test_joints_that_are_wrong_for_a_while_beside_a_tracker_that_is_not(bag, turn, begin, end):
-    """A tube's angle is reported too large by ``turn`` rad: the tracker contradicts the model, which is said; two seconds after the joints are
+    """A tube's angle is reported too large by ``turn`` rad: the tracker contradicts the model, which is said; 2.5 s after the joints are
     right again the outputs are. An estimate of the tracker's delay that measurements have driven away must not shut out the later ones."""
 
     def wrong(m):
@@ -248,7 +248,7 @@ def test_joints_that_are_wrong_for_a_while_beside_a_tracker_that_is_not(bag, tur
 
     run = play([wrong(m) for m in bag_messages(bag, end + 3.0)])
     check_outputs(run)
-    since = end + 2.0
+    since = end + 2.5
     assert all(out.valid for out, t in zip(run.outputs, run.t, strict=True) if t > since)
     error, _ = truth_error(run, bag, "p_trk", since)
     assert (

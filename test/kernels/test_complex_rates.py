@@ -15,9 +15,9 @@ def solved(real, imag, rows, result):
     """c0 x, a damped equation, and the strains of both kinds of cross-sections."""
     c0, r, out = complex_rate(real, imag), view(COMPLEX, rows, 0, 16), view(COMPLEX, result, 0, 16)
     out[0] = c0 * r[0]
-    out[1] = damped(c0, r[2], r[3], r[0])
-    out[2], out[3] = plane_curvature(c0, r[2], r[3], r[4], r[0], r[1])
-    out[4], out[5] = oval_curvature(c0, r[2], r[5], r[6], r[3], r[4], r[0], r[1])
+    out[1] = damped(c0, 0, r[2], r[3], r[0])
+    out[2], out[3] = plane_curvature(c0, 0, r[2], r[3], r[4], r[0], r[1])
+    out[4], out[5] = oval_curvature(c0, 0, r[2], r[2], r[5], r[6], r[3], r[4], r[0], r[1])
 
 
 @pytest.fixture(scope="module")

@@ -89,7 +89,7 @@ class RodEkf:
         inputs = state.inputs
         self.forget_parameters()
         pi_aa = self.factor.start(
-            state.key, state.mesh, inputs.beta, inputs.alpha, self._block(inputs), state.unknowns[-1]
+            state.key, state.mesh, inputs.beta, inputs.alpha, self._block(inputs), state.unknowns_at_base
         )
         if self._strides is None:  # of the first start; the exposed length tells how they change
             self._strides = ColumnStrides.of(self.model, state, self._block(inputs), self.simulator.scheme.dt)
@@ -320,8 +320,12 @@ class RodEkf:
         np.clip(self.theta, u.lowest, u.highest, out=self.theta)
         self._apply_theta()
         state.bank[:2] += factor.fields_change(a)
-        move_unknowns(factor.dx, a, state.unknowns, state.earlier)
-        state.nodes += factor.nodes_change(a)
+        nodes = factor.nodes_change(a)
+        if self.simulator.collocation is None:
+            move_unknowns(factor.dx, a, state.unknowns, state.earlier)
+        else:
+            self.simulator.collocation.shift(state, factor.dx @ a, nodes)
+        state.nodes += nodes
         self.tips.shift(a)
 
     # -- outputs --
