@@ -125,30 +125,50 @@ def factorise(matrix, owner, factors, e):
 
 @njit(nogil=True, error_model="numpy")
 def solve_system(owner, factors, e, F, z):
-    """z = - J^-1 F, both (2, mt); ``F`` is written to."""
-    z[:] = 0.0
-    if factors.whole.shape[2]:
-        F *= -1.0
-        add_product(factors.whole[e], F, z)
+    """z = - J^-1 F, both (2, mt); ``F`` is written to.
+
+    Written out in single loops: a slice counts references, which takes as long as the arithmetic.
+    """
+    along, from_base, ends, inverse, whole = factors
+    mt, m, cuts, size = F.shape[1], len(owner), along.shape[1], along.shape[3]
+    if whole.shape[2]:
+        for i in range(mt):
+            z[0, i] = z[1, i] = 0.0
+        for k in range(mt):
+            a, b = -F[0, k], -F[1, k]
+            for i in range(mt):
+                z[0, i] += a * whole[e, 0, k, i] - b * whole[e, 1, k, i]
+                z[1, i] += a * whole[e, 1, k, i] + b * whole[e, 0, k, i]
         return
-    m = len(owner)
-    D, P, R, A = factors.along[e], factors.from_base[e], factors.ends[e], factors.inverse[e]
-    cuts, size = D.shape[0], D.shape[2]
     # what the misses bring to the segments' starts with the first unknowns held
     for j in range(1, cuts):
-        add_product(D[j], F[:, m + (j - 1) * size : m + j * size], F[:, m + j * size : m + (j + 1) * size])
+        start, target = m + (j - 1) * size, m + j * size
+        for k in range(size):
+            a, b = F[0, start + k], F[1, start + k]
+            for i in range(size):
+                F[0, target + i] += a * along[e, j, 0, k, i] - b * along[e, j, 1, k, i]
+                F[1, target + i] += a * along[e, j, 1, k, i] + b * along[e, j, 0, k, i]
     for q in range(m):
         if owner[q] > 0:
-            first = m + (owner[q] - 1) * size
+            start, x, y = m + (owner[q] - 1) * size, F[0, q], F[1, q]
             for k in range(size):
-                a, b = F[0, first + k], F[1, first + k]
-                F[0, q] += R[0, q, k] * a - R[1, q, k] * b
-                F[1, q] += R[0, q, k] * b + R[1, q, k] * a
-    for part in range(2):
-        for q in range(m):
-            F[part, q] = -F[part, q]
-    add_product(A, F[:, :m], z[:, :m])
+                a, b = F[0, start + k], F[1, start + k]
+                x += ends[e, 0, q, k] * a - ends[e, 1, q, k] * b
+                y += ends[e, 0, q, k] * b + ends[e, 1, q, k] * a
+            F[0, q], F[1, q] = x, y
+    for i in range(m):
+        z[0, i] = z[1, i] = 0.0
+    for k in range(m):
+        a, b = -F[0, k], -F[1, k]
+        for i in range(m):
+            z[0, i] += a * inverse[e, 0, k, i] - b * inverse[e, 1, k, i]
+            z[1, i] += a * inverse[e, 1, k, i] + b * inverse[e, 0, k, i]
     for j in range(cuts):
-        rows = slice(m + j * size, m + (j + 1) * size)
-        z[:, rows] = F[:, rows]
-        add_product(P[j], z[:, :m], z[:, rows])
+        start = m + j * size
+        for i in range(size):
+            z[0, start + i], z[1, start + i] = F[0, start + i], F[1, start + i]
+        for k in range(m):
+            a, b = z[0, k], z[1, k]
+            for i in range(size):
+                z[0, start + i] += a * from_base[e, j, 0, k, i] - b * from_base[e, j, 1, k, i]
+                z[1, start + i] += a * from_base[e, j, 1, k, i] + b * from_base[e, j, 0, k, i]

@@ -156,7 +156,8 @@ class CollocationSteps:
         state.usable = True
         records: tuple[Record, ...] = ()
         if record:
-            own = np.copy if scheme is not self.scheme else np.asarray  # parts of a step share one bank
+            # parts of a step share one bank
+            own = np.asarray if record == "end" and scheme is self.scheme else np.copy
             records = (recorded(model, state, scheme, inputs, x[0], times, own),)
         return StepResult(True, "ok", sweeps - 1, sweeps, jacobians, records=records)
 

@@ -49,7 +49,7 @@ PARAMETERS: tuple[Parameter, ...] = (
     Parameter(
         "model.tolerance",
         "float",
-        1e-5,
+        1e-4,
         "",
         "Scaled residual at the tip below which the shooting has converged.",
         1e-11,

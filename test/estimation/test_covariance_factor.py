@@ -149,7 +149,7 @@ def test_columns_follow_a_fast_vibration():
     simulator, unc = Simulator(model), model_uncertainty(model)
     state = simulator.rest(still)
     factor = CovarianceFactor(model, unc, rank=24)
-    factor.start(state.key, state.mesh, BETA, ALPHA, model.parameters, state.unknowns[-1])
+    factor.start(state.key, state.mesh, BETA, ALPHA, model.parameters, state.unknowns_at_base)
     assert factor.theta[unc.force, unc.force].diagonal() == pytest.approx([1e-3] * 3)
     factor.theta[unc.force] = 0.0  # the force is gone, and what it has done remains
     found = []
@@ -190,7 +190,7 @@ def test_the_factor_follows_finite_differences_of_the_simulation(robot, nodes, e
     factor = CovarianceFactor(model, unc, rank=24)
     par = model.parameters.copy()
     par[model.layout["force"]] = start.inputs.force
-    factor.start(start.key, start.mesh, BETA, ALPHA, par, start.unknowns[-1])
+    factor.start(start.key, start.mesh, BETA, ALPHA, par, start.unknowns_at_base)
     for done in records[every - 1 :: every]:
         assert factor.propagate(done[-1], model.parameters, every * DT)
     weight = field_weights(model, factor.mesh, BETA)
@@ -229,7 +229,7 @@ def test_energy_is_that_of_all_points(model):
     unc = model_uncertainty(model)
     start, _, records = simulated(model, model.parameters, (0.0, 0.0), 3)
     factor = CovarianceFactor(model, unc, rank=24)
-    factor.start(start.key, start.mesh, BETA, ALPHA, model.parameters, start.unknowns[-1])
+    factor.start(start.key, start.mesh, BETA, ALPHA, model.parameters, start.unknowns_at_base)
     for done in records:
         assert factor.propagate(done[-1], model.parameters, DT)
     weights = field_weights(model, factor.mesh, BETA)
@@ -252,7 +252,7 @@ def test_a_checkpoint_of_the_factor_is_not_written_by_later_steps(model):
     unc = model_uncertainty(model)
     start, _, records = simulated(model, model.parameters, (0.0, 0.0), 3)
     factor = CovarianceFactor(model, unc, rank=24)
-    factor.start(start.key, start.mesh, BETA, ALPHA, model.parameters, start.unknowns[-1])
+    factor.start(start.key, start.mesh, BETA, ALPHA, model.parameters, start.unknowns_at_base)
     stored = factor.checkpoint()
     before = factor.fields.copy()
     for done in records:
@@ -271,7 +271,7 @@ def test_the_factor_stays_where_a_step_cannot_be_linearised(model, monkeypatch, 
     """A failure shows in a later batch of lanes only, when the first columns have been written."""
     start, _, records = simulated(model, model.parameters, (0.0, 0.0), 3)
     factor = CovarianceFactor(model, model_uncertainty(model), rank=24)
-    factor.start(start.key, start.mesh, BETA, ALPHA, model.parameters, start.unknowns[-1])
+    factor.start(start.key, start.mesh, BETA, ALPHA, model.parameters, start.unknowns_at_base)
     factor.propagate(records[0][-1], model.parameters, DT)
     before = [np.copy(x) for x in (factor.fields, factor.dx, factor.dnodes)]
     if lent:

@@ -171,7 +171,7 @@ def test_two_runs_together_are_each_alone():
     states = [s.rest(at(0.0)) for s, at in zip(simulators, motions, strict=True)]
     alone = [s.copy() for s in states]
     for k in range(20):
-        events = (0.0305,) if k == 10 else ()
+        events = (0.0315,) if k == 10 else ()
         both = pair.step(*states, 0.003 * k, *motions, record=True, events=events)
         assert both is not None
         assert all(result.ok for result in both)
