@@ -208,8 +208,12 @@ def _oval_curvature(c0, number, stiffness, k11, k12, k22, damping, turning, mx, 
         def iterate_in_stages(c0, number, stiffness, k11, k12, k22, damping, turning, mx, my):
             ux, uy = damped(c0, number, stiffness, damping, mx), damped(c0, number, stiffness, damping, my)
             for _ in range(STAGE_PASSES):
-                ux = damped(c0, number, stiffness, damping, mx - (k11 - stiffness) * ux - (k12 + turning) * uy)
-                uy = damped(c0, number, stiffness, damping, my - (k22 - stiffness) * uy - (k12 - turning) * ux)
+                ux = damped(
+                    c0, number, stiffness, damping, mx - (k11 - stiffness) * ux - (k12 + turning) * uy
+                )
+                uy = damped(
+                    c0, number, stiffness, damping, my - (k22 - stiffness) * uy - (k12 - turning) * ux
+                )
             return ux, uy
 
         def solve_undamped(c0, number, stiffness, k11, k12, k22, damping, turning, mx, my):

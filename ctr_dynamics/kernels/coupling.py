@@ -108,8 +108,8 @@ def _mix(context, builder, signature, args):
 
 
 def table_size(n: int, width: int) -> int:
-    """Numbers in the table of a coupling for ``n`` tubes: C, and the inverses: those with torsion of every tube, with bending of the first one, two ..
-    tubes together, and with every drive."""
+    """Numbers in the table of a coupling for ``n`` tubes: C, and the inverses: those with torsion of every tube, with bending of the first one, two
+    .. tubes together, and with every drive."""
     return (1 + 3 * n) * STAGES * width
 
 

@@ -113,7 +113,9 @@ def curvature(kind, W, present, ust, u0, c0):
             turning += bb * g
             rx += k11 * wx + k12 * wy - bb * hx
             ry += k12 * wx + k22 * wy - bb * hy
-        ux, uy = oval_curvature(c0, n + present - 1, stiffness, k11_all, k12_all, k22_all, bb_all, turning, rx, ry)
+        ux, uy = oval_curvature(
+            c0, n + present - 1, stiffness, k11_all, k12_all, k22_all, bb_all, turning, rx, ry
+        )
         if soft > 0.0:
             for i in range(present):
                 Ti = T + 7 * i

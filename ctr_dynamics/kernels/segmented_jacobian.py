@@ -99,8 +99,8 @@ def real_jacobian(kind, c0, mesh, single, x, b, units, residual_units, step, mat
 def complex_jacobian(kind, rate, mesh, point, b, matrix):
     """Jacobian, in units, at the complex ``rate`` about one solved or nearly solved stage, into ``matrix`` (2, mt, mt), real and imaginary.
 
-    ``point``: :class:`~ctr_dynamics.kernels.structures.StagePoint`. ``b``: buffers of :func:`complex_segment_lanes`, its histories those of one batch.
-    False where anything is not finite.
+    ``point``: :class:`~ctr_dynamics.kernels.structures.StagePoint`. ``b``: buffers of :func:`complex_segment_lanes`, its histories those of one
+    batch. False where anything is not finite.
     """
     lanes = complex_segment_lanes(kind)
     L, re, im, main = lanes.count, rate.real, rate.imag, len(b.history) // WIDE

@@ -193,7 +193,7 @@ class CollocationCoefficients(NamedTuple):
 @structure
 class CollocationSolver(NamedTuple):
     """For the stages of one or two runs: buffers of their lanes with the table of their ``coupling``; those of the complex Jacobian, ``wide``, with
-    its own ``table``, the Jacobian's ``matrix`` (2, mt, mt) and the ``point`` where it is taken; largest scaled residual; most sweeps."""
+    its ``matrix`` (2, mt, mt) and the ``point`` where it is taken; largest scaled residual; most sweeps."""
 
     stages: SweepBuffers
     coupling: np.ndarray
