@@ -121,7 +121,7 @@ class ColumnStrides:
     def of(cls, model: Model, state: State, par: NDArray[np.float64], dt: float) -> ColumnStrides:
         """From the modes about the equilibrium ``state`` with the parameter block ``par`` (NP,)."""
         rest = Equilibrium(
-            True, state.unknowns[-1], state.fields, state.nodes, state.mesh, state.key, np.zeros(model.n)
+            True, state.unknowns_at_base, state.fields, state.nodes, state.mesh, state.key, np.zeros(model.n)
         )
         basis = modal_basis(model, rest, par, state.inputs.beta, count=MODES)
         frequency = np.zeros(0) if basis is None else basis.frequency_hz
