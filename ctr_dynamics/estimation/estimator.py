@@ -218,10 +218,11 @@ class Estimator:
         if self.t0_ns is None:
             return False
         stamp = self.timeline.stamp(k)
-        if stamp <= inputs.joints.known_until:
-            return True
+        known = stamp <= inputs.joints.known_until
         if now_ns is None:
-            return False
+            return known
+        if known:
+            return stamp <= now_ns  # joints that are stamped ahead do not take the outputs with them
         return stamp <= now_ns if inputs.extrapolating else stamp <= now_ns - inputs.timeout_ns
 
     @property

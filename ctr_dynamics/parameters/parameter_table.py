@@ -226,6 +226,15 @@ PARAMETERS: tuple[Parameter, ...] = (
         choices=("wait", "predict"),
     ),
     Parameter(
+        "output.max_age_s",
+        "float",
+        0.06,
+        "s",
+        "An output that is older than this when it goes out is invalid: the node was held up, or joint states came late. Live node alone.",
+        0.003,
+        60.0,
+    ),
+    Parameter(
         "output.backbone_every",
         "int",
         11,

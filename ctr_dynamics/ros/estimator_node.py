@@ -23,6 +23,7 @@ from ctr_dynamics import __version__
 from ctr_dynamics.errors import InputError
 from ctr_dynamics.estimation.estimator import Estimator
 from ctr_dynamics.estimation.monitoring.statuses import all_statuses, snap_ahead
+from ctr_dynamics.estimation.step_output import StepOutput
 from ctr_dynamics.io.atomic_files import atomic_file, check_targets
 from ctr_dynamics.io.bag_writer import LiveRecorder
 from ctr_dynamics.io.messages import topics
@@ -101,12 +102,13 @@ class EstimatorNode(Node):
         self._now_ns = self._clock_source()
         self.loop = StepLoop(
             self._estimator,
-            self.outputs.step,
+            self._publish,
             self._housekeeping,
             Clock(self._now_ns, wall=not self._use_sim_time),
             self.timing,
             self.get_logger().error,
             prefetch=self._prefetch,
+            max_age_ns=round(self.settings["output.max_age_s"] * 1e9),
         )
         self._offered = [
             self.create_service(Trigger, "~/reset", self._on_reset),
@@ -242,6 +244,11 @@ class EstimatorNode(Node):
         count, _ = self._undecodable.get(topic, (0, ""))
         self._undecodable[topic] = (count + 1, str(error))
 
+    def _publish(self, out: StepOutput) -> bool:
+        if not out.valid:
+            self._estimator.health.problem = out.reason  # also where it has come too late
+        return self.outputs.step(out)
+
     def _prefetch(self) -> None:
         self._estimator.prefetch()
         self.outputs.prefetch()
@@ -371,6 +378,7 @@ class EstimatorNode(Node):
         self._estimator = estimator
         self._gate = InputGate(estimator)
         self.timing.policy = settings["output.policy"]
+        self.loop.max_age_ns = round(settings["output.max_age_s"] * 1e9)
         self.timing.input_timeout_ns = round(settings["input_timeout_s"] * 1e9)
         self.loop.swap(estimator)
 

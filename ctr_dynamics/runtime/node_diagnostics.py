@@ -24,6 +24,7 @@ def timing_status(timing: StepTiming, faults: int, last_fault: str, withheld_beh
         "later than 20 ms": str(timing.very_late),
         "skipped": str(timing.skipped),
         "withheld": str(timing.withheld),
+        "too old": str(timing.too_old),
         "restarts": str(timing.restarts),
         "lateness p50 / p99 / max (ms)": spread("lateness_ms"),
         "step p50 / p99 / max (ms)": spread("step_ms"),

@@ -11,7 +11,7 @@ from ctr_dynamics.parameters import PARAMETERS, Settings
 from ctr_dynamics.robot import Robot
 
 AFTER_NS = 1_000_000_000  # what arrives later than this after the last joint state changes no step
-LIVE_ONLY = ("qos.", "record.", "timing_report")  # parameters of a node
+LIVE_ONLY = ("qos.", "record.", "timing_report", "output.max_age_s")  # parameters of a node
 LEAST_SHARE = 0.1  # less than a tenth of a recording that was used is next to nothing: whoever needs the rest has to hear of it
 
 

@@ -93,6 +93,7 @@ class StepLoop(threading.Thread):
         log_error: takes one line for the log.
         gather_ns: how long the first inputs are gathered.
         prefetch: computes a step without effect; called a moment before joints that several steps wait for.
+        max_age_ns: a step whose stamp is older than this when it goes out is made invalid: who acts on it acts on the past.
     """
 
     def __init__(
@@ -105,6 +106,7 @@ class StepLoop(threading.Thread):
         log_error: Callable[[str], Any],
         gather_ns: int = GATHER_NS,
         prefetch: Callable[[], object] = lambda: None,
+        max_age_ns: int | None = None,
     ) -> None:
         super().__init__(name="stepping", daemon=True)
         self.estimator = estimator
@@ -121,6 +123,7 @@ class StepLoop(threading.Thread):
         self._wall = clock.wall
         self._gather_ns = gather_ns
         self._prefetch_step = prefetch
+        self.max_age_ns = max_age_ns
         self._took_steps = False
         # a step was due in this round and the estimator did not take it: it wants an input
         self._starved = False
@@ -279,13 +282,28 @@ class StepLoop(threading.Thread):
                 if self._last is not None and step.k <= self._last[0]:
                     self.timing.restarted()  # the estimator has reinitialised itself
                 self._last = (step.k, step.stamp_ns)
-                if self._publish(step):
+                if self._publish(self._not_too_old(step)):
                     self.timing.published(step.k, step.stamp_ns, self._now_ns())
                 else:
                     self.timing.withheld += 1
             if self._stopping or not more or not steps:
                 return
         self._wake.set()  # there is more to take, after a look at the inbox
+
+    def _not_too_old(self, step: Any) -> Any:
+        """The step, invalid where it comes so late that the robot may be elsewhere by now."""
+        now_ns = self._now_ns()
+        if (
+            self.max_age_ns is None
+            or now_ns <= 0
+            or not step.valid
+            or now_ns - step.stamp_ns <= self.max_age_ns
+        ):
+            return step
+        self.timing.too_old += 1
+        age_s, limit_s = (now_ns - step.stamp_ns) * 1e-9, self.max_age_ns * 1e-9
+        reason = f"output is {age_s:.3f} s old when it goes out, limit {limit_s:g} s (output.max_age_s): the node is held up, or joints come late"
+        return step._replace(valid=False, reason=reason)
 
     def _gathering_ns(self) -> int:
         """How much longer the first inputs are gathered before the model starts; 0 once it may."""

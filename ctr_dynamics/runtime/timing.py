@@ -71,7 +71,7 @@ class StepTiming:
         self.late = 0
         self.very_late = 0
         self.skipped = 0
-        self.withheld = 0
+        self.withheld = self.too_old = 0
         self.restarts = 0
         self.start_steps = 0
         self.start_max_ns = 0
@@ -153,6 +153,7 @@ class StepTiming:
             "late_fraction": self.late / self.steps if self.steps else 0.0,
             "skipped": self.skipped,
             "withheld": self.withheld,
+            "too_old": self.too_old,
             "restarts": self.restarts,
             "lateness_ms": self.lateness.summary(),
             "step_ms": self.step_time.summary(),
