@@ -29,7 +29,9 @@ def test_the_demo_ends_with_tables_picture_and_recorded_outputs(tmp_path, capfd)
     assert figures["timing"]["skipped"] == 0
     assert (tmp_path / "out" / "demo.png").read_bytes().startswith(b"\x89PNG")
     bag = open_bag(tmp_path / "out" / "outputs.mcap")
-    assert bag.topics[topics.TIP_POSE].messages > 300
+    # a busy machine makes outputs too old to be valid; every step says whether it is
+    assert bag.topics[topics.VALID].messages > 300
+    assert bag.topics[topics.TIP_POSE].messages > 0
 
 
 def test_an_unknown_robot_or_policy_is_rejected_before_anything_starts(tmp_path, capfd):
