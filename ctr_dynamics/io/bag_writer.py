@@ -8,6 +8,8 @@ gives every block to the operating system at once, so that a killed process lose
 from __future__ import annotations
 
 import contextlib
+import errno
+import os
 import threading
 import time
 from collections.abc import Iterator, Mapping
@@ -145,7 +147,7 @@ class LiveRecorder:
             ros_type: needed for topics outside the topic table.
 
         Raises:
-            OSError: the disk is full or gone; the file so far stays readable.
+            OSError: the disk is full or gone, then the file so far stays readable; or the file was deleted.
         """
         with self._lock:
             if not self._open:
@@ -162,6 +164,8 @@ class LiveRecorder:
             if now - self._flushed > _LIVE_FLUSH_S:
                 self._flushed = now
                 self._writer.flush()
+                if not os.fstat(self._stream.fileno()).st_nlink:
+                    raise OSError(errno.ENOENT, "the file was deleted while it was recorded", str(self.path))
 
     def flush(self) -> None:
         """Hand everything recorded so far to the operating system."""

@@ -177,7 +177,7 @@ class EstimatorNode(Node):
 
         def arrived(data: bytes) -> None:
             arrival_ns = now_ns()
-            loop.offer(partial(take, data, arrival_ns))
+            loop.offer(partial(take, data, arrival_ns), len(data))
             if record is not None:
                 record.put(topic.name, arrival_ns, data)
             if ring_buffer is not None:

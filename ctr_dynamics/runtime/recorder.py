@@ -18,11 +18,12 @@ class Writer(Protocol):
 class Recorder:
     """Writes in its own thread, so that no disk ever holds up a step.
 
-    When the disk falls behind by more than `LIMIT` messages, further ones are dropped and counted. A disk
-    that fails ends the recording, not the node.
+    When the disk falls behind by more than `LIMIT` messages or `LIMIT_BYTES`, further ones are dropped and counted. A disk
+    that fails ends the recording, not the node; so does a file that was deleted.
     """
 
     LIMIT = 100_000
+    LIMIT_BYTES = 256 * 2**20
 
     def __init__(self, writer: Writer, log_error: Callable[[str], Any]) -> None:
         self.written = 0
@@ -31,17 +32,23 @@ class Recorder:
         self._writer = writer
         self._log_error = log_error
         self._queue: queue.SimpleQueue[tuple[str, int, bytes] | None] = queue.SimpleQueue()
+        self._bytes = 0  # that wait
+        self._lock = threading.Lock()
         self._thread = threading.Thread(target=self._run, name="recorder", daemon=True)
         self._thread.start()
 
     def put(self, topic: str, log_ns: int, data: bytes) -> None:
         """Have one message written; returns at once."""
-        if self.error or self._queue.qsize() > self.LIMIT:
+        if self.error or self._queue.qsize() > self.LIMIT or self._bytes + len(data) > self.LIMIT_BYTES:
             if not (self.dropped or self.error):
-                self._log_error(f"the disk is behind by {self.LIMIT} messages: further ones are not recorded")
+                self._log_error(
+                    f"the disk is behind by {self._queue.qsize()} messages of {self._bytes} bytes: further ones are not recorded"
+                )
             self.dropped += 1
-        else:
-            self._queue.put((topic, log_ns, data))
+            return
+        with self._lock:
+            self._bytes += len(data)
+        self._queue.put((topic, log_ns, data))
 
     def close(self) -> None:
         """Write what is queued, finish the file, end the thread."""
@@ -53,6 +60,8 @@ class Recorder:
     def _run(self) -> None:
         try:
             while (item := self._queue.get()) is not None:
+                with self._lock:
+                    self._bytes -= len(item[2])
                 self._writer.write(*item)
                 self.written += 1
         except OSError as error:

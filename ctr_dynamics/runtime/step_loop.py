@@ -14,6 +14,7 @@ import time
 import traceback
 from collections import deque
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any, NamedTuple, Protocol
 
 from ctr_dynamics.runtime.clock_offset import ClockOffset
@@ -26,6 +27,8 @@ SLICE_STEPS = 8
 """Steps of a backlog that are taken between two looks at the inbox."""
 INBOX_LIMIT = 20_000
 """Messages that may wait: minutes of a robot's, and what keeps a flood from filling the memory."""
+INBOX_BYTES = 64 * 2**20
+"""Bytes of them that may wait: a message of a robot has some hundred, but nothing says how large one is that comes over the network."""
 IDLE_NS = 50_000_000
 RETRY_NS = 1_000_000
 COLLECT_NS = 1_000_000_000
@@ -114,6 +117,7 @@ class StepLoop(threading.Thread):
         self.clock_offset = ClockOffset()
         self.inbox: deque[Callable[[], None]] = deque()
         self.rejected = 0
+        self._offered_bytes = self._taken_bytes = 0  # each is written by one thread alone
         self.faults = 0
         self.last_fault = ""
         self._publish = publish
@@ -142,12 +146,17 @@ class StepLoop(threading.Thread):
         self.inbox.append(item)
         self._wake.set()
 
-    def offer(self, item: Callable[[], None]) -> None:
-        """The same for a message: beyond ``INBOX_LIMIT`` that wait it is rejected, and counted."""
-        if len(self.inbox) < INBOX_LIMIT:
-            self.put(item)
+    def offer(self, item: Callable[[], None], size: int = 0) -> None:
+        """The same for a message of ``size`` bytes: beyond ``INBOX_LIMIT`` or ``INBOX_BYTES`` that wait it is rejected, and counted."""
+        if len(self.inbox) < INBOX_LIMIT and self._offered_bytes - self._taken_bytes + size <= INBOX_BYTES:
+            self._offered_bytes += size
+            self.put(partial(self._take, item, size))
         else:
             self.rejected += 1
+
+    def _take(self, item: Callable[[], None], size: int) -> None:
+        self._taken_bytes += size
+        item()
 
     def call(self, function: Callable[[], Any], timeout_s: float = 5.0) -> Any:
         """Run `function` in the stepping thread and return its result.

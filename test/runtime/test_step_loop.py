@@ -13,6 +13,7 @@ from ctr_dynamics.runtime.clock_offset import ClockOffset
 from ctr_dynamics.runtime.node_diagnostics import clock_status, topics_status
 from ctr_dynamics.runtime.step_loop import (
     CATCH_UP_NS,
+    INBOX_BYTES,
     INBOX_LIMIT,
     PREFETCH_NS,
     PREFETCH_STEPS,
@@ -192,8 +193,13 @@ def test_a_flood_of_messages_is_rejected_beyond_a_limit_and_counted(clock):
     assert topics_status({}, {}, loop.rejected).level == ERROR
     loop._round()
     assert taken == list(range(INBOX_LIMIT))
-    loop.offer(partial(taken.append, -1))
-    assert loop.rejected == 3
+    loop.offer(partial(taken.append, -1), INBOX_BYTES)
+    loop.offer(partial(taken.append, -2), 1)
+    assert loop.rejected == 4
+    loop._round()
+    loop.offer(partial(taken.append, -3), 1)
+    loop._round()
+    assert taken[INBOX_LIMIT:] == [-1, -3]
 
 
 def test_a_backlog_is_published_step_by_step_and_nothing_is_skipped(clock):
