@@ -50,6 +50,22 @@ def carried(matrix: csr_array, values: Floats) -> Floats:
     return product.reshape(-1, *values.shape[1:])
 
 
+class SolvedStage(NamedTuple):
+    """What a solved stage is known by: sections, rates of the fields (fields,), unknowns (5 + N,) and inputs (inputs,)."""
+
+    key: Key
+    rates: Floats
+    unknowns: Floats
+    inputs: Floats
+
+    def between(self, other: SolvedStage | None) -> SolvedStage:
+        """Halfway to ``other``; itself where the sections are others, or there is none."""
+        if other is None or other.key != self.key:
+            return self
+        pairs = zip(self[1:], other[1:], strict=True)
+        return SolvedStage(self.key, *(0.5 * (a + b) for a, b in pairs))
+
+
 class FactorState(NamedTuple):
     """What a checkpoint stores of a :class:`CovarianceFactor`, attribute by attribute. Arrays are references: later steps go on with others."""
 
@@ -61,6 +77,7 @@ class FactorState(NamedTuple):
     fields: Floats
     dnodes: Floats
     dx: Floats
+    linearised: SolvedStage | None
 
 
 class CovarianceFactor:
@@ -97,6 +114,7 @@ class CovarianceFactor:
         self.mesh: Mesh | None = None
         self.beta = np.zeros(model.n)
         self._deviation: tuple[Floats, Floats, Floats] | None = None  # dnodes, pi, and what follows from them
+        self._linearised: SolvedStage | None = None  # at the end of what V has followed
         self._lent = False  # whether a checkpoint holds `fields`
         self._spare = self._nothing = np.empty((0, 0))  # room for the next `fields`
 
@@ -134,7 +152,7 @@ class CovarianceFactor:
         ):  # fmt: skip
             dx[:], fields[:], dnodes[:] = 0.0, 0.0, 0.0  # some may have been written
         self.key, self.mesh, self.interpolation = own, mesh, interpolation
-        self.beta = beta.copy()
+        self.beta, self._linearised = beta.copy(), None
         r = self.rank
         wide = max(count, r)
         self.theta = np.zeros((count, wide))
@@ -171,9 +189,9 @@ class CovarianceFactor:
         self.fields = remap_columns(self.model.n, self.fields[None], self.mesh, self.beta, mesh, beta)[0]
 
     def propagate(self, record: Record, par: Floats, over_s: float) -> bool:
-        """Move V over ``over_s`` (s), with the dynamics linearised at the end of the solved (sub)step ``record``.
+        """Move V over ``over_s`` (s), up to the end of the solved (sub)step ``record``.
 
-        ``par`` (NP,): the parameter block. Returns False where that cannot be linearised, and V then stays.
+        The dynamics are linearised halfway between that end and the one at which this was last called. ``par`` (NP,): the parameter block. Returns False where that cannot be linearised, and V then stays.
         """
         model, m = self.model, self.model.unknown_count
         beta = record.inputs[-1, input_rows(model.n)["beta"]]
@@ -181,7 +199,9 @@ class CovarianceFactor:
         if key != self.key:
             self._remap(key, mesh, beta)
         self.key, self.mesh, self.interpolation, self.beta = key, mesh, interpolation, beta
-        rates = record.rates[-1]
+        now = SolvedStage(record.key, record.rates[-1], record.found[-1], record.inputs[-1])
+        middle = now.between(self._linearised)
+        rates = middle.rates
         if interpolation is not None:
             rates = carried(interpolation.restrict, rates)
         # not in place: where the step cannot be linearised, V stays as it is
@@ -190,7 +210,7 @@ class CovarianceFactor:
         dx, dnodes = np.empty((m, columns)), np.empty((len(buffers.far.nodes) // COMPLEX.count, columns))
         if not rational_tangent(
             model.kind, self._lanes, mesh, self.fraction, over_s,
-            SolvedStep(par.copy(), record.inputs, record.found, record.before, rates[None], record.after),
+            SolvedStep(par.copy(), middle.inputs[None], middle.unknowns[None], record.before, rates[None], record.after),
             carried(self._effect, self.theta), self.fields, self._differences, buffers,
             Derivatives(np.empty((m, m)), dx, fields, dnodes),
         ):  # fmt: skip
@@ -198,6 +218,7 @@ class CovarianceFactor:
             return False
         self._spare = self._nothing if self._lent else self.fields
         self.fields, self.dx, self.dnodes, self._lent = fields, dx, dnodes, False
+        self._linearised = now
         return True
 
     def _buffers(self, key: Key, mesh: Mesh) -> RationalBuffers:
@@ -255,10 +276,13 @@ class CovarianceFactor:
             self.fields,
             self.dnodes,
             self.dx,
+            self._linearised,
         )
 
     def restore(self, state: FactorState) -> None:
         """Return to a checkpoint."""
-        self.key, self.mesh, self.interpolation, self.beta, theta, self.fields, self.dnodes, self.dx = state
+        (
+            self.key, self.mesh, self.interpolation, self.beta, theta, self.fields, self.dnodes, self.dx, self._linearised,
+        ) = state  # fmt: skip
         self._lent = True
         self.theta = theta.copy()

@@ -22,7 +22,8 @@ Complexes = NDArray[np.complexfloating]
 MODES = 8  # slowest ones: those beyond have next to no part in what a load does to the tip
 MOST_STEPS = 4  # tips in between get interpolated columns; nothing is gained beyond, as measurements come every eighth step or sooner
 FOLLOWED_S = 0.5  # s: what older columns have said of a vibration has been corrected by measurements since
-LARGEST_ERROR = 0.1  # of a column: a deviation that errs by a tenth changes an NEES by a fifth
+# Of a column. An update moves the fields by columns: they keep this part of a correction, which may be several times the fused deviation.
+LARGEST_ERROR = 0.04
 LARGEST_GROWTH = 9.0  # exponent of the growth along the robot: rounding and differences are multiplied by its exponential, 8000
 LENGTH_STEP = 0.05  # relative change of the exposed length at which strides are chosen anew
 COST = {
