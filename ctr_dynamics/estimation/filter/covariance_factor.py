@@ -191,7 +191,8 @@ class CovarianceFactor:
     def propagate(self, record: Record, par: Floats, over_s: float) -> bool:
         """Move V over ``over_s`` (s), up to the end of the solved (sub)step ``record``.
 
-        The dynamics are linearised halfway between that end and the one at which this was last called. ``par`` (NP,): the parameter block. Returns False where that cannot be linearised, and V then stays.
+        The dynamics are linearised halfway between that end and the one at which this was last called. ``par`` (NP,): the parameter block.
+        Returns False where that cannot be linearised, and V then stays.
         """
         model, m = self.model, self.model.unknown_count
         beta = record.inputs[-1, input_rows(model.n)["beta"]]
@@ -199,7 +200,10 @@ class CovarianceFactor:
         if key != self.key:
             self._remap(key, mesh, beta)
         self.key, self.mesh, self.interpolation, self.beta = key, mesh, interpolation, beta
-        now = SolvedStage(record.key, record.rates[-1], record.found[-1], record.inputs[-1])
+        # copies: corrections write into what a record holds
+        now = SolvedStage(
+            record.key, record.rates[-1].copy(), record.found[-1].copy(), record.inputs[-1].copy()
+        )
         middle = now.between(self._linearised)
         rates = middle.rates
         if interpolation is not None:
