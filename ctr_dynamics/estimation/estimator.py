@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctr_dynamics.estimation.backbone import Backbone
+from ctr_dynamics.estimation.discretisation import discretise
 from ctr_dynamics.estimation.inputs.input_buffer import InputBuffer
 from ctr_dynamics.estimation.inputs.measurement_queue import tracker_of
 from ctr_dynamics.estimation.mode_tracker import ModeTracker
@@ -71,6 +72,7 @@ class Estimator:
         settings: the parameter table's values.
 
     Attributes:
+        discretisation: nodes of the model, and the errors to expect of it.
         health: counters and statuses.
         tracker: measurement model, with the parameters' corrections.
         step_times_s: s of every step, for those who set it to an empty array; else None.
@@ -93,7 +95,10 @@ class Estimator:
     def __init__(self, robot: Robot, settings: Settings) -> None:
         self.robot, self.settings = robot, settings
         self.options = EstimatorOptions()
-        self.model = Model(robot, nodes=int(settings["model.nodes"]))
+        self.discretisation = discretise(
+            robot, int(settings["model.nodes"]), float(settings["model.accuracy_m"])
+        )
+        self.model = Model(robot, nodes=self.discretisation.nodes)
         self.tracker = tracker_of(self.model, settings)
         self.health = Health(consistency=consistency_monitor(settings, robot.tracker.noise.position.value))
         self.health.fusing = bool(settings["filter.enabled"])
@@ -405,4 +410,5 @@ class Estimator:
 
     def summary(self) -> dict[str, Any]:
         """The estimator's part of a replay's summary."""
-        return self.health.summary()
+        numerics = {**self.discretisation.numerics(), "substeps": self.health.substeps_summary()}
+        return {**self.health.summary(), "numerics": numerics}

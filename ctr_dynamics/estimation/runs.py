@@ -121,8 +121,7 @@ class Runs:
         if not result.ok:
             self.fused.reinitialise(self.open_loop, k)
             return result
-        if result.substeps > 1:
-            self._health.substeps += 1
+        self._health.count_substeps(result.substeps)
         ekf, state = self.fused.ekf, self.fused.state
         assert state is not None
         # 2. Propagate the covariance, or reuse the stored one.
@@ -202,6 +201,13 @@ class Runs:
             ),
             open_loop.simulator.step(open_loop.state, t, open_loop.inputs_at, events=events),
         )
+
+    def rehearse_rescue(self, k: int) -> None:
+        """Step ``k`` as the rescue takes a hard one, on copies: it is compiled and in memory then."""
+        for run in (self.fused, self.open_loop):
+            steps = run.simulator.collocation
+            if steps is not None and run.state is not None:
+                steps.rescue(run.state.copy(), steps.scheme, seconds(k - 1), run.inputs_at, "end")
 
 
 def filter_options(settings: Settings) -> FilterOptions:

@@ -44,7 +44,24 @@ PARAMETERS: tuple[Parameter, ...] = (
         read_only=True,
     ),
     Parameter(
-        "model.nodes", "int", 12, "", "Number of arc-length nodes along the robot.", 8, 1000, read_only=True
+        "model.nodes",
+        "int",
+        12,
+        "",
+        "Least number of arc-length nodes along the robot; model.accuracy_m may want more.",
+        8,
+        1000,
+        read_only=True,
+    ),
+    Parameter(
+        "model.accuracy_m",
+        "float",
+        0.05e-3,
+        "m",
+        "Largest error of the tip by the nodes, rms over 4 s after a load is cut that deflects the tip by a third of its length.",
+        1e-6,
+        1.0,
+        read_only=True,
     ),
     Parameter(
         "model.tolerance",

@@ -29,7 +29,7 @@ def warm_up(robot: Robot, settings: Settings) -> int:
 
     The actuators turn and slide a little, a load comes and goes, and jumps once, so that a step is divided, and the tracker reports the predicted
     tip, now and then late enough to be fused by roll-back. For a while it contradicts the model, and corrections are put off for as long as they
-    may be: memory is then nearly what it will be at most. In the end each run takes a step by itself.
+    may be: memory is then nearly what it will be at most. In the end each run takes a step by itself, and the rescue of a hard one.
     """
     estimator = Estimator(robot, settings)
     encoder = StepEncoder(settings["output.frame_id"], robot.name)
@@ -59,4 +59,5 @@ def warm_up(robot: Robot, settings: Settings) -> int:
             estimator.add_tracker_pose(out.stamp_ns - age_ns, (x + beside, y, z), (*xyz, w))
     if estimator.runs.running:
         estimator.runs.apart(estimator.k + 1, [], record=True)
+        estimator.runs.rehearse_rescue(estimator.k + 2)
     return steps

@@ -70,6 +70,7 @@ class Health:
     Attributes:
         joints, tracker, load: input problems by kind.
         problem: why the last output is invalid; empty when it is valid.
+        propagated: steps whose ``substeps_taken`` are counted, and ``most_substeps`` of one.
         steps, failures, restarts, substeps, sweeps: of the runs; reasons: failures by reason. corrected_steps: taken again for late inputs.
         accepted, rejected, dropped, late: measurements. fusing: whether they are fused.
         nis_sum, nis_dof, nis_count: over all measurements that reached the gate.
@@ -100,6 +101,9 @@ class Health:
     recent: deque[tuple[float, bool]] = field(default_factory=lambda: deque(maxlen=RECENT))
     sweeps: int = 0
     substeps: int = 0
+    propagated: int = 0
+    substeps_taken: int = 0
+    most_substeps: int = 0
     corrected_steps: int = 0
     fusing: bool = True
     force_sigma: float = 0.0
@@ -231,6 +235,19 @@ class Health:
             "upper95": upper,
             "within": lower <= mean <= upper,
         }
+
+    def count_substeps(self, count: int) -> None:
+        """A step has been taken in ``count`` substeps."""
+        self.substeps += count > 1
+        self.propagated += 1
+        self.substeps_taken += count
+        self.most_substeps = max(self.most_substeps, count)
+
+    def substeps_summary(self) -> dict[str, float | None]:
+        """Substeps a step, in the mean and at most; None before the first step."""
+        if not self.propagated:
+            return {"mean": None, "max": None}
+        return {"mean": self.substeps_taken / self.propagated, "max": self.most_substeps}
 
     def summary(self) -> dict[str, Any]:
         """The counters as a replay's summary has them."""

@@ -1,0 +1,159 @@
+"""Nodes and steps for the accuracy that is asked, from the vibration modes at rest (docs/model.md, "Accuracy").
+
+The error of a mesh is in the modes' frequencies, and falls with the fourth power of the nodes. So do two meshes tell how many nodes a robot
+needs. The error of the steps is in the modes' phase and amplitude; a mode that is too fast for the steps is unresolved.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ctr_dynamics.errors import InputError
+from ctr_dynamics.estimation.timeline import DT
+from ctr_dynamics.estimation.vibration_modes import ModalBasis, modal_basis
+from ctr_dynamics.model.model import Model
+from ctr_dynamics.model.segments import growth
+from ctr_dynamics.model.statics import Statics
+from ctr_dynamics.model.time_scheme import Collocation, collocation
+from ctr_dynamics.robot import Robot
+
+Floats = NDArray[np.float64]
+MODES = 8  # of the basis; its Krylov space holds as many
+COARSE, FINE = 12, 24  # nodes of the meshes whose frequencies are compared
+MOST = 100  # nodes that are chosen: more cost several times the real time on any machine
+DURATION = 4.0  # s that a vibration is followed without damping
+DEFLECTION = 1.0 / 3.0  # of the exposed length: what a force of E I / L^2 on its tip does to a uniform tube
+GROWTH_PER_CELL = 1.2  # beyond 1.3 a mesh is unstable in time
+AMPLITUDE, PHASE, PERIODS = 0.02, 0.1, 50  # within which a resolved mode stays, the phase in rad
+
+
+RESOLVED_HZ = 103.0  # highest frequency that steps of 3 ms resolve so; a test holds it to `resolved`
+
+
+@dataclass(frozen=True)
+class Mode:
+    """A vibration mode at rest: frequency in Hz, damping ratio, amplitude m of the tip after the reference load, and whether the steps resolve it."""
+
+    frequency_hz: float
+    damping: float
+    amplitude_m: float
+    resolved: bool
+
+
+@dataclass(frozen=True)
+class Discretisation:
+    """Nodes of the model, and what errors to expect of the tip.
+
+    Attributes:
+        nodes: chosen.
+        space_error_m, time_error_m: rms over 4 s after a load is cut that deflects the tip by a third of the exposed length; None where the modes
+        are not known.
+        modes: the slowest at rest.
+    """
+
+    nodes: int
+    space_error_m: float | None
+    time_error_m: float | None
+    modes: tuple[Mode, ...]
+
+    def numerics(self) -> dict[str, Any]:
+        """For a summary."""
+        unresolved = [mode.frequency_hz for mode in self.modes if not mode.resolved]
+        return {
+            "nodes": self.nodes,
+            "space_error_m": self.space_error_m,
+            "time_error_m": self.time_error_m,
+            "unresolved_modes_hz": unresolved,
+            "modes": [asdict(mode) for mode in self.modes],
+        }
+
+
+def amplification(scheme: Collocation, z: NDArray[np.complexfloating]) -> NDArray[np.complex128]:
+    """By what a step multiplies the mode exp(z t / dt), z (k,)."""
+    C = scheme.coefficients.C * scheme.dt
+    inside = np.linalg.solve(
+        C[None] - z[:, None, None] * np.eye(len(C)), np.tile(C.sum(1), (len(z), 1))[..., None]
+    )
+    found: NDArray[np.complex128] = inside[:, -1, 0]
+    return found
+
+
+def resolved(scheme: Collocation, frequency_hz: Floats) -> NDArray[np.bool_]:
+    """Whether 50 undamped periods of each frequency (k,) keep 2 % of their amplitude and 0.1 rad of their phase."""
+    z = 2j * np.pi * frequency_hz * scheme.dt
+    ratio = amplification(scheme, z) * np.exp(-z)
+    steps = PERIODS / (frequency_hz * scheme.dt)
+    decay, phase = np.abs(ratio) ** steps, np.abs(np.angle(ratio)) * steps
+    return (np.abs(decay - 1.0) <= AMPLITUDE) & (phase <= PHASE) & (frequency_hz * scheme.dt < 0.5)
+
+
+def discretise(robot: Robot, least: int, accuracy_m: float) -> Discretisation:
+    """Nodes for which the error of the mesh stays below ``accuracy_m``, at ``least`` so many."""
+    scheme = collocation(DT)
+    coarse, reach = _modes_at(robot, COARSE)
+    fine, _ = _modes_at(robot, FINE)
+    model = Model(robot, nodes=COARSE)
+    beta = np.array(robot.rest.beta.value)
+    try:
+        _, mesh = model.mesh(beta)
+        steepest = max(
+            growth(model, mesh, beta, rate).sum() for rate in scheme.parted(DT / 2).coefficients.rates
+        )
+        least = max(least, math.ceil(steepest / GROWTH_PER_CELL) + 1)
+    except InputError:
+        return Discretisation(least, None, None, ())
+    if coarse is None or fine is None:
+        return Discretisation(least, None, None, ())
+    count = min(len(coarse.frequency_hz), len(fine.frequency_hz))
+    frequency, damping = fine.frequency_hz[:count], np.maximum(fine.damping[:count], 0.0)
+    amplitude = _amplitudes(fine, robot.n_tubes, reach)[:count]
+    followed = np.minimum(DURATION, 1.0 / np.maximum(damping * 2 * np.pi * frequency, 1e-12))
+    kept = resolved(scheme, frequency)
+    # of 4th order: the coarse mesh errs by 16/15 of what the two differ
+    shift = np.abs(coarse.frequency_hz[:count] / frequency - 1.0) / (1.0 - (COARSE / FINE) ** 4)
+    at_coarse = _tip_error(amplitude, kept * 2 * np.pi * frequency * followed * shift)
+    wanted = COARSE * (at_coarse / accuracy_m) ** 0.25
+    nodes = max(least, min(MOST, math.ceil(wanted)))
+    z = 2j * np.pi * frequency * DT
+    missed = np.abs(amplification(scheme, z) - np.exp(z)) * followed / DT
+    time_error = _tip_error(amplitude, kept * np.minimum(missed, 2.0))
+    modes = tuple(
+        Mode(float(f), float(d), float(a), bool(k))
+        for f, d, a, k in zip(frequency, damping, np.linalg.norm(amplitude, axis=1), kept, strict=True)
+    )
+    return Discretisation(nodes, at_coarse * (COARSE / nodes) ** 4, time_error, modes)
+
+
+def _modes_at(robot: Robot, nodes: int) -> tuple[ModalBasis | None, float]:
+    """Modes at rest on a mesh of ``nodes``, and the length (m) of tube 1 in front of the plate."""
+    model = Model(robot, nodes=nodes)
+    beta, alpha = np.array(robot.rest.beta.value), np.array(robot.rest.alpha.value)
+    reach = float(robot.lengths[0] + beta[0])
+    par = model.parameters.copy()
+    par[model.layout["alpha"]], par[model.layout["beta"]] = alpha, beta
+    try:
+        rest = Statics(model).solve(beta, alpha)
+    except InputError:
+        return None, reach
+    return (modal_basis(model, rest, par, beta, MODES) if rest.converged else None), reach
+
+
+def _amplitudes(basis: ModalBasis, n: int, reach: float) -> Floats:
+    """(m, 3) m, how much of every mode the reference force on the tip excites along each axis of ``ctr_base``."""
+    m = len(basis.frequency_hz)
+    by_force = 2.0 * np.abs(basis.by_inputs[:m, 2 * n : 2 * n + 3])
+    return DEFLECTION * reach * by_force / max(float(by_force.sum(axis=0).max()), 1e-300)
+
+
+def _tip_error(amplitude: Floats, phase: Floats) -> float:
+    """m, rms of the tip's error along the worst direction of the load, from the modes' ``amplitude`` (m, 3) and final errors of ``phase`` (m,) rad.
+
+    Modes of different frequencies add in the mean square. An error that grows with the time has an rms of its last value by sqrt 3, and so has a sine
+    by sqrt 2.
+    """
+    return float(np.linalg.norm(amplitude * phase[:, None], axis=0).max() / math.sqrt(6))
