@@ -202,7 +202,7 @@ class Runs:
             open_loop.simulator.step(open_loop.state, t, open_loop.inputs_at, events=events),
         )
 
-    def rehearse_rescue(self, k: int) -> None:
+    def warm_up_rescue(self, k: int) -> None:
         """Step ``k`` as the rescue takes a hard one, on copies: it is compiled and in memory then."""
         for run in (self.fused, self.open_loop):
             steps = run.simulator.collocation

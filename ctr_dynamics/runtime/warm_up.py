@@ -59,5 +59,5 @@ def warm_up(robot: Robot, settings: Settings) -> int:
             estimator.add_tracker_pose(out.stamp_ns - age_ns, (x + beside, y, z), (*xyz, w))
     if estimator.runs.running:
         estimator.runs.apart(estimator.k + 1, [], record=True)
-        estimator.runs.rehearse_rescue(estimator.k + 2)
+        estimator.runs.warm_up_rescue(estimator.k + 2)
     return steps
