@@ -24,6 +24,7 @@ from ctr_dynamics.estimation.mode_tracker import ModeTracker
 from ctr_dynamics.estimation.monitoring.consistency_monitor import consistency_monitor
 from ctr_dynamics.estimation.monitoring.health import Health
 from ctr_dynamics.estimation.monitoring.innovation_log import InnovationLog
+from ctr_dynamics.estimation.monitoring.settling import Settling
 from ctr_dynamics.estimation.monitoring.statuses import all_statuses
 from ctr_dynamics.estimation.out_of_sequence import OutOfSequence
 from ctr_dynamics.estimation.runs import Runs
@@ -48,7 +49,7 @@ class EstimatorOptions:
         modes_every: steps between refreshes of the vibration modes, 0.4 s.
         longest_without_idle: steps after which idle work is done without idle time, 0.2 s.
         retry_every: steps between starts while there is no equilibrium. Looking for one in vain takes longer than a step.
-        largest_deviation: m. A tip that is known no better than that is not estimated any more.
+        deviation_fraction: of tube 1's length: outputs with a larger deviation of the tip are invalid, where no parameter says otherwise.
         largest_gap: steps to catch up with at once, 3 s. Beyond, the model is reinitialised at the newest joints.
         lead_ns: what a live step takes, from waking to its messages.
         backwards: joint states in a row whose time ran backwards, after which the clock was set back or another bag begins.
@@ -58,7 +59,7 @@ class EstimatorOptions:
     modes_every: int = 132
     longest_without_idle: int = 66
     retry_every: int = 33
-    largest_deviation: float = 1.0
+    deviation_fraction: float = 0.05
     largest_gap: int = 1000
     lead_ns: int = 1_000_000
     backwards: int = 3
@@ -112,6 +113,10 @@ class Estimator:
         self._clear()
 
     def _clear(self) -> None:
+        self._settling = Settling(self.robot.tracker.noise.position.value)
+        self._watched: tuple[int, Floats] | None = (
+            None  # stamp and joints of a start, until they have told whether the robot moves
+        )
         self._no_start: tuple[int, str] | None = None  # step and reason of a start that found no equilibrium
         self._stability = StabilityWatch(self.model)
         self._stability_due = False
@@ -144,6 +149,7 @@ class Estimator:
             self.health.restarts += 1
         if from_ns is not None:
             self.late.changed(from_ns)
+        self._look_for_motion()
 
     def add_tracker_pose(
         self, stamp_ns: int, position: Sequence[float], quaternion_xyzw: Sequence[float], frame_id: str = ""
@@ -340,6 +346,8 @@ class Estimator:
             return self._invalid(k, reason)
         self.late.history.restart(k)
         self._modes.clear()
+        self._settling.start(self.timeline.stamp(k))
+        self._watched = self.timeline.stamp(k), self.inputs.joints.at(self.timeline.stamp(k))[0]
         return self._output(k, StepResult(True, "at rest", 0, 0, 0))
 
     # -- outputs --
@@ -355,40 +363,88 @@ class Estimator:
             health.failed("not finite")
             health.restarts += 1
             return self._invalid(k, "the estimate is not finite; the model is reinitialised at rest")
-        variance = tip.covariance[0, 0] + tip.covariance[1, 1] + tip.covariance[2, 2]
-        if variance > options.largest_deviation**2:
+        stamp = self.timeline.stamp(k)
+        self._inflate(tip.covariance, tip.position, stamp)
+        deviation = math.sqrt(max(tip.covariance[0, 0] + tip.covariance[1, 1] + tip.covariance[2, 2], 0.0))
+        if (
+            deviation > self.robot.tubes[0].length
+        ):  # a tip that is known no better than that is not estimated any more
             fused.reinitialise(self.runs.open_loop, k)
             self.late.history.record(k)
             health.failed("led astray")
             return self._invalid(
                 k,
-                f"the tracker has led the estimate astray: deviation of the tip {math.sqrt(variance):.2g} m, limit "
-                f"{options.largest_deviation:g} m; the filter is reinitialised from the open-loop run",
+                f"the tracker has led the estimate astray: deviation of the tip {deviation:.2g} m, limit "
+                f"{self.robot.tubes[0].length:g} m; the filter is reinitialised from the open-loop run",
             )
-        stamp = self.timeline.stamp(k)
         since = fused.measured_ns if fused.measured_ns is not None else self.t0_ns
         health.tracker_age_s = max(0.0, (stamp - (since or stamp)) * 1e-9)
-        problem = health.problem = self._problem(stamp)
+        innovations = self.innovations.take()
+        self._settling.take(innovations)
+        problem = health.problem = self._problem(stamp, deviation)
         self._stability_due |= k % options.stability_every == 0
         return StepOutput(
             stamp, k, not problem, problem, tip.position, tip.quaternion, tip.covariance[:6, :6], tip.twist, tip.covariance[6:, 6:],
             predicted[:3], predicted[3:], self._backbone.rows(fused.state), self._modes.measure(fused.state), fused.ekf.force,
-            tip.force_sigma, self.innovations.take(), SolverStats(result.iterations, result.sweeps, result.reason),
+            tip.force_sigma, innovations, SolverStats(result.iterations, result.sweeps, result.reason),
         )  # fmt: skip
 
     def _invalid(self, k: int, reason: str) -> StepOutput:
         self.health.problem = reason
         return StepOutput.invalid(self.timeline.stamp(k), k, reason, self.innovations.take())
 
-    def _problem(self, stamp: int) -> str:
-        """Why the output of that stamp (ns) cannot be trusted; empty when it can."""
+    def _inflate(self, covariance: Floats, position: Floats, stamp: int) -> None:
+        """Add to the ``covariance`` (12, 12) of the tip, in place, what the actuators may have done since the last joints.
+
+        A rotation moves the tip at its distance from the axis, or half the robot's length where tubes turn against each other; a translation
+        moves it by as much.
+        """
+        error = self.inputs.extrapolation_error(stamp)
+        if not error.any():
+            return
+        n = self.model.n
+        half = 0.5 * (self.robot.tubes[0].length + float(self.inputs.joints.values[-1][n]))
+        arm = max(half, math.hypot(position[0], position[1]))
+        age = (stamp - self.inputs.joints.stamps[-1]) * 1e-9
+        turned = float(error[:n] @ error[:n])
+        moved = arm**2 * turned + float(error[n:] @ error[n:])
+        for first, variance in ((0, moved), (3, turned)):
+            for i in range(first, first + 3):
+                covariance[i, i] += variance
+                covariance[6 + i, 6 + i] += variance * (2.0 / age) ** 2
+
+    def _problem(self, stamp: int, deviation: float) -> str:
+        """Why the output of that stamp (ns) and ``deviation`` of the tip (m) cannot be trusted; empty when it can."""
         age = (stamp - self.inputs.joints.stamps[-1]) * 1e-9
         limit = self.inputs.timeout_ns * 1e-9
         if age > limit:
             return f"joint states are missing: the last is {age:.3f} s old, limit {limit:g} s"
+        largest = float(self.settings["output.largest_deviation_m"])
+        largest = largest or self.options.deviation_fraction * self.robot.tubes[0].length
+        if deviation > largest:
+            return f"the tip is known to {1e3 * deviation:.1f} mm only, limit {1e3 * largest:.1f} mm"
         if self.health.fusing and self.health.rejecting:
             return "the tracker contradicts the model: most of its last measurements are outside the gate"
-        return ""
+        return self._settling.problem(stamp)
+
+    def _look_for_motion(self) -> None:
+        """Have outputs wait after a gap of the joints, or after a start, in which the robot moved."""
+        gap, settling, watched = self.inputs.gap, self._settling, self._watched
+        if gap is not None:
+            self.inputs.gap = None
+            if settling.moved(gap.change.tolist()) and self.runs.running:
+                missing = (gap.until_ns - gap.from_ns) * 1e-9
+                settling.begin(
+                    gap.until_ns, f"joint states were missing for {missing:.2f} s while the robot moved"
+                )
+        if watched is None or not self.inputs.joints.stamps:
+            return
+        stamp = self.inputs.joints.stamps[-1]
+        if stamp > watched[0] + settling.options.watched_s * 1e9:
+            self._watched = None
+        elif settling.moved((self.inputs.joints.values[-1] - watched[1]).tolist()):
+            self._watched = None
+            settling.begin(watched[0], "the estimate has started while the robot moved")
 
     # -- reports --
 

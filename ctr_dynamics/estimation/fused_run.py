@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctr_dynamics.estimation.filter.ekf import RodEkf
-from ctr_dynamics.estimation.filter.filter_records import FilterState
+from ctr_dynamics.estimation.filter.filter_records import FilterState, Update
 from ctr_dynamics.estimation.inputs.input_buffer import InputBuffer
 from ctr_dynamics.estimation.inputs.measurement_queue import DueMeasurement
 from ctr_dynamics.estimation.inputs.run_inputs import InterpolatedInputs, RunInputs
@@ -79,7 +79,9 @@ class FusedRun:
         for measurement, time_s, position, quaternion in due:
             measurement.fused_k = k
             motion, residual = self.residuals(time_s, position, quaternion, open_loop)
-            if self._health.fusing:
+            if self._inputs.missing_at(time_s - self.ekf.tracker.age):
+                update = Update.impossible("no joint states at its time")
+            elif self._health.fusing:
                 update = self.ekf.update(self.state, time_s, position, quaternion)
             else:
                 update = self.ekf.compare(time_s, position, quaternion)

@@ -92,8 +92,13 @@ class StateHistory:
             self.checkpoints.pop()  # the filter has been reinitialised or reduced since
         self.checkpoints.append(self.checkpoint(k))
         oldest = k - self._inputs.window_ns // STEP_NS - (self._every + 1)
+        # while joints are missing, the last checkpoint that they cover stays: what comes after is taken again when they come back
+        covered = self._inputs.covered_step(k)
         while len(self.checkpoints) > 1 and self.checkpoints[1].k <= oldest:
-            self.checkpoints.popleft()
+            if self.checkpoints[1].k > covered:
+                del self.checkpoints[1]
+            else:
+                self.checkpoints.popleft()
         self._inputs.forget_inputs(self.checkpoints[0].k)
 
     def checkpoint(self, k: int) -> Checkpoint:

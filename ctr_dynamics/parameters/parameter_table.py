@@ -252,6 +252,15 @@ PARAMETERS: tuple[Parameter, ...] = (
         60.0,
     ),
     Parameter(
+        "output.largest_deviation_m",
+        "float",
+        0.0,
+        "m",
+        "Largest standard deviation of the tip's position (root of the trace) at which outputs are valid. 0 stands for 5 % of tube 1's length.",
+        0.0,
+        1.0,
+    ),
+    Parameter(
         "output.backbone_every",
         "int",
         11,

@@ -154,6 +154,11 @@ class ActuatorSignal(Signal):
         self.values[first:] = list(self.actuators.behind_backlash(np.array(self._drive[first:]), before))
         return kind
 
+    @property
+    def drive_position(self) -> Floats:
+        """The last drive position (2 N,), before the backlash."""
+        return self._drive[-1] if self._loose else self.values[-1]
+
     def forget(self, before_ns: int) -> None:
         """Drop samples that no time from ``before_ns`` on needs, delayed as they are."""
         super().forget(before_ns - max(self.delay_ns, 0))

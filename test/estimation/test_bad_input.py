@@ -227,7 +227,7 @@ def test_actuator_jump(jump):
     assert [out.k for out in run.outputs] == list(range(401))
     assert all(out.valid for out in run.outputs[:100])
     assert all(out.valid for out in run.outputs[-60:])
-    failed = sum(not out.valid for out in run.outputs)
+    failed = sum("is known to" not in out.reason for out in run.outputs if not out.valid)
     assert run.estimator.health.failures >= failed
     assert status(run, "solver").level == (1 if failed else 0)
 
@@ -276,12 +276,12 @@ def test_snap_of_the_tubes():
     robot = load_robot("till2020_snap")
     alpha, beta = np.array(robot.rest.alpha.value), np.array(robot.rest.beta.value)
     messages = [
-        joints(0.01 * k, [alpha[0], alpha[1] + 2 * np.pi * min(k / 50, 1.0), *beta]) for k in range(151)
+        joints(0.01 * k, [alpha[0], alpha[1] + 2 * np.pi * min(k / 50, 1.0), *beta]) for k in range(241)
     ]
     run = play(messages, robot=robot)
     check_outputs(run)
     assert run.last.valid
-    assert run.last.k == 500
+    assert run.last.k == 800
 
 
 def test_snap_is_announced_in_the_diagnostics_before_it_happens():
@@ -290,8 +290,8 @@ def test_snap_is_announced_in_the_diagnostics_before_it_happens():
     snap, rate = s_curve(robot, robot.rest.beta.value, points=300).snap[0], 2.0
     made, encoder = estimator(None, robot), StepEncoder()
     warned, failed, outputs = [], [], []
-    for k in range(171):
-        turn = snap - 2.0 + rate * min(0.01 * k, 1.5)
+    for k in range(261):
+        turn = snap - 2.0 + rate * min(max(0.01 * k - 0.1, 0.0), 1.5)  # it starts at rest
         joints(0.01 * k, [-turn, 0.0, *robot.rest.beta.value]).give(made)
         for out in made.advance(START_NS + k * 10_000_000):
             outputs.append(out)
@@ -301,12 +301,13 @@ def test_snap_is_announced_in_the_diagnostics_before_it_happens():
                     warned.append(at)
             if not out.valid:
                 failed.append((at, out.reason))
-    assert 0.1 < warned[0] < 0.5  # the equilibrium is lost at 1 s
-    assert len(failed) <= MAX_FAILURES
-    assert all("step failed" in reason and at > 0.99 for at, reason in failed)
-    print(f"warned of at {warned[0]:.3f} s, failed {failed}")
+    assert 0.2 < warned[0] < 0.6  # the equilibrium is lost at 1.1 s
+    steps = [at for at, reason in failed if "step failed" in reason]
+    assert len(steps) <= MAX_FAILURES
+    assert all(at > 1.09 for at, _ in failed)
+    assert len(failed) == len(steps) or "started while the robot moved" in failed[-1][1]
     assert outputs[-1].valid
-    assert made.health.restarts == (len(failed) == MAX_FAILURES)  # or a step behind the snap succeeds
+    assert made.health.restarts == (len(steps) == MAX_FAILURES)  # or a step behind the snap succeeds
     [stability] = [s for s in all_statuses(made.health) if s.name == "stability"]
     assert stability.message.startswith("stable")
 

@@ -26,6 +26,38 @@ Floats = NDArray[np.float64]
 LOAD_GRACE_NS = 100_000_000  # a first load that comes this soon after the joints is there from the start: nodes start one after another
 
 
+SMOOTHED_NS, INTERVALS = (
+    40_000_000,
+    4,
+)  # accelerations are looked for in the last 0.16 s; encoder noise is small in rates over 40 ms
+LONGEST_BRIDGE = 1000  # steps that are taken again, along a straight line, where joints come back after a gap
+
+
+class JointGap(NamedTuple):
+    """Joints were missing from ``from_ns`` to ``until_ns`` and have changed by ``change`` (2 N,), rad and m, meanwhile."""
+
+    from_ns: int
+    until_ns: int
+    change: Floats
+
+
+def largest_acceleration(stamps: Sequence[int], values: Sequence[Floats]) -> Floats:
+    """Largest acceleration (size,) of a signal of late, 1/s^2: from its mean rates over the last intervals of ``SMOOTHED_NS``."""
+    ends = [len(stamps) - 1]
+    while len(ends) <= INTERVALS:
+        before = bisect.bisect_right(stamps, stamps[ends[-1]] - SMOOTHED_NS) - 1
+        if before < 0:
+            break
+        ends.append(before)
+    times = np.array([stamps[i] for i in ends], dtype=float) * 1e-9
+    places = np.array([values[i] for i in ends])
+    if len(ends) < 3:
+        return np.zeros(places.shape[1])
+    rates = np.diff(places, axis=0) / np.diff(times)[:, None]
+    middles = 0.5 * (times[1:] + times[:-1])
+    return np.abs(np.diff(rates, axis=0) / np.diff(middles)[:, None]).max(axis=0)
+
+
 class LoadChange(NamedTuple):
     """A load that changes what was known: from the stamp ``from_ns`` on, and whether it has ``jumped``."""
 
@@ -45,6 +77,7 @@ class InputBuffer:
     Attributes:
         timeline: where the estimator stands.
         joints, load: by stamp. measurements: the measurement queue. backwards: joint states in a row whose time ran backwards.
+        gap: the last one of the joints, until somebody sets it to None.
         window_ns: how late an input may come. timeout_ns: how long after the last joints steps are taken without.
         extrapolating: whether steps are taken on time, with extrapolated joints.
     """
@@ -70,6 +103,8 @@ class InputBuffer:
         self._opening: int | None = None  # ns of the value without load that was put before the first load
         self.measurements.clear()
         self.backwards = 0
+        self.gap: JointGap | None = None
+        self._accelerations: tuple[int, Floats] | None = None  # of the actuators, and the stamp up to which
 
     def carry_load(self, load: Signal) -> None:
         """Have of loads only the last one of ``load``: what hangs on the robot does so whatever the estimator is told.
@@ -107,15 +142,12 @@ class InputBuffer:
         self.backwards = 0
         last = self.joints.stamps[-1] if self.joints.stamps else None
         taken = self.timeline.taken_ns
-        if (
-            last is not None
-            and taken is not None
-            and last < taken < stamp_ns
-            and taken - last > self.timeout_ns
-        ):
-            # steps were taken with the held value: go on from there, not from a straight line over the gap
-            held, _ = Signal.at(self.joints, taken, self.timeout_ns if self.extrapolating else 0)
-            self.joints.add(taken, held)
+        if last is not None and stamp_ns - last > self.timeout_ns:
+            self.gap = JointGap(last, stamp_ns, value - self.joints.drive_position)
+            if taken is not None and taken < stamp_ns and taken - last > LONGEST_BRIDGE * STEP_NS:
+                # too many steps were taken with the held value to be taken again: go on from there, not from a straight line over the gap
+                held, _ = Signal.at(self.joints, taken, self.timeout_ns if self.extrapolating else 0)
+                self.joints.add(taken, held)
         kind = self.joints.add(stamp_ns, value)
         if kind == "duplicate":
             self.health.note(
@@ -201,6 +233,29 @@ class InputBuffer:
         end_ns = t0_ns + k * STEP_NS
         found = self.load.slope_changes(end_ns - STEP_NS, end_ns, self._least_change)
         return [(stamp - t0_ns) * 1e-9 for stamp in found]
+
+    def covered_step(self, k: int) -> int:
+        """The last step up to ``k`` that joints cover; ``k`` where they have been missing for too long to take steps again."""
+        covered = (self.joints.stamps[-1] - self.timeline.stamp(0)) // STEP_NS
+        return min(k, covered) if k - covered <= LONGEST_BRIDGE else k
+
+    def extrapolation_error(self, time_ns: int) -> Floats:
+        """(2 N,) deviation of actuators (rad and m) that are extrapolated to ``time_ns``: by the accelerations they have had of late."""
+        stamps, values = self.joints.stamps, self.joints.values
+        age = (time_ns - stamps[-1]) * 1e-9
+        if age <= 0.0:
+            return np.zeros(self.joints.size)
+        if self._accelerations is None or self._accelerations[0] != stamps[-1]:
+            self._accelerations = stamps[-1], largest_acceleration(stamps, values)
+        return (0.5 * age**2) * self._accelerations[1]
+
+    def missing_at(self, time_s: float) -> bool:
+        """Whether no joint states around ``time_s`` (s from t0) tell what drove the robot then: a gap longer than the timeout, over or not."""
+        assert self.t0_ns is not None
+        stamps, time_ns = self.joints.stamps, self.t0_ns + time_s * 1e9
+        i = bisect.bisect_left(stamps, time_ns)
+        until = time_ns if i == len(stamps) else stamps[i]
+        return i > 0 and until - stamps[i - 1] > self.timeout_ns
 
     def covers_no_more(self, k: int) -> bool:
         """Whether step ``k`` is the last one that a joint state covers; joints that are not in yet are taken to hold their rhythm."""

@@ -1,0 +1,117 @@
+"""After a start or a gap of the joints in motion the model does not know how the robot moves; outputs wait until measurements agree with it.
+
+A model that starts at rest, or whose actuators took an unknown path, lacks the vibration that the robot has. No covariance holds that, so
+nothing is published until measurements in a row have been within the gate. Without measurements the vibration has to die down.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ctr_dynamics import chi_square
+from ctr_dynamics.estimation.step_output import Innovation
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class SettlingOptions:
+    """When the outputs count again.
+
+    Attributes:
+        agreeing: measurements in a row within the gate, 0.2 s at 40 Hz: about a period of a slow vibration.
+        longest_s: s. Without measurements the outputs count again after that time.
+        watched_s: s after a start in which the joints tell whether the robot moves.
+        vibrating: probability with which the change of the open-loop residual between the first measurements is more than noise.
+        compared_s: s after a start in which they are compared.
+        moved_rad, moved_m: by any joint in that time or over a gap. Less makes no vibration that counts.
+    """
+
+    agreeing: int = 8
+    longest_s: float = 1.2
+    watched_s: float = 0.05
+    moved_rad: float = 0.01
+    moved_m: float = 5e-4
+    vibrating: float = 0.9999
+    compared_s: float = 0.2
+
+
+class Settling:
+    """Whether the outputs have to wait, and why.
+
+    Args:
+        noise: m per axis, deviation of a measured position.
+        options: when the outputs count again.
+    """
+
+    def __init__(self, noise: float, options: SettlingOptions | None = None) -> None:
+        self.options = options or SettlingOptions()
+        self._limit = 2.0 * noise**2 * chi_square.quantile(self.options.vibrating, 3)
+        self.clear()
+
+    def clear(self) -> None:
+        """Nothing to wait for."""
+        self._since_ns: int | None = None
+        self._why = ""
+        self._agreed = 0
+        self._start_ns: int | None = None
+        self._residual: Floats | None = None
+
+    def start(self, stamp_ns: int) -> None:
+        """The model starts at rest at ``stamp_ns``."""
+        self.clear()
+        self._start_ns = stamp_ns
+
+    def begin(self, stamp_ns: int, why: str) -> None:
+        """The model does not know how the robot moves at ``stamp_ns``, and ``why``, in words."""
+        self._since_ns, self._why, self._agreed = stamp_ns, why, 0
+
+    def moved(self, change: Sequence[float]) -> bool:
+        """Whether joints that changed by ``change`` (2 N,), rotations (rad) and then translations (m), moved the robot."""
+        n = len(change) // 2
+        options = self.options
+        return any(abs(x) > options.moved_rad for x in change[:n]) or any(
+            abs(x) > options.moved_m for x in change[n:]
+        )
+
+    def take(self, innovations: Sequence[Innovation]) -> None:
+        """Count measurements of this step that agree."""
+        for innovation in innovations:
+            self._compare(innovation)
+            if self._since_ns is None:
+                continue
+            if innovation.stamp_ns >= self._since_ns and innovation.dof:
+                self._agreed = self._agreed + 1 if innovation.accepted and not innovation.reason else 0
+
+    def _compare(self, innovation: Innovation) -> None:
+        """A robot that vibrates where the model starts at rest shows in how the open-loop residual changes."""
+        start, motion = self._start_ns, innovation.motion
+        if start is None or motion is None or innovation.stamp_ns < start:
+            return
+        if innovation.stamp_ns > start + self.options.compared_s * 1e9:
+            self._start_ns = self._residual = None
+            return
+        before, self._residual = self._residual, motion.residual
+        if before is None:
+            return
+        change = motion.residual - before
+        if float(change @ change) > self._limit and self._since_ns is None:
+            self.begin(innovation.stamp_ns, "the estimate has started while the robot moved")
+
+    def problem(self, stamp_ns: int) -> str:
+        """Why the output of ``stamp_ns`` does not count yet; empty where it does."""
+        if self._since_ns is None:
+            return ""
+        options = self.options
+        waited = (stamp_ns - self._since_ns) * 1e-9
+        if self._agreed >= options.agreeing or waited > options.longest_s:
+            self._since_ns = None
+            return ""
+        return (
+            f"{self._why}: how it moves is not known yet; {self._agreed} measurements in a row agree, limit {options.agreeing}, "
+            f"{waited:.2f} s have passed, limit {options.longest_s:g} s"
+        )

@@ -1,0 +1,92 @@
+"""Outputs wait after a start in motion, and the estimate goes on along the gap where joints come back."""
+
+import numpy as np
+import pytest
+from estimation_cases import START_NS, bag_messages, play, rms
+
+from ctr_dynamics.estimation.monitoring.settling import Settling, SettlingOptions
+from ctr_dynamics.estimation.step_output import Innovation, MotionPoint
+
+NOISE, MS = 2.5e-4, 1_000_000
+
+
+def innovation(at_ms, residual=(0.0, 0.0, 0.0), reason=""):
+    motion = MotionPoint(np.array(residual), *np.zeros((7, 3)))
+    return Innovation(
+        at_ms * MS, np.zeros(6), np.ones(6), 6.0, 6, not reason, 0.0, reason, np.ones(6), motion
+    )
+
+
+def test_outputs_count_again_after_measurements_in_a_row():
+    settling, options = Settling(NOISE), SettlingOptions()
+    assert not settling.problem(0)
+    settling.begin(1000 * MS, "joints were missing")
+    assert "joints were missing" in settling.problem(1001 * MS)
+    for i in range(options.agreeing - 1):
+        settling.take([innovation(1010 + i)])
+    settling.take([innovation(1100, reason="outside the gate")])
+    for i in range(options.agreeing - 1):
+        settling.take([innovation(1101 + i)])
+    assert settling.problem(1200 * MS)
+    settling.take([innovation(1201)])
+    assert not settling.problem(1202 * MS)
+    settling.begin(2000 * MS, "again")
+    assert settling.problem(1999 * MS + round(options.longest_s * 1e9))
+    assert not settling.problem(2001 * MS + round(options.longest_s * 1e9))
+
+
+@pytest.mark.parametrize(("change", "waits"), [(0.0003, False), (0.003, True)])
+def test_a_residual_that_changes_after_a_start_shows_motion(change, waits):
+    settling = Settling(NOISE)
+    settling.start(0)
+    settling.take([innovation(10, (0.005, 0.0, 0.0)), innovation(35, (0.005 + change, 0.0, 0.0))])
+    assert bool(settling.problem(36 * MS)) == waits
+
+
+def test_joints_that_move_after_a_start_make_outputs_wait():
+    messages = [m for m in bag_messages("clean_sweep", 2.5) if m.stamp >= 2e9]
+    run = play(messages)
+    invalid = [out for out in run.outputs if not out.valid]
+    assert invalid
+    assert all("while the robot moved" in out.reason for out in invalid)
+    assert run.outputs[-1].valid
+
+
+@pytest.mark.parametrize("policy", ["predict", "wait"])
+def test_after_a_gap_in_motion_the_estimate_is_where_it_would_have_been(policy):
+    messages = bag_messages("clean_sweep", 3.0)
+    whole = play(messages, {"output.policy": policy})
+    gap = [m for m in messages if m.kind != "joints" or not 1.5e9 < m.stamp < 1.9e9]
+    run = play(gap, {"output.policy": policy})
+    by_k = {out.k: out for out in whole.outputs}
+    after = [(out, by_k[out.k]) for out in run.outputs if out.stamp_ns > START_NS + 1_920_000_000]
+    assert any("missing for 0.4" in out.reason for out, _ in after)
+    difference = [out.tip_position - other.tip_position for out, other in after if out.valid]
+    assert len(difference) > 200
+    assert rms(np.array(difference)) < 5e-4
+    assert np.abs(difference).max() < 1.5e-3
+
+
+def test_extrapolated_actuators_are_as_uncertain_as_they_accelerate():
+    """A sine of 1 Hz and 0.5 rad that falls silent: the tip's deviation covers what the hold of the last rate errs by."""
+    messages = [m for m in bag_messages("clean_sweep", 2.1) if m.kind != "joints" or m.stamp < 2.0e9]
+    whole, run = (
+        play(bag_messages("clean_sweep", 2.1)),
+        play(messages, {"output.policy": "predict"}, tick=0.003),
+    )
+    right = {out.k: out.tip_position for out in whole.outputs}
+    silent = [out for out in run.outputs if 2.01e9 < out.stamp_ns - START_NS < 2.09e9 and out.k in right]
+    assert len(silent) > 20
+    for out in silent:
+        deviation = np.sqrt(np.trace(out.tip_covariance[:3, :3]))
+        assert np.linalg.norm(out.tip_position - right[out.k]) < 3.0 * deviation
+    assert np.trace(silent[-1].tip_covariance[:3, :3]) > 4.0 * np.trace(silent[0].tip_covariance[:3, :3])
+
+
+def test_outputs_are_invalid_where_the_tip_is_not_known_well_enough():
+    messages = bag_messages("clean_sweep", 0.3)
+    usual, strict = play(messages), play(messages, {"output.largest_deviation_m": 1e-4})
+    assert all(out.valid for out in usual.outputs)
+    invalid = [out for out in strict.outputs if not out.valid]
+    assert invalid
+    assert all("is known to" in out.reason and "limit 0.1 mm" in out.reason for out in invalid)
