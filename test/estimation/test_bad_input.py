@@ -226,7 +226,8 @@ def test_actuator_jump(jump):
     check_outputs(run)
     assert [out.k for out in run.outputs] == list(range(401))
     assert all(out.valid for out in run.outputs[:100])
-    assert all(out.valid for out in run.outputs[-60:])
+    # as far as the file's tolerances let the vibration be known
+    assert all(out.valid or "is known to" in out.reason for out in run.outputs[-60:])
     failed = sum("is known to" not in out.reason for out in run.outputs if not out.valid)
     assert run.estimator.health.failures >= failed
     assert status(run, "solver").level == (1 if failed else 0)

@@ -78,7 +78,7 @@ def test_late_joints_under_predict_end_as_in_time_under_wait(sweep, in_time):
     assert run.last.k == last.k
     # steps taken again reuse their stored covariance, and both runs end within the solver's tolerance
     assert np.abs(run.last.tip_position - last.tip_position).max() < 2e-6
-    assert np.abs(run.last.tip_velocity - last.tip_velocity).max() < 1e-3
+    assert np.abs(run.last.tip_velocity - last.tip_velocity).max() < 3e-3
     variance = np.diag(last.tip_covariance)
     # the stored covariance was that of extrapolated joints: a few percent in variance
     assert np.abs(np.diag(run.last.tip_covariance) - variance).max() < 5e-2 * variance.max()
