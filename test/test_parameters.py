@@ -210,7 +210,8 @@ def test_a_least_deviation_above_the_largest_is_rejected():
     with pytest.raises(
         InputError, match=r"tip_force_sigma_N is 0\.3 N, limit filter\.tip_force_sigma_max_N, 0\.2 N"
     ):
-        Settings({"filter.tip_force_sigma_N": 0.3})
+        Settings({"filter.tip_force_sigma_N": 0.3, "filter.tip_force_sigma_max_N": 0.2})
+    Settings({"filter.tip_force_sigma_N": 0.3})
     Settings({"filter.tip_force_sigma_N": 0.3, "filter.tip_force_sigma_max_N": 0.3})
 
 

@@ -25,8 +25,17 @@ def bench(
         Path | None,
         typer.Option(metavar="BAG", help="Bag of till2020_tissue to replay; default: the shipped one."),
     ] = None,
+    fleet: Annotated[
+        int,
+        typer.Option(
+            "--fleet",
+            metavar="N",
+            min=0,
+            help="Measure the filter's consistency alone: N bags of each robot of the fleet.",
+        ),
+    ] = 0,
 ) -> int:
-    """Measure cost per step, real-time ratios and tick times.
+    """Measure cost per step, real-time ratios and tick times; with --fleet errors, NEES and NIS of the filter.
 
     Figures depend on the machine and on what else it does: both are recorded, and costs are given as multiples
     of a plain sweep measured in the same run as well.
@@ -41,6 +50,8 @@ def bench(
 
     check_targets({"page": page}, {"bag": bag})
     output_folder(output)
+    if fleet:
+        return _fleet(fleet, output)
     result = measure(bag or shipped_bag(), quick, say)
     with atomic_file(output / "bench.json") as part:
         part.write_text(json.dumps(result, indent=1, allow_nan=False) + "\n", encoding="utf-8")
@@ -60,3 +71,16 @@ def bench(
         result["snap"],
     ]
     return 1 if any(row["failure"] for row in rows) else 0
+
+
+def _fleet(draws: int, output: Path) -> int:
+    """NEES, NIS and errors of robots drawn from their tolerances, as a table and ``fleet.json``."""
+    from ctr_dynamics.benchmarks.fleet import fleet, table
+    from ctr_dynamics.runtime.replay import plain
+
+    rows = fleet(draws, say=lambda line: print(f"bench: {line}", file=sys.stderr, flush=True))
+    with atomic_file(output / "fleet.json") as part:
+        part.write_text(json.dumps(plain(rows), indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    print(table(rows))
+    print(f"\noutput  {output / 'fleet.json'}")
+    return 1 if any(row["failures"] for row in rows) else 0

@@ -97,20 +97,20 @@ PARAMETERS: tuple[Parameter, ...] = (
     Parameter(
         "filter.tip_force_sigma_N",
         "float",
-        0.00005,
+        0.0,
         "N",
-        "Smallest standard deviation per axis of the unknown tip force. The low end of the range practically switches the force off.",
-        1e-6,
+        "Smallest standard deviation per axis of the unknown tip force; 0: what moves the tip by half a percent of the tracker's noise.",
+        0.0,
         10.0,
     ),
     Parameter(
         "filter.tip_force_sigma_max_N",
         "float",
-        0.2,
+        0.0,
         "N",
-        "Largest standard deviation per axis of the unknown tip force. "
+        "Largest standard deviation per axis of the unknown tip force; 0: what bends the robot by a tenth of its exposed length. "
         "The innovations decide between the smallest and the largest; equal values fix it.",
-        1e-6,
+        0.0,
         10.0,
     ),
     Parameter(

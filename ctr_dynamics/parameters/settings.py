@@ -34,7 +34,7 @@ class Settings(Mapping[str, Value]):
             checked[name] = parameter(name).check(value)
         self._values = checked
         least, most = self["filter.tip_force_sigma_N"], self["filter.tip_force_sigma_max_N"]
-        if least > most:
+        if 0.0 < most < least:
             raise InputError(
                 f"filter.tip_force_sigma_N is {least:g} N, limit filter.tip_force_sigma_max_N, {most:g} N",
                 do="lower the one or raise the other",

@@ -8,7 +8,7 @@ import pytest
 import ctr_dynamics.estimation.filter.covariance_factor as factor_module
 from ctr_dynamics.estimation.energy_norm import energy_rows, field_weights
 from ctr_dynamics.estimation.filter.covariance_factor import CovarianceFactor
-from ctr_dynamics.estimation.filter.parameter_priors import model_uncertainty
+from ctr_dynamics.estimation.filter.parameter_priors import force_range, model_uncertainty, tip_compliance
 from ctr_dynamics.kernels.layout import base_field_count
 from ctr_dynamics.model.mesh import build_mesh
 from ctr_dynamics.model.mesh_interpolation import coarse_key, mesh_interpolation
@@ -119,6 +119,32 @@ def test_an_equilibrium_that_cannot_be_linearised_begins_without_deviation(model
     assert not factor.fields.any()
     assert not factor.dnodes.any()
     assert factor.theta.any()
+
+
+def test_the_force_s_range_follows_the_robot_s_compliance(robot, model):
+    """Of the straight cantilever that the formula is for, a precurved robot under gravity has the compliance to a third."""
+    push = 1e-4
+    statics = Statics(model)
+    tips = [statics.solve(BETA, ALPHA, np.array([0.0, 0.0, f])).tip_position for f in (push, -push)]
+    across = [statics.solve(BETA, ALPHA, np.array([f, 0.0, 0.0])).tip_position for f in (push, -push)]
+    found = max(np.linalg.norm(a - b) for a, b in (tips, across)) / (2 * push)
+    assert tip_compliance(robot) == pytest.approx(found, rel=0.35)
+    least, most = force_range(robot, 0.0, 0.0)
+    assert least * tip_compliance(robot) == pytest.approx(0.005 * robot.tracker.noise.position.value)
+    assert most * tip_compliance(robot) == pytest.approx(0.1 * (robot.lengths[0] + robot.rest.beta.value[0]))
+    assert force_range(robot, 1e-3, 0.0) == (1e-3, most)
+    assert force_range(robot, 0.0, 1e-6) == (1e-6, 1e-6)
+
+
+def test_the_speed_scale_of_friction_may_be_uncertain(robot):
+    friction = robot.friction.model_copy(
+        update={"epsilon": robot.friction.epsilon.model_copy(update={"tolerance": 3.0})}
+    )
+    model = Model(robot.model_copy(update={"friction": friction}))
+    unc = model_uncertainty(model)
+    i = unc.names.index("friction_epsilon")
+    assert unc.sigma[i] == pytest.approx(0.2)
+    assert unc.effect[model.layout["epsilon"], i] == pytest.approx(15.0)
 
 
 # -- propagation --

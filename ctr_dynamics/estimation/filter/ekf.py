@@ -24,7 +24,7 @@ from ctr_dynamics.estimation.filter.filter_records import (
     Update,
 )
 from ctr_dynamics.estimation.filter.gating import Gate
-from ctr_dynamics.estimation.filter.parameter_priors import model_uncertainty
+from ctr_dynamics.estimation.filter.parameter_priors import force_range, model_uncertainty
 from ctr_dynamics.estimation.filter.process_noise import ProcessNoise
 from ctr_dynamics.estimation.filter.rational_step import ColumnStrides, exposed
 from ctr_dynamics.estimation.filter.tip_window import TipWindow, insertion_fraction
@@ -61,8 +61,10 @@ class RodEkf:
         self.model: Model = simulator.model
         self.uncertainty = model_uncertainty(self.model)
         self._force = self.uncertainty.force
-        sigma = np.where(self.uncertainty.sigma > 0, self.uncertainty.sigma, options.force_sigma)
+        least, most = force_range(self.model.robot, options.force_sigma, options.force_sigma_max)
+        sigma = np.where(self.uncertainty.sigma > 0, self.uncertainty.sigma, least)
         self._parameter_weights = (options.parameter_energy / sigma)[:, None]
+        self._least_force = least
         self.nominal = simulator.parameters.copy()
         self.theta = np.zeros(len(self.uncertainty.names))
         self.bias = np.zeros(STATES)
@@ -72,7 +74,7 @@ class RodEkf:
         dt = simulator.scheme.dt
         oldest = options.window + max(0.0, tracker.delay) + tracker.averaging
         self.tips = TipWindow(math.ceil(oldest / dt) + 5)
-        force = ForceRange(options.force_sigma, options.force_sigma_max, options.force_change)
+        force = ForceRange(least, most, options.force_change)
         noise = self.model.robot.tracker.noise.position.value
         self.adapted = AdaptedVariances(force, noise, self.model.robot.tubes[0].length)
         self._noise = ProcessNoise(self.model.robot, dt, self._force, options.force_time, self.adapted)
@@ -102,7 +104,7 @@ class RodEkf:
         scale = np.diag(self.factor.theta)[self._force]
         for axis, size in enumerate(scale):
             i = self._force.start + axis
-            self.pi[i, i] = (self.options.force_sigma / size) ** 2
+            self.pi[i, i] = (self._least_force / size) ** 2
         self.adapted.start(self.pi, self._force)
         self.tips.clear(r)
         self._reduce()

@@ -27,8 +27,8 @@ class FilterOptions:
     """
 
     rank: int = 24
-    force_sigma: float = 0.00005
-    force_sigma_max: float = 0.2
+    force_sigma: float = 0.0
+    force_sigma_max: float = 0.0
     force_change: float = 20.0
     force_time: float = 0.3
     window: float = 0.2

@@ -71,6 +71,31 @@ class ModelUncertainty:
         return x
 
 
+# The range of the unknown tip force by what it does to the robot: the least moves the tip by this part of the tracker's noise, which no innovation
+# shows; the most bends the robot by this part of its exposed length, about as far as small strains go.
+LEAST_MOVED, MOST_MOVED = 0.005, 0.1
+
+
+def tip_compliance(robot: Robot) -> float:
+    """m/N across the robot at its rest position: a cantilever of the tubes' summed bending stiffness, int (L - s)^2 / (E I) ds."""
+    ends = np.array(robot.lengths) + np.array(robot.rest.beta.value)
+    stiffness = np.array([tube.bending_stiffness for tube in robot.tubes])
+    exposed, compliance, begin = float(ends[0]), 0.0, 0.0
+    for end in sorted(e for e in ends if e > 0.0):
+        present = stiffness[ends > 0.5 * (begin + end)].sum()
+        compliance += ((exposed - begin) ** 3 - (exposed - end) ** 3) / (3.0 * present)
+        begin = end
+    return float(compliance)
+
+
+def force_range(robot: Robot, least: float, most: float) -> tuple[float, float]:
+    """Deviations (N) between which that of the unknown tip force lies; those given as 0 come from the robot's compliance."""
+    compliance = tip_compliance(robot)
+    exposed = float(robot.lengths[0] + robot.rest.beta.value[0])
+    most = most or max(MOST_MOVED * exposed / compliance, least)
+    return least or min(LEAST_MOVED * robot.tracker.noise.position.value / compliance, most), most
+
+
 def model_uncertainty(model: Model) -> ModelUncertainty:
     """Uncertain parameters of ``model`` from its robot file's tolerances; those with tolerance 0 are left out."""
     robot: Robot = model.robot
@@ -119,6 +144,7 @@ def model_uncertainty(model: Model) -> ModelUncertainty:
         ("tube_viscous", robot.friction.tubes.viscous),
     ):
         add(name, quantity.relative, scaled((name, 0)))
+    add("friction_epsilon", robot.friction.epsilon.relative, scaled(("epsilon", 0)))
     g = np.array(robot.gravity.value)
     if np.any(g):
         across = np.linalg.svd(g[None] / np.linalg.norm(g))[2][1:]
