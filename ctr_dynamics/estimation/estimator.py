@@ -385,7 +385,7 @@ class Estimator:
         self._stability_due |= k % options.stability_every == 0
         return StepOutput(
             stamp, k, not problem, problem, tip.position, tip.quaternion, tip.covariance[:6, :6], tip.twist, tip.covariance[6:, 6:],
-            predicted[:3], predicted[3:], self._backbone.rows(fused.state), self._modes.measure(fused.state), fused.ekf.force,
+            predicted[:3], predicted[3:], self._backbone.rows(fused.state), self._modes.measure(fused.state, k), fused.ekf.force,
             tip.force_sigma, innovations, SolverStats(result.iterations, result.sweeps, result.reason),
         )  # fmt: skip
 

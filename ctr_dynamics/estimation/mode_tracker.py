@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctr_dynamics.estimation.step_output import Modes
+from ctr_dynamics.estimation.timeline import seconds
 from ctr_dynamics.estimation.vibration_modes import ModalBasis, lanes_of, modal_parts
 from ctr_dynamics.kernels.structures import SweepBuffers
 from ctr_dynamics.model.mesh import Key
@@ -56,11 +57,13 @@ class ModeTracker:
         self.coarse = model if model.nodes <= nodes else Model(model.robot, nodes, model.base_cells)
         self._interpolations: dict[tuple[Key, Key], MeshInterpolation] = {}
         self._buffers: dict[Key, SweepBuffers] = {}
+        self._former: ModalBasis | None = None  # the last modes found, on the coarse mesh
         self.clear()
 
     def clear(self) -> None:
-        """Forget the modes."""
+        """Forget the modes, but for what continues them in order and sign."""
         self._basis: ModalBasis | None = None
+        self._load: tuple[int, Floats] | None = None  # step and load (6,) of the last measurement
         self._age = self.every
         self._pending: Iterator[ModalBasis | None] | None = None
         self._own: Equilibrium | None = None
@@ -75,14 +78,19 @@ class ModeTracker:
         """Whether a refresh has begun and has parts left."""
         return self._pending is not None
 
-    def measure(self, state: State) -> Modes:
-        """Modes in ``state``; to be called once a step."""
+    def measure(self, state: State, k: int) -> Modes:
+        """Modes in ``state`` at step ``k``; to be called once a step."""
         self._age += 1
         if self._own is not None and self._own.key != state.key:
             self.clear()
         if self._basis is None:
             return Modes.none()
-        return self._basis.measure(state.fields, state.inputs)
+        load = np.concatenate([state.inputs.force, state.inputs.torque])
+        before, self._load = self._load, (k, load)
+        rate = None
+        if before is not None and before[0] < k and (load != before[1]).any():
+            rate = (load - before[1]) / seconds(k - before[0])
+        return self._basis.measure(state.fields, state.inputs, rate)
 
     def refresh(self, state: State, parameters: Floats) -> None:
         """A part of the work that renews the modes, where they are old, about ``state`` with the parameter block (NP,)."""
@@ -92,6 +100,9 @@ class ModeTracker:
                 self._pending = None
             elif isinstance(part, ModalBasis):
                 assert self._own is not None
+                if self._former is not None:
+                    part = part.aligned_with(self._former)
+                self._former = part
                 readout = (
                     part.readout
                     if self._interpolation is None

@@ -16,18 +16,26 @@ FUSION_OFF = "fusion is off"
 
 
 class Modes(NamedTuple):
-    """Slowest vibration modes: frequency_hz (m,), damping ratio (m,), amplitude (m,) m and rate (m,) m/s of the tip's motion in each."""
+    """Slowest vibration modes.
+
+    Attributes:
+        frequency_hz, damping: (m,) Hz and damping ratio.
+        amplitude: (m,) m, of the tip's motion along the direction, from the equilibrium at the present actuators and load.
+        rate: (m,) m/s, time derivative of the amplitude.
+        direction: (m, 3) unit, of the tip's motion, ``ctr_base``; continuous in sign while the robot moves.
+    """
 
     frequency_hz: Floats
     damping: Floats
     amplitude: Floats
     rate: Floats
+    direction: Floats
 
     @classmethod
     def none(cls) -> Modes:
         """No modes known."""
         empty = np.zeros(0)
-        return cls(empty, empty, empty, empty)
+        return cls(empty, empty, empty, empty, np.zeros((0, 3)))
 
 
 class MotionPoint(NamedTuple):

@@ -14,6 +14,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg.lapack import dgeev
+from scipy.optimize import linear_sum_assignment
 
 from ctr_dynamics.estimation.energy_norm import field_weights
 from ctr_dynamics.estimation.step_output import Modes
@@ -41,10 +42,12 @@ class ModalBasis:
     Attributes:
         frequency_hz, damping: (m,). exponent: (m,) complex mu in 1/s.
         readout: (2m, fields) real, then imaginary parts of the modal coordinate z = readout (y - rest). The tip's displacement along the mode's
-            main direction is 2 Re z, and its speed 2 Re(mu z).
+            main direction is 2 Re z.
         rest: (fields,) fields of the equilibrium; inputs (2N + 6,): alpha, beta, force and torque there.
         by_inputs: (2m, 2N + 6) modal coordinates of the equilibrium that moves with alpha, beta, force and torque.
         direction: (m, 3) unit, main direction of the tip's motion in ``ctr_base``; zero where a mode does not move it.
+        by_input_rates: (m, 2N + 6) speed of the equilibrium along the direction, by the rates of alpha, beta, force and torque.
+        shapes: (fields, m) complex, the fields in each mode where its own coordinate is 1 and all others are 0, but for a factor.
     """
 
     frequency_hz: Floats
@@ -55,15 +58,69 @@ class ModalBasis:
     direction: Floats
     inputs: Floats
     by_inputs: Floats
+    by_input_rates: Floats
+    shapes: NDArray[np.complex128]
 
-    def measure(self, fields: Floats, now: Inputs) -> Modes:
-        """Amplitude and rate of each mode in ``fields`` (fields,) at the actuators and load ``now``."""
+    def measure(self, fields: Floats, now: Inputs, load_rate: Floats | None = None) -> Modes:
+        """Amplitude and rate of each mode in ``fields`` (fields,) at the actuators and load ``now``.
+
+        Fields hold velocities. So 2 Re(mu z) is the speed along the direction with that of the equilibrium, which follows actuators and load.
+        The rate is without it.
+
+        Args:
+            load_rate: (6,) rates of force (N/s) and torque (N m/s); None where they stand still.
+        """
         by_fields, by_inputs, at_rest = self._rows
-        m = len(self.damping)
+        m, n = len(self.damping), len(now.alpha)
         values = modal_coordinates(
             by_fields, fields, by_inputs, now.alpha, now.beta, now.force, now.torque, at_rest
         )
-        return Modes(self.frequency_hz, self.damping, values[:m], values[m:])
+        moving = (
+            self.by_input_rates[:, :n] @ now.alpha_rate + self.by_input_rates[:, n : 2 * n] @ now.beta_rate
+        )
+        if load_rate is not None:
+            moving += self.by_input_rates[:, 2 * n :] @ load_rate
+        return Modes(self.frequency_hz, self.damping, values[:m], values[m:] - moving, self.direction)
+
+    @property
+    def _coordinates(self) -> NDArray[np.complex128]:
+        """(m, fields) complex rows of ``readout``."""
+        m = len(self.damping)
+        return self.readout[:m] + 1j * self.readout[m:]
+
+    def aligned_with(self, before: ModalBasis) -> ModalBasis:
+        """The same modes in the order and with the signs of those of ``before`` that they continue; new ones follow, slowest first.
+
+        Two modes are the same where each one's coordinate responds to the other's shape as to its own (modal assurance criterion with left and right
+        eigenvectors). Fields are in the tubes' frames, so that a turning robot's shapes hardly change.
+        """
+        if before.readout.shape[1] != self.readout.shape[1]:
+            return self  # another mesh
+        here, there = self._coordinates, before._coordinates
+        own, former = np.sum(here * self.shapes.T, axis=1), np.sum(there * before.shapes.T, axis=1)
+        response = here @ before.shapes
+        likeness = np.abs(response * (there @ self.shapes).T) / np.abs(np.outer(own, former))
+        pairs = [
+            (j, i) for i, j in zip(*linear_sum_assignment(-likeness), strict=True) if likeness[i, j] > 0.5
+        ]
+        order = [i for _, i in sorted(pairs)]
+        order += [i for i in range(len(own)) if i not in order]
+        sign = np.ones(len(own))
+        for j, i in pairs:
+            sign[i] = 1.0 if (response[i, j] / former[j]).real >= 0.0 else -1.0
+        rows, signs = np.concatenate([order, np.add(order, len(own))]), np.tile(sign, 2)[:, None]
+        return ModalBasis(
+            self.frequency_hz[order],
+            self.damping[order],
+            self.exponent[order],
+            (signs * self.readout)[rows],
+            self.rest,
+            (sign[:, None] * self.direction)[order],
+            self.inputs,
+            (signs * self.by_inputs)[rows],
+            (sign[:, None] * self.by_input_rates)[order],
+            self.shapes[:, order],
+        )
 
     @cached_property
     def _rows(self) -> tuple[Floats, Floats, Floats]:
@@ -85,21 +142,48 @@ def equilibrium_slope(
     model: Model, equilibrium: Equilibrium, par: Floats, buffers: SweepBuffers
 ) -> Floats | None:
     """d(equilibrium's fields)/d(alpha, beta, force, torque), (fields, 2N + 6); ``buffers``: of :func:`lanes_of` lanes."""
-    n, layout = model.n, model.layout
+    layout, scale = model.layout, _input_scale(model.n)
     rows = np.concatenate([layout.rows(name) for name in ("alpha", "beta", "force", "torque")])
-    m, count = model.unknown_count, len(rows)
+    dpar = np.zeros((layout.size, len(rows)))
+    dpar[rows, range(len(rows))] = scale
+    fields = _static_response(model, equilibrium, par, buffers, dpar, np.zeros((0, 0)))
+    return None if fields is None else fields / scale
+
+
+def equilibrium_motion(
+    model: Model, equilibrium: Equilibrium, par: Floats, buffers: SweepBuffers, slope: Floats
+) -> Floats | None:
+    """d(fields)/d(rates of alpha, beta, force, torque), (fields, 2N + 6), while the robot follows its equilibrium slowly.
+
+    The strains change as ``slope`` says (:func:`equilibrium_slope`), and velocities are what that and turning bases give. Insertion is not in
+    the fields.
+    """
+    n, layout, scale = model.n, model.layout, _input_scale(model.n)
+    dpar = np.zeros((layout.size, len(scale)))
+    dpar[layout.rows("alpha_rate"), range(n)] = scale[:n]
+    fields = _static_response(model, equilibrium, par, buffers, dpar, slope * scale)
+    return None if fields is None else fields / scale
+
+
+def _input_scale(n: int) -> Floats:
+    """(2N + 6,) small changes of alpha (rad), beta (m), force (N) and torque (N m)."""
+    return np.array([1e-2] * n + [1e-4] * n + [1e-4] * 3 + [1e-6] * 3)
+
+
+def _static_response(
+    model: Model, equilibrium: Equilibrium, par: Floats, buffers: SweepBuffers, dpar: Floats, rates: Floats
+) -> Floats | None:
+    """Fields (fields, k) by changes ``dpar`` (NP, k) of the parameters, where the fields' rates are ``rates`` (fields, k); empty for none."""
+    m, count = model.unknown_count, dpar.shape[1]
     lanes = lanes_of(model)
     main, base = len(buffers.history) // lanes.count, len(buffers.base_history) // lanes.count
-    scale = np.array([1e-2] * n + [1e-4] * n + [1e-4] * 3 + [1e-6] * 3)
-    dpar = np.zeros((layout.size, count))
-    dpar[rows, range(count)] = scale
     fields, nodes = np.zeros((main + base, count)), np.zeros((equilibrium.nodes.size, count))
     ok = linearise(
         model.kind, lanes, 0.0, equilibrium.mesh, Solution(par, equilibrium.x, np.zeros(main), np.zeros(base)), dpar,
-        np.zeros((main + base, count)), FiniteDifferences(1e-3, model.tangent_perturbation), buffers,
+        rates if rates.size else np.zeros((main + base, count)), FiniteDifferences(1e-3, model.tangent_perturbation), buffers,
         Derivatives(np.zeros((m, m)), np.zeros((m, count)), fields, nodes),
     )  # fmt: skip
-    return fields / scale if ok else None
+    return fields if ok else None
 
 
 class _InverseStep:
@@ -187,6 +271,10 @@ def modal_parts(
     if slope is None:
         return
     yield None
+    moving = equilibrium_motion(model, equilibrium, par, buffers, slope)
+    if moving is None:
+        return
+    yield None
     # 2. Block Arnoldi.
     step = _InverseStep(model, equilibrium, par, buffers)
     dpar = step.first_loads()
@@ -234,6 +322,8 @@ def modal_parts(
         axis,
         np.concatenate([par[layout["alpha"]], beta, par[layout["force"]], par[layout["torque"]]]),
         rows @ slope,
+        2.0 * (pairs.exponent[:, None] * (readout @ moving)).real,
+        np.concatenate(whole, axis=1) @ pairs.right,
     )
 
 

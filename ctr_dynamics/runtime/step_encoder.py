@@ -124,7 +124,7 @@ class StepEncoder:
             out.tip_velocity, out.tip_velocity_covariance,
             out.predicted_position, out.predicted_quaternion_wxyz[_XYZW],
             out.disturbance_force, _NO_TORQUE, out.disturbance_sigma,
-            modes.amplitude, modes.frequency_hz, modes.damping, modes.rate, np.zeros(2 * count),
+            modes.amplitude, modes.frequency_hz, modes.damping, modes.rate, np.zeros(2 * count), modes.direction.T.ravel(),
         )  # fmt: skip
         messages = [Encoded(topic, stamp, data) for topic, data in zip(template.topics, filled, strict=True)]
         messages.append(Encoded(topics.BACKBONE_STATE, stamp, *self._cloud(points).fill(stamp, backbone)))
@@ -148,7 +148,11 @@ class StepEncoder:
                 templates.stamped_numbers(topics.DISTURBANCE_SIGMA, frame, 3),
             ]
             if count:
-                layouts.append(templates.joint_state(topics.MODES, frame, mode_names(count), velocities=True))
+                layouts.append(
+                    templates.joint_state(
+                        topics.MODES, frame, mode_names(count), velocities=True, efforts=True
+                    )
+                )
             self._numbers[count] = templates.Template(*layouts)
         return self._numbers[count]
 

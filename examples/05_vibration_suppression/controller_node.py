@@ -55,17 +55,16 @@ class ControllerNode(Node):
         self.values = values
         robot = load_robot(values["robot"])
         self._rest = np.array([robot.rest.alpha.value, robot.rest.beta.value])
-        jacobian = tip_jacobian(robot)
-        self._axis = int(np.argmax(np.abs(jacobian)))
+        self._jacobian = tip_jacobian(robot)
         self._mode = int(values["mode"]) - 1
         self._damper = ModalDamper(
-            float(jacobian[self._axis]),
+            float(np.linalg.norm(self._jacobian)),  # until the first modes tell their directions
             1.0 / values["rate_hz"],
             Tuning(damping=values["damping"], latency_s=values["latency_s"], stale_s=values["stale_s"]),
             Limits(values["max_angle_rad"], values["max_rate_rad_s"], values["max_acceleration_rad_s2"]),
         )
         self._drives = DriveHistory()
-        self._rate_sigma = math.inf
+        self._rate_covariance: np.ndarray | None = None  # (3, 3) of the tip's velocity
         self.rejected = {"no mode": 0, "no joints": 0, "invalid": 0}
         profile = qos.profile("reliable", 10)
         self._output = self.create_publisher(JointState, COMMANDS, profile)
@@ -80,8 +79,7 @@ class ControllerNode(Node):
         ]
         self._timer = self.create_timer(1.0 / values["rate_hz"], self._tick)
         self.get_logger().info(
-            f"turning all tubes moves the tip by {np.round(1e3 * jacobian, 1)} mm/rad; damping mode {self._mode + 1} along "
-            f"{'xyz'[self._axis]}"
+            f"turning all tubes moves the tip by {np.round(1e3 * self._jacobian, 1)} mm/rad; damping mode {self._mode + 1}"
         )
 
     @property
@@ -99,23 +97,24 @@ class ControllerNode(Node):
             self._drives.add(message.stamp_ns * 1e-9, at["tube1_rotation"] - float(self._rest[0, 0]))
 
     def _twist(self, message: Any) -> None:
-        """Deviation of the tip's speed; it comes before the modes of the same step."""
-        self._rate_sigma = math.sqrt(max(message.twist.covariance[7 * self._axis], 0.0))
+        """Covariance of the tip's velocity; it comes before the modes of the same step."""
+        self._rate_covariance = np.reshape(message.twist.covariance, (6, 6))[:3, :3]
 
     def _modes(self, data: bytes) -> None:
         message = decode_modes(data)
         if message is None:
             self._reject("no mode")
             return
-        t, count, position, velocity = message
+        t, count, position, velocity, direction = message
         drive = self._drives.at(t)
-        if self._mode >= count or not math.isfinite(self._rate_sigma):
+        if self._mode >= count or self._rate_covariance is None:
             self._reject("no mode")
             return
         if drive is None:
             self._reject("no joints")
             return
         m = self._mode
+        along = direction[m]
         self._damper.take(
             Estimate(
                 t,
@@ -123,8 +122,9 @@ class ControllerNode(Node):
                 velocity[m],
                 2 * math.pi * position[count + m],
                 position[2 * count + m],
-                self._rate_sigma,
+                math.sqrt(max(float(along @ self._rate_covariance @ along), 0.0)),
                 *drive,
+                authority=float(along @ self._jacobian),
             )
         )
 
@@ -147,16 +147,16 @@ class ControllerNode(Node):
         self._output.publish(encode_joint_state(now_ns, names, positions))
 
 
-def decode_modes(data: bytes) -> tuple[float, int, list[float], list[float]] | None:
-    """Stamp (s), number of modes, position and velocity of a modes message; None when it is not one."""
+def decode_modes(data: bytes) -> tuple[float, int, list[float], list[float], np.ndarray] | None:
+    """Stamp (s), number of modes, position, velocity and directions (m, 3) of a modes message; None when it is not one."""
     from rclpy.serialization import deserialize_message
 
     message = deserialize_message(data, JointState)
     count, rest = divmod(len(message.name), 3)
-    if rest or len(message.position) != 3 * count or len(message.velocity) < count:
+    if rest or not len(message.position) == len(message.effort) == 3 * count or len(message.velocity) < count:
         return None
-    stamp = message.header.stamp
-    return stamp.sec + 1e-9 * stamp.nanosec, count, list(message.position), list(message.velocity)
+    stamp, direction = message.header.stamp, np.reshape(message.effort, (3, count)).T
+    return stamp.sec + 1e-9 * stamp.nanosec, count, list(message.position), list(message.velocity), direction
 
 
 def main() -> int:

@@ -16,6 +16,7 @@ from collections import deque
 from dataclasses import dataclass
 
 STEP_S = 0.002  # of the prediction; an eightieth of a period at 6 Hz
+LEAST_AUTHORITY = 1e-4  # m/rad; with less, a vibration of a millimetre would take ten radians
 
 
 @dataclass(frozen=True)
@@ -56,7 +57,8 @@ class Tuning:
 @dataclass(frozen=True)
 class Estimate:
     """The estimator's word about the mode at `stamp_s`: amplitude (m) and rate (m/s) from the moving equilibrium, frequency (rad/s),
-    damping ratio, deviation of the rate (m/s), and the drives' angle delta (rad) and rate (rad/s) at that time."""
+    damping ratio, deviation of the rate (m/s), and the drives' angle delta (rad) and rate (rad/s) at that time. `authority`: X (m/rad) along
+    the direction that the mode has now; None leaves it as it was."""
 
     stamp_s: float
     amplitude: float
@@ -66,6 +68,7 @@ class Estimate:
     rate_sigma: float
     delta: float
     delta_rate: float
+    authority: float | None = None
 
 
 class DriveHistory:
@@ -102,7 +105,7 @@ class ModalDamper:
     def __init__(
         self, authority: float, period_s: float, tuning: Tuning | None = None, limits: Limits | None = None
     ) -> None:
-        if abs(authority) < 1e-4:
+        if abs(authority) < LEAST_AUTHORITY:
             raise ValueError(
                 f"turning the tubes moves the tip by {authority:g} m/rad only: there is nothing to damp with"
             )
@@ -124,6 +127,11 @@ class ModalDamper:
         if not all(abs(value) <= most for value, most in sizes) or not 1.0 <= estimate.omega <= 1e3:
             self.invalid()  # NaN fails every comparison
             return
+        if estimate.authority is not None:
+            if not LEAST_AUTHORITY <= abs(estimate.authority) <= 10.0:
+                self.invalid()  # the tubes do not reach this mode
+                return
+            self.authority = estimate.authority
         self._estimate = estimate
         self._good += 1
 

@@ -55,8 +55,7 @@ def run(
     plant = SimulatedRobot(robot, START_NS, hardware)
     estimator = Estimator(robot, Settings({"output.policy": "predict"}))
     jacobian = tip_jacobian(robot)
-    axis = int(np.argmax(np.abs(jacobian)))
-    damper, drives = ModalDamper(float(jacobian[axis]), period_s, tuning, limits), DriveHistory()
+    damper, drives = ModalDamper(float(np.linalg.norm(jacobian)), period_s, tuning, limits), DriveHistory()
     on_the_way: deque[tuple[float, Estimate | None]] = deque()
     next_command = 0.0
     while plant.t < seconds:
@@ -78,12 +77,15 @@ def run(
             drive = drives.at(t)
             estimate = None
             if out.valid and drive is not None and len(out.modes.frequency_hz) > mode:
+                along = out.modes.direction[mode]
                 estimate = Estimate(
                     t, float(out.modes.amplitude[mode]), float(out.modes.rate[mode]),
                     2 * np.pi * float(out.modes.frequency_hz[mode]), float(out.modes.damping[mode]),
-                    float(np.sqrt(out.tip_velocity_covariance[axis, axis])), *drive,
+                    float(np.sqrt(along @ out.tip_velocity_covariance[:3, :3] @ along)), *drive,
+                    authority=float(along @ jacobian),
                 )  # fmt: skip
             on_the_way.append((plant.t + ESTIMATOR_LATENCY_S, estimate))
+            estimator.do_idle_work()  # as a node does between its steps; the modes are found there
         while on_the_way and on_the_way[0][0] <= plant.t:
             _, estimate = on_the_way.popleft()
             damper.take(estimate) if estimate is not None else damper.invalid()

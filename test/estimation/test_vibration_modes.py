@@ -1,5 +1,8 @@
 """Vibration modes against a simulation, and what a moving robot's are refreshed for."""
 
+import dataclasses
+import itertools
+
 import numpy as np
 import pytest
 from scipy.optimize import curve_fit
@@ -89,15 +92,17 @@ def test_modes_are_recomputed_only_where_the_robot_has_moved(model):
     tracker = ModeTracker(model, every=0)
     simulator = Simulator(model)
 
+    count = itertools.count()
+
     def refreshed(alpha):
         """Frequencies and amplitudes after a refresh at rest at ``alpha``, and whether the modes were found for it."""
         state = simulator.rest(Inputs(alpha, ZERO, BETA, ZERO))
-        tracker.measure(state)
+        tracker.measure(state, next(count))
         parts = 0
         while not parts or tracker.refreshing:
             tracker.refresh(state, simulator.parameters)
             parts += 1
-        found = tracker.measure(state)
+        found = tracker.measure(state, next(count))
         return found.frequency_hz, found.amplitude, parts > 1
 
     frequency, amplitude, found = refreshed(ALPHA)
@@ -117,3 +122,56 @@ def test_modes_are_recomputed_only_where_the_robot_has_moved(model):
     assert refreshed(ALPHA + 0.02)[2]
     turned = ALPHA + 0.02 + 0.015
     assert refreshed(turned)[2]
+
+
+def test_the_rate_is_the_derivative_and_modes_keep_their_sign_while_the_tubes_turn(model):
+    """Half a turn of both tubes with a small vibration on it, refreshed all the time: as the estimator does it, without noise."""
+    tracker, simulator = ModeTracker(model, every=20), Simulator(model, tolerance=1e-8)
+    speed = 1.2  # rad/s
+
+    def at(t):
+        return Inputs(ALPHA + speed * t, np.full(2, speed), BETA, ZERO)
+
+    state = simulator.rest(Inputs(ALPHA, ZERO, BETA, ZERO, np.array([2e-3, 1e-3, 0.0])))
+    found = []
+    for k in range(round(np.pi / speed / DT)):
+        assert simulator.step(state, k * DT, at).ok
+        found.append(tracker.measure(state, k))
+        tracker.refresh(state, simulator.parameters)
+    found = found[100:]
+    amplitude, rate, direction = (
+        np.array([getattr(modes, name)[:2] for modes in found]) for name in ("amplitude", "rate", "direction")
+    )
+    # the directions turn with the robot, and none jumps to its opposite
+    cosine = np.sum(direction[1:] * direction[:-1], axis=2)
+    assert cosine.min() > 0.9
+    assert np.sum(direction[0] * direction[-1], axis=1).min() < -0.5
+    # refreshes renew the equilibrium: the derivative is that between them
+    slope = np.gradient(amplitude, DT, axis=0)
+    quiet = np.abs(np.diff(amplitude, 2, axis=0, prepend=0, append=0)).max(1)
+    usual = quiet < 8.0 * np.median(quiet)
+    assert usual.mean() > 0.8
+    error = np.sqrt(np.mean((rate - slope)[usual] ** 2, axis=0))
+    # the second mode is hardly excited
+    assert np.all(error < 0.1 * np.sqrt(np.mean(slope[usual, 0] ** 2)))
+
+
+def test_modes_continue_those_before_in_order_and_sign(model):
+    equilibrium = Statics(model, 1e-10).solve(BETA, ALPHA, np.zeros(3), np.zeros(3))
+    par = model.parameters.copy()
+    par[model.layout["alpha"]], par[model.layout["beta"]] = ALPHA, BETA
+    basis = modal_basis(model, equilibrium, par, BETA)
+    m, order, sign = len(basis.damping), np.array([2, 0, 3, 1]), np.array([1.0, -1.0, -1.0, 1.0])
+    assert m == 4
+    twice, phase = np.tile(sign, 2)[:, None], np.exp(1j * np.arange(m))
+    mixed = dataclasses.replace(
+        basis,
+        frequency_hz=basis.frequency_hz[order],
+        readout=(twice * basis.readout[np.concatenate([order, order + m])]),
+        direction=sign[:, None] * basis.direction[order],
+        shapes=basis.shapes[:, order] * phase,  # an eigenvector has no phase of its own
+    )
+    aligned = mixed.aligned_with(basis)
+    assert np.array_equal(aligned.frequency_hz, basis.frequency_hz)
+    assert np.allclose(aligned.readout, basis.readout, rtol=1e-12)
+    assert np.allclose(aligned.direction, basis.direction)

@@ -62,6 +62,7 @@ def make_step(
             damping=rng.uniform(0, 0.1, modes),
             amplitude=rng.normal(size=modes) * 1e-3,
             rate=rng.normal(size=modes) * 1e-2,
+            direction=rng.normal(size=(modes, 3)),
         ),
         disturbance_force=rng.normal(size=3) * 0.05,
         disturbance_sigma=rng.uniform(0.01, 0.1, 3),
@@ -101,7 +102,13 @@ class Reference:
         return self.make("geometry_msgs/msg/PoseStamped", self.header(stamp_ns), self.pose(position, wxyz))
 
     def joint_state(
-        self, stamp_ns: int, names: Any, positions: Any, velocities: Any = (), frame_id: str | None = None
+        self,
+        stamp_ns: int,
+        names: Any,
+        positions: Any,
+        velocities: Any = (),
+        frame_id: str | None = None,
+        efforts: Any = (),
     ) -> Any:
         return self.make(
             "sensor_msgs/msg/JointState",
@@ -109,7 +116,7 @@ class Reference:
             list(names),
             np.array(positions, dtype=float),
             np.array(velocities, dtype=float),
-            np.array([], dtype=float),
+            np.array(efforts, dtype=float),
         )
 
     def wrench_stamped(self, stamp_ns: int, force: Any, torque: Any) -> Any:
@@ -189,6 +196,7 @@ class Reference:
                 mode_names(count),
                 [*out.modes.amplitude, *out.modes.frequency_hz, *out.modes.damping],
                 [*out.modes.rate, *[0.0] * (2 * count)],
+                efforts=out.modes.direction.T.ravel(),
             ),
             topics.INNOVATION: self.joint_state(innovation.stamp_ns, entries, list(entries.values())),
             topics.DISTURBANCE: self.wrench_stamped(t, out.disturbance_force, (0, 0, 0)),

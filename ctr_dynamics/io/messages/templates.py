@@ -110,8 +110,10 @@ def stamped_numbers(topic: str, frame_id: str, count: int) -> Layout:
     return Layout(topic, writer.done(), [stamp], _span(offset, count))
 
 
-def joint_state(topic: str, frame_id: str, names: Sequence[str], velocities: bool) -> Layout:
-    """A JointState with these names; fills positions, then velocities when wanted. Efforts are empty."""
+def joint_state(
+    topic: str, frame_id: str, names: Sequence[str], velocities: bool, efforts: bool = False
+) -> Layout:
+    """A JointState with these names; fills positions, then velocities and efforts when wanted."""
     count = len(names)
     writer = CdrWriter()
     stamp = writer.header(0, frame_id)
@@ -119,7 +121,8 @@ def joint_state(topic: str, frame_id: str, names: Sequence[str], velocities: boo
     numbers = _span(writer.float64_sequence([0.0] * count), count)
     moving = count if velocities else 0
     numbers += _span(writer.float64_sequence([0.0] * moving), moving)
-    writer.float64_sequence([])
+    pushing = count if efforts else 0
+    numbers += _span(writer.float64_sequence([0.0] * pushing), pushing)
     return Layout(topic, writer.done(), [stamp], numbers)
 
 

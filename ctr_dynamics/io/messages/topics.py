@@ -291,15 +291,20 @@ TOPICS: tuple[Topic, ...] = (
             ),
             Field(
                 "position",
-                "first M: amplitude of the mode, its present contribution to the tip's displacement; next M: "
-                "frequency; last M: damping ratio (1 = critical)",
+                "first M: amplitude of the mode, its present contribution to the tip's displacement along the mode's direction, from the "
+                "equilibrium at the present actuators and load; next M: frequency; last M: damping ratio (1 = critical)",
                 "m, Hz, -",
             ),
-            Field("velocity", "first M: rate of the amplitude; the other 2 M are zero", "m/s"),
-            Field("effort", "empty"),
+            Field("velocity", "first M: time derivative of the amplitude; the other 2 M are zero", "m/s"),
+            Field(
+                "effort",
+                "no effort: the direction of each mode at the tip, a unit vector in base axes; first M: x, next M: y, last M: z",
+                "-",
+            ),
         ),
         (
-            "Modes are ordered by frequency, the slowest first. With M = len(name) / 3 the controller's "
+            "The first modes are ordered by frequency, the slowest first. From then on a mode keeps its number and its sign while the robot "
+            "moves. With M = len(name) / 3 the controller's "
             "state is `position[:M]` and `velocity[:M]`.",
             "Not published before the first modes have been computed.",
             _NOT_INVALID,
