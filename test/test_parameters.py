@@ -195,7 +195,7 @@ def test_estimator_yaml_holds_every_default_in_its_ros_type():
         node = block
         for key in p.name.split("."):
             node = node[key]
-        kinds = {"floats": list, "str": str, "int": int, "float": float, "bool": bool}
+        kinds = {"floats": list, "texts": list, "str": str, "int": int, "float": float, "bool": bool}
         assert type(node) is kinds[p.type], p.name
         assert p.check(node) == p.default
 

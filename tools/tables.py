@@ -29,6 +29,8 @@ def _markdown(header: list[str], rows: list[list[str]]) -> str:
 def _shown(value: Any) -> str:
     if isinstance(value, bool):
         return str(value).lower()
+    if value == ():
+        return "['']"  # ROS does not know the type of an empty array
     if isinstance(value, tuple):
         return "[" + ", ".join(_shown(v) for v in value) + "]"
     return f"{value:g}" if isinstance(value, float) else str(value)
@@ -36,6 +38,7 @@ def _shown(value: Any) -> str:
 
 GROUPS = {
     "": "General",
+    "joints": "Joints",
     "model": "Model",
     "filter": "Filter",
     "misfit": "Consistency monitor",
@@ -54,12 +57,12 @@ def parameter_tables() -> str:
 
 
 def _parameter_table(group: str) -> str:
-    types = {"floats": "float[3]", "str": "string"}
+    types = {"str": "string", "texts": "string[]"}
     rows = [
         [
             f"`{p.name}`",
-            types.get(p.type, p.type),
-            f"`{_shown(p.default)}`" if p.default != "" else "empty",
+            f"float[{p.size or ''}]" if p.type == "floats" else types.get(p.type, p.type),
+            f"`{_shown(p.default)}`" if p.default not in ("", ()) else "empty",
             p.unit,
             p.range,
             p.text + (" Read-only while the node runs." if p.read_only else ""),

@@ -9,12 +9,22 @@ from typing import Annotated
 
 import typer
 
+from ctr_dynamics.cli.recording_options import (
+    BAG_HELP,
+    Assignments,
+    Params,
+    Remap,
+    mapping_from,
+    settings_from,
+)
 from ctr_dynamics.io.bag_checks import Finding
 from ctr_dynamics.io.bag_info import BagReport, TopicReport, inspect
 from ctr_dynamics.io.bag_reader import open_bag
+from ctr_dynamics.io.inputs.input_mapping import InputMapping
 from ctr_dynamics.io.messages.topics import JOINT_STATES, TIP_LOAD, TRACKER_TIP
+from ctr_dynamics.parameters import Settings, pose_frame
 from ctr_dynamics.runtime.replay import plain
-from ctr_dynamics.sensing.checks import Kind
+from ctr_dynamics.sensing.checks import CheckOptions, Kind
 from ctr_dynamics.sensing.checks.input_checks import check_messages
 
 STREAMS = {"joints": JOINT_STATES, "tracker": TRACKER_TIP, "load": TIP_LOAD}
@@ -88,25 +98,35 @@ def _text(report: BagReport) -> str:
     return "\n".join(lines)
 
 
-def _input_faults(bag: Path, start_ns: int) -> list[Finding]:
+def _input_faults(bag: Path, start_ns: int, mapping: InputMapping, settings: Settings) -> list[Finding]:
     """Faults of the inputs that node and replay leave out or mend, one line each, with times in s after ``start_ns``."""
+    options = CheckOptions(
+        pose_frame_id=pose_frame(settings),
+        unwrap=bool(settings["joints.unwrap"]),
+        turns=mapping.joints.turns,
+    )
     return [
         Finding(found.level, STREAMS[found.stream], found.line(start_ns))
-        for found in check_messages(open_bag(bag).inputs())
+        for found in check_messages(open_bag(bag, mapping).inputs(), options=options)
         if found.kind not in REPORTED
     ]
 
 
 def info(
-    bag: Annotated[Path, typer.Argument(metavar="BAG", help="An .mcap file, or a folder with one.")],
+    bag: Annotated[Path, typer.Argument(metavar="BAG", help=BAG_HELP)],
+    remap: Remap = None,
+    params: Params = None,
+    assignments: Assignments = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the report as JSON.")] = False,
 ) -> int:
     """Say what is in a bag: topics, rates, gaps, clock and unit problems.
 
     Exit code 0 whatever is found, 2 when the file is not a bag.
     """
-    report = inspect(bag)
-    report.problems += _input_faults(bag, report.start_ns)
+    settings = settings_from(params, assignments)
+    mapping = mapping_from(settings, remap)
+    report = inspect(bag, mapping, pose_frame(settings))
+    report.problems += _input_faults(bag, report.start_ns, mapping, settings)
     if as_json:
         print(json.dumps(plain(report.to_dict()), indent=1, allow_nan=False, ensure_ascii=False))
     else:

@@ -10,8 +10,16 @@ from typing import Annotated, Any
 
 import typer
 
+from ctr_dynamics.cli.recording_options import (
+    BAG_HELP,
+    Assignments,
+    Params,
+    Remap,
+    open_with,
+    settings_from,
+)
 from ctr_dynamics.io.atomic_files import check_targets
-from ctr_dynamics.parameters import Settings, parse_assignments, read_parameter_file
+from ctr_dynamics.parameters import Settings
 from ctr_dynamics.runtime.replay import Progress, ReplayResult
 from ctr_dynamics.runtime.replay import replay as run_replay
 
@@ -22,13 +30,9 @@ def settings_for_replay(params: Path | None, assignments: list[str], fusion: boo
     Raises:
         InputError: unreadable file, unknown name, wrong type or out of range.
     """
-    values: dict[str, Any] = {"output.policy": "wait"}
-    if params is not None:
-        values.update(read_parameter_file(params))
-    values.update(parse_assignments(assignments))
-    if not fusion:
-        values["filter.enabled"] = False
-    return Settings(values)
+    defaults = {"output.policy": "wait"}
+    settings = settings_from(params, assignments, defaults)
+    return settings if fusion else settings.replace({"filter.enabled": False})
 
 
 @contextmanager
@@ -108,7 +112,7 @@ def _count(value: Any) -> Any:
 
 
 def replay(
-    bag: Annotated[Path, typer.Argument(metavar="BAG", help="An .mcap file, or a folder with one.")],
+    bag: Annotated[Path, typer.Argument(metavar="BAG", help=BAG_HELP)],
     robot: Annotated[
         str, typer.Option("--robot", metavar="NAME_OR_FILE", help="A shipped robot or a robot file.")
     ] = "",
@@ -122,13 +126,9 @@ def replay(
         Path | None,
         typer.Option("--report", metavar="OUT.html", help="Report to write: one file, opens offline."),
     ] = None,
-    params: Annotated[
-        Path | None,
-        typer.Option("--params", metavar="FILE", help="YAML file with parameters of the estimator."),
-    ] = None,
-    assignments: Annotated[
-        list[str] | None, typer.Option("--set", metavar="NAME=VALUE", help="One parameter; may be repeated.")
-    ] = None,
+    remap: Remap = None,
+    params: Params = None,
+    assignments: Assignments = None,
     no_fusion: Annotated[
         bool, typer.Option("--no-fusion", help="Open loop: the model without the tracker.")
     ] = False,
@@ -143,7 +143,13 @@ def replay(
     settings = settings_for_replay(params, assignments or [], not no_fusion)
     with _progress(bag.name or str(bag)) as progress:
         result = run_replay(
-            bag, robot or str(settings["robot"]), settings, output, summary, progress, report=report
+            open_with(bag, settings, remap),
+            robot or str(settings["robot"]),
+            settings,
+            output,
+            summary,
+            progress,
+            report=report,
         )
     for note in result.notes:
         print(f"ctr-dynamics: note: {note}", file=sys.stderr)

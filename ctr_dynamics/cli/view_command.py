@@ -10,11 +10,12 @@ from typing import Annotated
 
 import typer
 
+from ctr_dynamics.cli.recording_options import Assignments, Params, Remap, open_with
 from ctr_dynamics.cli.replay_command import settings_for_replay
 from ctr_dynamics.errors import InputError
 from ctr_dynamics.estimation.monitoring.statuses import all_statuses, snap_ahead
-from ctr_dynamics.io.bag_reader import open_bag
-from ctr_dynamics.io.messages import topics
+from ctr_dynamics.io.bag_reader import Bag
+from ctr_dynamics.parameters import Settings
 from ctr_dynamics.robot import Robot
 from ctr_dynamics.robot_files import load_robot
 from ctr_dynamics.runtime.step_encoder import StepEncoder
@@ -31,13 +32,9 @@ def view(
     robot: Annotated[
         str, typer.Option("--robot", metavar="NAME_OR_FILE", help="A shipped robot or a robot file.")
     ] = "till2020_tissue",
-    params: Annotated[
-        Path | None,
-        typer.Option("--params", metavar="FILE", help="YAML file with parameters of the estimator."),
-    ] = None,
-    assignments: Annotated[
-        list[str] | None, typer.Option("--set", metavar="NAME=VALUE", help="One parameter; may be repeated.")
-    ] = None,
+    remap: Remap = None,
+    params: Params = None,
+    assignments: Assignments = None,
     speed: Annotated[
         float, typer.Option("--speed", metavar="X", help="Times real time; 0: as fast as it goes.")
     ] = 1.0,
@@ -62,8 +59,9 @@ def view(
     if not 0.0 <= speed < math.inf:
         raise InputError(f"--speed is {speed:g}", do="write a number above 0, or 0 for as fast as it goes")
     loaded = load_robot(robot)
+    settings = settings_for_replay(params, assignments or [], True)
     if bag is not None:
-        open_bag(bag).check_inputs()
+        open_with(bag, settings, remap).check_inputs()
     server = ViewServer(loaded, host, port)
     print(f"serving ws://{host}:{server.port}; layout: {LAYOUT}", flush=True)
     try:
@@ -71,7 +69,7 @@ def view(
             _live(server)
         else:
             while True:
-                _replay(server, bag, loaded, params, assignments or [], speed)
+                _replay(server, open_with(bag, settings, remap), loaded, settings, speed)
                 if once:
                     break
     except KeyboardInterrupt:
@@ -81,18 +79,14 @@ def view(
     return 0
 
 
-def _replay(
-    server: ViewServer, bag: Path, robot: Robot, params: Path | None, assignments: list[str], speed: float
-) -> None:
+def _replay(server: ViewServer, opened: Bag, robot: Robot, settings: Settings, speed: float) -> None:
     """Inputs and the estimator's outputs of a bag, at the pace of their stamps."""
     from ctr_dynamics.estimation.estimator import Estimator
     from ctr_dynamics.runtime.replay import Player, no_step
 
-    settings = settings_for_replay(params, assignments, True)
     estimator = Estimator(robot, settings)
     encoder = StepEncoder(settings["output.frame_id"], robot.name, settings["output.backbone_every"])
-    opened = open_bag(bag)
-    inputs = opened.messages({topic.name for topic in topics.INPUTS})
+    inputs = opened.standard_messages()
     pending = next(inputs, None)
     pace = Pace(speed)
     player = Player(estimator)

@@ -29,9 +29,11 @@ class Finding:
 
 
 class Inspector(Protocol):
-    """Takes in the messages of one topic and sums them up."""
+    """Takes in the messages of one topic, serialised (``add``) or decoded (``take``), and sums them up."""
 
     def add(self, data: bytes) -> None: ...
+    def take(self, message: Any) -> None: ...
+    def failed(self, error: cdr.CdrError) -> None: ...
     def values(self) -> dict[str, Any]: ...
     def findings(self) -> list[Finding]: ...
 
@@ -66,12 +68,13 @@ class _Base:
 
     topic = ""
 
-    def __init__(self) -> None:
+    def __init__(self, frame: str = FRAME) -> None:
+        self.frame = frame
         self.malformed = 0
         self.fault = ""
         self.frames: dict[str, int] = {}
 
-    def _failed(self, error: cdr.CdrError) -> None:
+    def failed(self, error: cdr.CdrError) -> None:
         self.malformed += 1
         self.fault = self.fault or str(error)
 
@@ -86,13 +89,17 @@ class _Base:
                 Finding("error", self.topic, f"{self.malformed} messages cannot be decoded ({self.fault})")
             )
         for frame, count in self.frames.items():
-            if not accepts_frame(frame, FRAME):
+            if not accepts_frame(frame, self.frame):
                 found.append(
                     Finding(
                         "error",
                         self.topic,
-                        f"{count} messages are in frame {frame!r}, {FRAME!r} is expected; transform them, "
-                        "or name the frame so if it is that one",
+                        f"{count} messages are in frame {frame!r}, {self.frame!r} is expected; "
+                        + (
+                            f"if that is the tracker's frame, set tracker.frame_id={frame}"
+                            if self.topic == TRACKER_TIP
+                            else "transform them, or name the frame so if it is that one"
+                        ),
                     )
                 )
         return found
@@ -106,22 +113,25 @@ class JointInspector(_Base):
 
     topic = JOINT_STATES
 
-    def __init__(self) -> None:
-        super().__init__()
+    def __init__(self, frame: str = FRAME) -> None:
+        super().__init__(frame)
         self.ranges: dict[str, _Range] = {}
         self.others: set[str] = set()
         self.uneven = 0
+        self.without_positions = 0
         self.disordered = 0
         self.incomplete = 0
         self.messages = 0
 
     def add(self, data: bytes) -> None:
         try:
-            message = cdr.decode_joint_state(data)
+            self.take(cdr.decode_joint_state(data))
         except cdr.CdrError as error:
-            self._failed(error)
-            return
+            self.failed(error)
+
+    def take(self, message: cdr.JointStateIn) -> None:
         self.messages += 1
+        self.without_positions += not message.positions
         if len(message.names) != len(message.positions):
             self.uneven += 1
         betas: dict[int, float] = {}
@@ -155,8 +165,11 @@ class JointInspector(_Base):
         if not self.ranges:
             others = ", ".join(sorted(self.others)[:8]) or "none"
             text = (
-                f"no joint is named tubeN_rotation or tubeN_translation (names found: {others}); rename them"
+                f"no joint is named tubeN_rotation or tubeN_translation (names found: {others}); "
+                "name them, innermost tube first: --set joints.rotation_names=A,B and joints.translation_names=C,D"
             )
+            if self.messages and self.without_positions == self.messages:
+                text = f"none of {self.messages} messages holds positions; have the driver fill them in"
             return [*found, Finding("error", self.topic, text)]
         missing = [
             name
@@ -218,8 +231,8 @@ class PoseInspector(_Base):
 
     topic = TRACKER_TIP
 
-    def __init__(self) -> None:
-        super().__init__()
+    def __init__(self, frame: str = FRAME) -> None:
+        super().__init__(frame)
         self.axes = (_Range(), _Range(), _Range())
         self.norm = _Range()
         self.unnormalised = 0
@@ -227,10 +240,11 @@ class PoseInspector(_Base):
 
     def add(self, data: bytes) -> None:
         try:
-            message = cdr.decode_pose_stamped(data)
+            self.take(cdr.decode_pose_stamped(data))
         except cdr.CdrError as error:
-            self._failed(error)
-            return
+            self.failed(error)
+
+    def take(self, message: cdr.PoseIn) -> None:
         self._frame(message.frame_id)
         for axis, value in zip(self.axes, message.position, strict=True):
             axis.add(value)
@@ -278,17 +292,18 @@ class WrenchInspector(_Base):
 
     topic = TIP_LOAD
 
-    def __init__(self) -> None:
-        super().__init__()
+    def __init__(self, frame: str = FRAME) -> None:
+        super().__init__(frame)
         self.force = _Range()
         self.torque = _Range()
 
     def add(self, data: bytes) -> None:
         try:
-            message = cdr.decode_wrench_stamped(data)
+            self.take(cdr.decode_wrench_stamped(data))
         except cdr.CdrError as error:
-            self._failed(error)
-            return
+            self.failed(error)
+
+    def take(self, message: cdr.WrenchIn) -> None:
         self._frame(message.frame_id)
         for value in message.force:
             self.force.add(value)
@@ -308,11 +323,11 @@ class WrenchInspector(_Base):
         return found
 
 
-def inspector_for(topic: str) -> Inspector:
-    """A new inspector of an input topic."""
+def inspector_for(topic: str, frame: str = FRAME) -> Inspector:
+    """A new inspector of an input topic, whose messages are in ``frame``."""
     kinds: dict[str, type[JointInspector] | type[PoseInspector] | type[WrenchInspector]] = {
         JOINT_STATES: JointInspector,
         TRACKER_TIP: PoseInspector,
         TIP_LOAD: WrenchInspector,
     }
-    return kinds[topic]()
+    return kinds[topic](frame)

@@ -15,9 +15,12 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from ctr_dynamics.io.bag_checks import Finding, Inspector, inspector_for
-from ctr_dynamics.io.bag_reader import DECODERS, Bag, open_bag
+from ctr_dynamics.io.bag_checks import FRAME, Finding, Inspector, inspector_for
+from ctr_dynamics.io.bag_reader import INPUT_TOPICS, Bag, open_bag
+from ctr_dynamics.io.inputs.input_decoder import InputDecoder
+from ctr_dynamics.io.inputs.input_mapping import InputMapping, cure
 from ctr_dynamics.io.messages import cdr
+from ctr_dynamics.io.messages.input_types import Decoded, accepts_type, has_stamp
 from ctr_dynamics.io.messages.topics import JOINT_STATES, TIP_LOAD, TOPIC, TRACKER_TIP
 
 GAP_LIMIT_S = {JOINT_STATES: 0.1, TRACKER_TIP: 0.5}  # the joints' is the default of input_timeout_s
@@ -82,46 +85,74 @@ class _Times:
         self.frames: dict[str, int] = {}
 
     def add(self, log_ns: int, data: bytes) -> None:
+        """An output of the product."""
         self.log.append(min(log_ns, 2**63 - 1))
         if self.stamped:
             try:
-                stamp, frame = cdr.decode_header(data)
+                self._header(*cdr.decode_header(data))
             except cdr.CdrError:
                 return
-            self.stamp.append(stamp)
-            if len(self.frames) < 20 or frame in self.frames:
-                self.frames[frame] = self.frames.get(frame, 0) + 1
+
+    def take(self, log_ns: int, message: Decoded) -> None:
+        """An input, decoded."""
+        self.log.append(min(log_ns, 2**63 - 1))
+        if self.stamped:
+            self._header(message.stamp_ns, message.frame_id)
+
+    def _header(self, stamp_ns: int, frame: str) -> None:
+        self.stamp.append(stamp_ns)
+        if len(self.frames) < 20 or frame in self.frames:
+            self.frames[frame] = self.frames.get(frame, 0) + 1
 
 
-def inspect(path: str | Path) -> BagReport:
+def inspect(path: str | Path, mapping: InputMapping | None = None, pose_frame: str = FRAME) -> BagReport:
     """Read a bag through once.
+
+    Args:
+        path: of the bag. mapping: what its topics, names and units mean. pose_frame: the frame that the tracker's poses are in.
 
     Raises:
         InputError: not a bag, or an input topic of another type or encoding.
     """
-    bag = open_bag(path)
+    bag = open_bag(path, mapping)
     bag.check_inputs(required=())
+    known = bag.topics
     times: dict[str, _Times] = {}
     inspectors: dict[str, Inspector] = {}
-    known = bag.topics
-    for topic, log_ns, data in bag.messages():
+    decoder = InputDecoder(bag.mapping)
+    for topic, log_ns, data, ros_type, encoding in bag.messages():
         entry = times.get(topic)
         if entry is None:
-            definition = TOPIC.get(topic)
-            stamped = (
-                definition is not None
-                and definition.has_header
-                and definition.ros_type == known[topic].ros_type
+            entry = times[topic] = _Times(
+                _stamped(topic, known[topic].ros_type if topic in known else ros_type)
             )
-            entry = times[topic] = _Times(stamped)
-        entry.add(log_ns, data)
-        if topic in DECODERS:
-            inspectors.setdefault(topic, inspector_for(topic)).add(data)
+        if topic not in INPUT_TOPICS or (ros_type and not accepts_type(topic, ros_type)):
+            entry.add(log_ns, data)
+            continue
+        inspector = inspectors.setdefault(
+            topic, inspector_for(topic, pose_frame if topic == TRACKER_TIP else FRAME)
+        )
+        try:
+            values = decoder.decode(topic, ros_type, encoding, data, log_ns)
+        except cdr.CdrError as error:
+            inspector.failed(error)
+            entry.log.append(min(log_ns, 2**63 - 1))
+            continue
+        for value in values:
+            entry.take(log_ns, value)
+            inspector.take(value)
+    for rest in decoder.joints.rest():
+        times[JOINT_STATES].take(
+            times[JOINT_STATES].log[-1] if times[JOINT_STATES].log else rest.stamp_ns, rest
+        )
+        inspectors[JOINT_STATES].take(rest)
+    times = {name: entry for name, entry in times.items() if len(entry.log)}
     starts = [t.log[0] for t in times.values()]
     ends = [t.log[-1] for t in times.values()]
     start_ns = min(starts, default=0)
     problems = [Finding("warning", "", note) for note in bag.notes]
     problems += [Finding("note", "", note) for note in bag.unchecked]
+    problems += [Finding("note", JOINT_STATES, note) for note in decoder.joints.notes]
     reports = [
         _topic_report(known[name].ros_type, name, times.get(name), start_ns, problems) for name in known
     ]
@@ -150,6 +181,14 @@ def inspect(path: str | Path) -> BagReport:
     )
 
 
+def _stamped(topic: str, ros_type: str) -> bool:
+    """Whether messages begin with a header that is read."""
+    if topic in INPUT_TOPICS:
+        return has_stamp(ros_type)
+    definition = TOPIC.get(topic)
+    return definition is not None and definition.has_header and definition.ros_type == ros_type
+
+
 def _topic_report(
     ros_type: str, name: str, times: _Times | None, start_ns: int, problems: list[Finding]
 ) -> TopicReport:
@@ -175,7 +214,7 @@ def _topic_report(
             "median": float(np.median(offset)),
             "max": float(offset.max()),
         }
-    if name in DECODERS:
+    if name in INPUT_TOPICS:
         problems += _stamp_findings(report, ordered, stamps, steps)
     return report
 
@@ -235,6 +274,8 @@ def _between_topics(bag: Bag, times: dict[str, _Times], reports: list[TopicRepor
         (TIP_LOAD, "note", "not in the bag; the known load is taken as zero"),
     ):
         if name not in times:
+            advice = cure(name, bag.stored_topics) if name not in bag.topics else ""
+            text += f"; {advice}" if advice.startswith("if ") else ""
             found.append(Finding(level, name, text))  # type: ignore[arg-type]
     for name in (JOINT_STATES, TRACKER_TIP, TIP_LOAD):
         offset = by_name[name].log_minus_stamp_s if name in times else None

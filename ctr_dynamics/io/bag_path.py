@@ -1,7 +1,8 @@
-"""From a path to the MCAP files it means: a file, a rosbag2 folder, or a folder that holds one file."""
+"""From a path to the files it means: one file, a rosbag2 folder, or a folder that holds one bag."""
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,11 @@ from ctr_dynamics.errors import InputError
 
 METADATA = "metadata.yaml"
 _MAX_METADATA_BYTES = 16 * 2**20
+_SUFFIXES = (".mcap", ".db3", ".bag")
+_PACKED = ("", ".zstd", ".zst")
+_GIVE = "give a bag: an .mcap, .db3 or .bag file, or a folder with one"
+# A split bag's parts: NAME_0.mcap, NAME_1.mcap, ... (ROS 1: NAME_0.bag, or NAME_DATE_0.bag)
+_PART = re.compile(r"(?P<stem>.*?)(?:_\d{4}(?:-\d\d){5})?_(?P<number>\d+)")
 
 
 @dataclass
@@ -24,12 +30,11 @@ class Located:
 
 
 def locate(path: str | Path) -> Located:
-    """Files of the bag at `path`: an ``.mcap`` file, a rosbag2 folder (also split), or a folder that holds
-    exactly one ``.mcap``.
+    """Files of the bag at `path`: a file (``.mcap``, ``.db3``, ``.bag``, also compressed with zstd), a rosbag2 folder (also split), or a folder
+    that holds one bag, whole or in numbered parts, without a ``metadata.yaml``.
 
     Raises:
-        InputError: nothing there, no or several ``.mcap`` without a ``metadata.yaml``, another storage or a
-            compression of whole files or messages.
+        InputError: nothing there, or several bags.
     """
     path = Path(path)
     try:
@@ -38,42 +43,70 @@ def locate(path: str | Path) -> Located:
         if path.is_dir():
             return _locate_in_folder(path)
         if not path.exists():
-            raise InputError("no such bag", where=str(path), do="give an .mcap file or a bag folder")
+            raise InputError("no such bag", where=str(path), do=_GIVE)
         if not path.is_file():
-            raise InputError("not a regular file", where=str(path), do="give an .mcap file or a bag folder")
+            raise InputError("not a regular file", where=str(path), do=_GIVE)
     except OSError as error:
         raise InputError(f"cannot be read ({error.strerror})", where=str(path)) from None
     return Located(path, [path])
 
 
+def _bag_suffix(path: Path) -> str:
+    """The format that a file's name claims; empty for other files."""
+    for suffix in _SUFFIXES:
+        if any(path.name.endswith(suffix + packed) for packed in _PACKED):
+            return suffix
+    return ""
+
+
 def _locate_in_folder(folder: Path) -> Located:
-    present = sorted(item for item in folder.glob("*.mcap") if item.is_file())
+    present = sorted(item for item in folder.iterdir() if item.is_file() and _bag_suffix(item))
+    present = [item for item in present if not _packed_twin(item, present)]
+    converted = [item for item in present if _bag_suffix(item) == ".mcap"]
+    notes: list[str] = []
     if (folder / METADATA).is_file():
-        notes: list[str] = []
         information = _read_metadata(folder / METADATA, notes)
         if information is not None:
             return _from_metadata(folder, information, present)
-        if len(present) == 1:
-            return Located(folder, present, notes)
     if not present:
-        other = next(
-            (item.name for pattern in ("*.db3", "*.mcap.zstd", "*.bag") for item in folder.glob(pattern)), ""
-        )
-        if other:
-            raise InputError(
-                f"holds no .mcap file, but {other}",
-                where=str(folder),
-                do="convert it with `ros2 bag convert`",
-            )
-        raise InputError("holds no .mcap file", where=str(folder), do="give an .mcap file or a bag folder")
-    if len(present) > 1:
+        raise InputError("holds no .mcap, .db3 or .bag file", where=str(folder), do=_GIVE)
+    parts = _parts(
+        converted or present
+    )  # beside an .mcap, a bag of another format is what it was converted from
+    if not parts:
         names = ", ".join(item.name for item in present[:4]) + (", ..." if len(present) > 4 else "")
         raise InputError(
-            f"holds {len(present)} .mcap files and no usable {METADATA} ({names}), 1 is expected",
+            f"holds {len(present)} bags ({names}) and no usable {METADATA} that says they are parts of one",
             where=str(folder),
             do="give one of the files",
         )
-    return Located(folder, present)
+    if len(parts) > 1:
+        notes.append(f"{METADATA} is not there: {len(parts)} numbered files are read as parts of one bag")
+    return Located(folder, parts, notes)
+
+
+def _packed_twin(item: Path, present: list[Path]) -> bool:
+    """Whether a compressed file lies beside its unpacked content."""
+    plain = item.name.removesuffix(".zstd").removesuffix(".zst")
+    return plain != item.name and any(other.name == plain for other in present)
+
+
+def _parts(present: list[Path]) -> list[Path]:
+    """The files in the order of their numbers where they are parts of one bag; empty where they are several bags."""
+    if len(present) == 1:
+        return present
+    numbered: list[tuple[int, Path]] = []
+    stems: set[tuple[str, str]] = set()
+    for item in present:
+        suffix = _bag_suffix(item)
+        match = _PART.fullmatch(item.name[: item.name.rindex(suffix)])
+        if match is None:
+            return []
+        stems.add((match["stem"], suffix))
+        numbered.append((int(match["number"]), item))
+    if len(stems) > 1 or len({number for number, _ in numbered}) < len(numbered):
+        return []
+    return [item for _, item in sorted(numbered)]
 
 
 def _read_metadata(path: Path, notes: list[str]) -> dict[str, Any] | None:
@@ -89,38 +122,32 @@ def _read_metadata(path: Path, notes: list[str]) -> dict[str, Any] | None:
     except (OSError, ValueError, KeyError, TypeError, RecursionError, yaml.YAMLError) as error:
         reason = " ".join(str(error).split())[:120]
         notes.append(
-            f"{path.name} is not usable ({type(error).__name__}: {reason}); the .mcap file is read without it"
+            f"{path.name} is not usable ({type(error).__name__}: {reason}); the files beside it are read without it"
         )
         return None
 
 
 def _from_metadata(folder: Path, information: dict[str, Any], present: list[Path]) -> Located:
-    storage = str(information.get("storage_identifier") or "mcap")
-    if storage != "mcap":
-        raise InputError(
-            f"storage {storage!r}, only 'mcap' is read",
-            where=str(folder),
-            do="convert it with `ros2 bag convert`",
-        )
-    mode = str(information.get("compression_mode") or "").lower()
-    if mode not in ("", "none", "storage"):
-        raise InputError(
-            f"compression mode {mode!r} of rosbag2, only compression inside the .mcap file is read",
-            where=str(folder),
-            do="convert it with `ros2 bag convert`",
-        )
     listed = information.get("relative_file_paths")
     names = [str(name) for name in listed] if isinstance(listed, list) else []
-    files = [folder / Path(name).name for name in names]
-    found = [item for item in files if item.is_file()]
-    notes = [f"{item.name} is named in {METADATA} but is not there" for item in files if not item.is_file()]
-    if not found and len(present) == 1:
-        return Located(folder, present, notes)
-    if not found:
-        missing = ", ".join(item.name for item in files[:4]) or "none"
+    files: list[Path] = []
+    notes: list[str] = []
+    for name in (Path(name).name for name in names):
+        found = next(
+            (item for item in present if item.name in (name, f"{name}.zstd", f"{name}.zst")),
+            next((item for item in present if item.name == name.removesuffix(".zstd")), None),
+        )
+        if found is None:
+            notes.append(f"{name} is named in {METADATA} but is not there")
+        elif found not in files:
+            files.append(found)
+    if not files and (parts := _parts(present)):
+        return Located(folder, parts, notes)
+    if not files:
+        missing = ", ".join(Path(name).name for name in names[:4]) or "none"
         raise InputError(
             f"none of the files named in {METADATA} is there ({missing})",
             where=str(folder),
-            do="copy the .mcap files next to it",
+            do="copy the files of the bag next to it",
         )
-    return Located(folder, found, notes)
+    return Located(folder, files, notes)

@@ -4,36 +4,31 @@ from __future__ import annotations
 
 import hashlib
 import heapq
-from collections.abc import Callable, Collection, Iterator
-from contextlib import ExitStack
-from dataclasses import dataclass, field
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import IO, NamedTuple
+from typing import NamedTuple
 
 from ctr_dynamics.errors import InputError
 from ctr_dynamics.io.bag_path import locate
-from ctr_dynamics.io.mcap_file import McapFile, read_mcap
-from ctr_dynamics.io.messages import cdr
-from ctr_dynamics.io.messages.topics import JOINT_STATES, TIP_LOAD, TOPIC, TRACKER_TIP
+from ctr_dynamics.io.inputs.input_decoder import InputDecoder
+from ctr_dynamics.io.inputs.input_mapping import InputMapping, cure, listed, topic_names
+from ctr_dynamics.io.messages.cdr import CdrError, JointStateIn, decode_joint_state
+from ctr_dynamics.io.messages.encode import encode_input
+from ctr_dynamics.io.messages.input_types import TYPES, Decoded, accepts_type, names_child, own_type, rank
+from ctr_dynamics.io.messages.topics import INPUTS, JOINT_STATES, TIP_LOAD, TRACKER_TIP
+from ctr_dynamics.io.storage.open_file import open_file, unpacked_message
+from ctr_dynamics.io.storage.stored_file import (
+    MAX_HELD_BYTES,
+    HeldBytes,
+    RawMessage,
+    StoredFile,
+    StoredTopic,
+)
 
-Decoded = cdr.JointStateIn | cdr.PoseIn | cdr.WrenchIn
-DECODERS: dict[str, Callable[[bytes], Decoded]] = {
-    JOINT_STATES: cdr.decode_joint_state,
-    TRACKER_TIP: cdr.decode_pose_stamped,
-    TIP_LOAD: cdr.decode_wrench_stamped,
-}
-
-
-MAX_HELD_BYTES = 128 * 2**20  # two of the largest chunks
-_ENTRY_BYTES = 256  # what a message takes beside its bytes while it waits for its turn
-
-
-class RawMessage(NamedTuple):
-    """A message as recorded: topic, log time (arrival) and serialised bytes."""
-
-    topic: str
-    log_ns: int
-    data: bytes
+__all__ = ["MAX_HELD_BYTES", "Bag", "BagTopic", "InputMessage", "RawMessage", "open_bag", "sha256_of"]
+INPUT_TOPICS = frozenset(topic.name for topic in INPUTS)
+ENCODINGS = ("cdr", "ros1")
 
 
 class InputMessage(NamedTuple):
@@ -46,12 +41,13 @@ class InputMessage(NamedTuple):
 
 @dataclass(frozen=True)
 class BagTopic:
-    """A topic of a bag: its message type, encoding and number of messages."""
+    """A topic of a bag: its name as it is used here, message type, encoding, number of messages, and its name in the bag."""
 
     name: str
     ros_type: str
     encoding: str
     messages: int
+    recorded_name: str = ""
 
 
 @dataclass
@@ -59,36 +55,51 @@ class Bag:
     """An opened bag. It holds the index only; messages are read while iterating.
 
     `notes` says what is missing or damaged; damage inside a chunk is found, and added, while iterating.
+    `mapping` says what its topics, names, frames and units mean; `names` gives each topic the name that it has here.
     """
 
     path: Path
-    files: list[McapFile]
+    files: Sequence[StoredFile]
     location_notes: list[str] = field(default_factory=list)
     malformed: dict[str, int] = field(default_factory=dict)
+    mapping: InputMapping = field(default_factory=InputMapping)
+    names: dict[str, str] = field(default_factory=dict)
     _first_fault: dict[str, str] = field(default_factory=dict)
+    _input_notes: list[str] = field(default_factory=list)
 
     @property
     def notes(self) -> list[str]:
         notes = [*self.location_notes, *(note for file in self.files for note in file.notes)]
         for topic, count in self.malformed.items():
             notes.append(f"{topic}: {count} messages cannot be decoded ({self._first_fault[topic]})")
-        return notes
+        return [*notes, *self._input_notes]
+
+    @property
+    def stored_topics(self) -> list[StoredTopic]:
+        """Topics as they are in the files."""
+        return [topic for file in self.files for topic in file.topics]
 
     @property
     def topics(self) -> dict[str, BagTopic]:
-        """Topics by name. Several channels of one topic are counted together."""
+        """Topics by name. Several channels of one topic are counted together; of several types the one that is used is given."""
         found: dict[str, BagTopic] = {}
-        for file in self.files:
-            for channel in file.channels.values():
-                schema = file.schemas.get(channel.schema_id)
-                before = found.get(channel.topic)
-                found[channel.topic] = BagTopic(
-                    channel.topic,
-                    before.ros_type if before else (schema.name if schema else ""),
-                    before.encoding if before else channel.message_encoding,
-                    file.counts.get(channel.id, 0) + (before.messages if before else 0),
-                )
+        for topic in self.stored_topics:
+            name = self.names.get(topic.name)
+            if name is None:
+                continue
+            before = found.get(name)
+            count = topic.messages + (before.messages if before else 0)
+            if before is None or (name in TYPES and rank(name, topic.ros_type) < rank(name, before.ros_type)):
+                found[name] = BagTopic(name, topic.ros_type, topic.encoding, count, topic.name)
+            else:
+                found[name] = replace(before, messages=count)
         return dict(sorted(found.items()))
+
+    @property
+    def span_ns(self) -> tuple[int, int]:
+        """First and last log time of its files; (0, 0) where there is no message."""
+        spans = [file.span_ns for file in self.files if file.span_ns != (0, 0)]
+        return min((s for s, _ in spans), default=0), max((e for _, e in spans), default=0)
 
     @property
     def unchecked(self) -> list[str]:
@@ -107,115 +118,196 @@ class Bag:
         """Check types and encodings of the input topics, and that the required ones hold messages.
 
         Raises:
-            InputError: a topic is missing, empty, or has another type or encoding.
+            InputError: a topic is missing, empty, or has another type or encoding, or one child frame has to be named.
         """
+        stored = self.stored_topics
         for name in required:
             here = self.topics.get(name)
             if here is None or (here.messages == 0 and all(file.complete for file in self.files)):
-                known = ", ".join(
-                    f"{topic.name} ({topic.ros_type})" for topic in list(self.topics.values())[:6]
-                )
                 state = "no topic" if here is None else "no message on"
                 damage = "".join(f"; {note}" for note in self.notes[:2])
+                missing = [name, *(n for n in (TRACKER_TIP, TIP_LOAD) if n not in self.topics and n != name)]
+                cures = [cure(n, stored) for n in missing]
                 raise InputError(
-                    f"{state} {name}; the bag holds {known or 'no topics at all'}{damage}",
+                    f"{state} {name}; the bag holds {listed(stored)}{damage}",
                     where=str(self.path),
-                    do="record that topic, or rename it with `ros2 bag convert`",
+                    do=" ".join([cures[0], *(f"and {c}" for c in cures[1:] if c.startswith("if "))]),
                 )
-        for file in self.files:
-            for channel in file.channels.values():
-                if channel.topic in DECODERS:
-                    schema = file.schemas.get(channel.schema_id)
-                    _check_channel(
-                        file.path, channel.topic, channel.message_encoding, schema.name if schema else ""
-                    )
+        for name in TYPES:
+            _check_topic(self.path, name, [t for t in stored if self.names.get(t.name) == name], stored)
+        self._check_child()
+
+    def _check_child(self) -> None:
+        """Of several child frames one has to be named.
+
+        Raises:
+            InputError: none is, or another one.
+        """
+        here = self.topics.get(TRACKER_TIP)
+        if here is None or not names_child(here.ros_type):
+            return
+        decoder = InputDecoder(self.mapping)
+        for _ in self._decoded(decoder, {TRACKER_TIP}):
+            pass
+        wanted, seen = self.mapping.child_frame.lstrip("/"), sorted(decoder.children)
+        if not seen or wanted in seen or (not wanted and len(seen) == 1):
+            return
+        frames = ", ".join(seen[:12])
+        raise InputError(
+            f"topic {here.recorded_name} has no child frame '{wanted}', but {frames}"
+            if wanted
+            else f"topic {here.recorded_name} has the child frames {frames}, and any may be the sensor",
+            where=str(self.path),
+            do="name that of the sensor: --set tracker.child_frame_id=NAME",
+        )
 
     def messages(self, only: Collection[str] | None = None) -> Iterator[RawMessage]:
-        """Messages in the order of log time, ties by topic name, then in the order of the file.
+        """Messages in the order of log time, ties by topic name, then in the order of the files.
 
         Only chunks that overlap in time are held in memory.
 
         Args:
-            only: topics wanted; None for all.
+            only: topics wanted, by the names that they have here; None for all.
 
         Raises:
             InputError: so many chunks overlap that their messages would not fit into ``MAX_HELD_BYTES``, or a file cannot be read.
         """
-        with ExitStack() as stack:
-            streams: list[IO[bytes]] = []
-            blocks = []
-            for number, file in enumerate(self.files):
-                try:
-                    streams.append(stack.enter_context(file.path.open("rb")))
-                except OSError as error:
-                    raise InputError(f"cannot be read ({error.strerror})", where=str(file.path)) from None
-                blocks += [(block.start_ns, number, block.offset, block) for block in file.blocks]
-            blocks.sort()
-            queue: list[tuple[int, str, int, int, int, bytes]] = []
-            held = 0
-            for _, number, offset, block in blocks:
-                # Everything before this block's first message can go; what is equal may tie with it.
-                while queue and queue[0][0] < block.start_ns:
-                    log_ns, topic, *_, data = heapq.heappop(queue)
-                    held -= len(data) + _ENTRY_BYTES
-                    yield RawMessage(topic, log_ns, data)
-                file = self.files[number]
-                try:
-                    for place, message in enumerate(file.load(streams[number], block)):
-                        channel = file.channels.get(message.channel_id)
-                        if channel is None:
-                            file.note(f"messages of the unknown channel {message.channel_id} are left out")
-                        elif only is None or channel.topic in only:
-                            entry = (message.log_ns, channel.topic, number, offset, place, message.data)
-                            heapq.heappush(queue, entry)
-                            held += len(message.data) + _ENTRY_BYTES
-                            if held > MAX_HELD_BYTES:
-                                raise InputError(
-                                    f"{len(queue)} messages overlap in time at {message.log_ns} ns, more than {MAX_HELD_BYTES} bytes",
-                                    where=str(file.path),
-                                    do="write them in the order of time: `mcap sort`",
-                                )
-                except OSError as error:
-                    file.note(f"byte {block.offset} cannot be read ({error.strerror})")
-            while queue:
-                log_ns, topic, *_, data = heapq.heappop(queue)
-                yield RawMessage(topic, log_ns, data)
 
-    def inputs(self) -> Iterator[InputMessage]:
+        def name_of(recorded: str) -> str | None:
+            # a topic that only the damaged part of a file tells of is not in the index
+            name = self.names.get(recorded, recorded)
+            if recorded not in self.names and recorded in self.names.values():
+                return None
+            return name if only is None or name in only else None
+
+        held = HeldBytes()
+        waiting = sorted(range(len(self.files)), key=lambda i: (self.files[i].span_ns[0], i), reverse=True)
+        heads: list[tuple[int, str, int, RawMessage, Iterator[RawMessage]]] = []
+        while waiting or heads:
+            # a file is opened when its time has come: of a split bag, one after the other
+            while waiting and (not heads or heads[0][0] >= self.files[waiting[-1]].span_ns[0]):
+                number = waiting.pop()
+                stream = self.files[number].messages(name_of, held)
+                _push(heads, number, stream)
+            if heads:
+                _, _, number, message, stream = heapq.heappop(heads)
+                yield message._replace(data=unpacked_message(message.data))
+                _push(heads, number, stream)
+
+    def inputs(self, only: Collection[str] = INPUT_TOPICS, n: int = 0) -> Iterator[InputMessage]:
         """Decoded messages of the estimator's input topics, in arrival order.
 
         What cannot be decoded is counted in `malformed` and left out.
+
+        Args:
+            only: topics wanted. n: number of tubes; 0 where it is not known.
 
         Raises:
             InputError: an input topic has another type or encoding.
         """
         self.check_inputs(required=())
+        decoder = InputDecoder(self.mapping, n)
         self.malformed.clear()
-        for topic, log_ns, data in self.messages(DECODERS):
+        log_ns = 0
+        for item in self._decoded(decoder, only):
+            log_ns = item.log_ns
+            yield item
+        for rest in decoder.joints.rest():
+            yield InputMessage(JOINT_STATES, log_ns, rest)
+        for note in decoder.joints.notes:
+            if note not in self._input_notes:
+                self._input_notes.append(note)
+
+    def standard_messages(self, only: Collection[str] = INPUT_TOPICS) -> Iterator[RawMessage]:
+        """Messages of the inputs in the types of the topics themselves, as the node subscribes to them.
+
+        Those that are recorded so come byte by byte as they are.
+
+        Args:
+            only: topics wanted, by the names that they have here.
+
+        Raises:
+            InputError: an input topic has another type or encoding.
+        """
+        self.check_inputs(required=())
+        decoder = InputDecoder(self.mapping)
+        alike = self.mapping == InputMapping(self.mapping.remap)
+        for message in self.messages(only):
+            plain = message.ros_type in ("", TYPES[message.topic][0]) and message.encoding == "cdr"
+            if plain and alike and message.topic != JOINT_STATES:
+                yield message
+                continue
             try:
-                message = DECODERS[topic](data)
-            except cdr.CdrError as error:
+                values = decoder.decode(
+                    message.topic, message.ros_type, message.encoding, message.data, message.log_ns
+                )
+                names = [value.names for value in values if isinstance(value, JointStateIn)]
+                if plain and alike and names == [decode_joint_state(message.data).names]:
+                    yield message
+                    continue
+            except CdrError:
+                if plain:
+                    yield message  # whoever takes it counts it
+                continue
+            for value in values:
+                yield RawMessage(message.topic, message.log_ns, encode_input(value), TYPES[message.topic][0])
+
+    def _decoded(self, decoder: InputDecoder, only: Collection[str]) -> Iterator[InputMessage]:
+        """Messages of the inputs ``only``; of a topic with several types, those of the type that comes first in ``TYPES``."""
+        kinds = {name: own_type(topic.ros_type) for name, topic in self.topics.items()}
+        for topic, log_ns, data, ros_type, encoding in self.messages(only):
+            if ros_type and own_type(ros_type) != kinds.get(topic, own_type(ros_type)):
+                note = f"{topic}: messages of type {ros_type} are left out"
+                if note not in self._input_notes:
+                    self._input_notes.append(note)
+                continue
+            try:
+                values = decoder.decode(topic, ros_type, encoding, data, log_ns)
+            except CdrError as error:
                 self.malformed[topic] = self.malformed.get(topic, 0) + 1
                 self._first_fault.setdefault(topic, str(error))
                 continue
-            yield InputMessage(topic, log_ns, message)
+            for value in values:
+                yield InputMessage(topic, log_ns, value)
 
     def sha256(self) -> dict[str, str]:
         """SHA-256 of every file of the bag, by file name."""
         return {file.path.name: sha256_of(file.path) for file in self.files}
 
 
-def _check_channel(path: Path, topic: str, encoding: str, ros_type: str) -> None:
-    expected = TOPIC[topic].ros_type
-    if encoding != "cdr":
+def _push(
+    heads: list[tuple[int, str, int, RawMessage, Iterator[RawMessage]]],
+    number: int,
+    stream: Iterator[RawMessage],
+) -> None:
+    """The next message of a file, among those of the others."""
+    message = next(stream, None)
+    if message is not None:
+        heapq.heappush(heads, (message.log_ns, message.topic, number, message, stream))
+
+
+def _check_topic(path: Path, name: str, found: Sequence[StoredTopic], stored: Sequence[StoredTopic]) -> None:
+    """Check that messages of an input can be read; of several types one is enough.
+
+    Raises:
+        InputError: none has a type and an encoding that are read.
+    """
+    usable = [t for t in found if not t.ros_type or accepts_type(name, t.ros_type)]
+    if found and not usable:
+        first = found[0]
+        title = f"topic {first.name}" + (f" (for {name})" if first.name != name else "")
+        others = cure(name, [t for t in stored if t.name != first.name])
         raise InputError(
-            f"topic {topic} has encoding {encoding!r}, only 'cdr' is read",
+            f"{title} has type {first.ros_type!r}, {' or '.join(TYPES[name])} is expected",
             where=str(path),
-            do="record it from ROS 2, or convert the bag",
+            do=others if others.startswith("if") else "publish and record it as one of these",
         )
-    if ros_type not in (expected, expected.replace("/msg/", "/")):
+    wrong = next((t for t in usable if t.encoding not in ENCODINGS), None)
+    if wrong is not None:
         raise InputError(
-            f"topic {topic} has type {ros_type or 'unknown'!r}, {expected!r} is expected", where=str(path)
+            f"topic {wrong.name} has encoding {wrong.encoding!r}, 'cdr' of ROS 2 and 'ros1' are read",
+            where=str(path),
+            do="record it from ROS 2 with `ros2 bag record`",
         )
 
 
@@ -235,17 +327,18 @@ def sha256_of(path: Path) -> str:
     return digest.hexdigest()
 
 
-def open_bag(path: str | Path) -> Bag:
+def open_bag(path: str | Path, mapping: InputMapping | None = None) -> Bag:
     """Open a bag for reading. A file that was cut off or not closed is opened too; `Bag.notes` says what is missing.
 
     Args:
-        path: an ``.mcap`` file, a rosbag2 folder, or a folder that holds exactly one ``.mcap``.
+        path: a file (``.mcap``, ``.db3``, ``.bag``, also compressed with zstd), a rosbag2 folder, or a folder that holds one bag.
+        mapping: what its topics, names, frames and units mean, where they are not the product's.
 
     Returns:
         The bag: `inputs()` yields the decoded messages of the estimator's inputs in the order of their arrival, `messages()` all of them as bytes.
 
     Raises:
-        InputError: nothing there, or not a bag.
+        InputError: nothing there, not a bag, or a topic of ``mapping`` that is not in it.
 
     Example:
         >>> from ctr_dynamics import open_bag
@@ -257,4 +350,7 @@ def open_bag(path: str | Path) -> Bag:
         ('tube1_rotation', 'tube1_translation', 'tube2_rotation', 'tube2_translation')
     """
     located = locate(path)
-    return Bag(located.path, [read_mcap(file) for file in located.files], located.notes)
+    mapping = mapping or InputMapping()
+    bag = Bag(located.path, [open_file(file) for file in located.files], located.notes, mapping=mapping)
+    bag.names = topic_names(bag.stored_topics, mapping, str(located.path))
+    return bag

@@ -10,11 +10,17 @@ from typing import Any, Literal
 
 from ctr_dynamics.errors import InputError
 
-Value = bool | int | float | str | tuple[float, ...]
-Kind = Literal["bool", "int", "float", "str", "floats"]
+Value = bool | int | float | str | tuple[float, ...] | tuple[str, ...]
+Kind = Literal["bool", "int", "float", "str", "floats", "texts"]
 
 _AXES = re.compile(r"(x?)(y?)(z?)(r?)(p?)(y?)")
-_KIND_TEXT = {"bool": "true or false", "int": "a whole number", "float": "a number", "str": "text"}
+_KIND_TEXT = {
+    "bool": "true or false",
+    "int": "a whole number",
+    "float": "a number",
+    "str": "text",
+    "texts": "a list of names",
+}
 
 
 @dataclass(frozen=True)
@@ -23,13 +29,13 @@ class Parameter:
 
     Attributes:
         name: dotted name.
-        type: "bool", "int", "float", "str" or "floats" (an array of `size` numbers).
-        default: value when nothing is given; tuple for "floats".
+        type: "bool", "int", "float", "str", "floats" (an array of `size` numbers) or "texts" (an array of names).
+        default: value when nothing is given; tuple for arrays.
         unit: "" when it has none.
         text: one sentence, what it does.
         low, high: inclusive range of numbers, each component for arrays; None is unbounded.
         choices: the texts that are taken; empty: any.
-        size: length of an array.
+        size: length of an array; 0: any. Where it is any, one number or name serves as an array of one.
         read_only: fixed once the node runs.
         syntax: called with a text; raises InputError when it is not one.
         syntax_text: the texts that `syntax` takes, for readers.
@@ -75,7 +81,7 @@ class Parameter:
         Raises:
             InputError: wrong type or out of range.
         """
-        if isinstance(value, str) and self.type != "str":
+        if isinstance(value, str) and self.type not in ("str", "texts"):
             value = self._from_text(value)
         if self.type == "bool":
             if not isinstance(value, bool):
@@ -85,18 +91,32 @@ class Parameter:
             if not isinstance(value, str):
                 raise self._wrong_type(value)
             return self._check_text(value)
+        if self.type == "texts":
+            return self._check_texts(value)
         if self.type == "floats":
+            if not self.size and not isinstance(value, bool) and isinstance(value, (int, float)):
+                value = (value,)
             if isinstance(value, (str, bytes, Mapping)) or not hasattr(value, "__len__"):
                 raise self._wrong_type(value)
             items = tuple(self._check_number(v) for v in value)
-            if len(items) != self.size:
+            if len(items) != (self.size or max(len(items), 1)):
                 raise InputError(
-                    f"has {len(items)} numbers, needs {self.size}",
+                    f"has {len(items)} numbers, needs {self.size or 'at least one'}",
                     do=f"write {list(self.default) if isinstance(self.default, tuple) else self.default}",
                     where=f"parameter {self.name}",
                 )
             return items
         return self._check_number(value)
+
+    def _check_texts(self, value: Any) -> tuple[str, ...]:
+        if isinstance(value, str):
+            inner = value.strip()
+            inner = inner[1:-1] if inner[:1] == "[" and inner[-1:] == "]" else inner
+            value = [part.strip().strip("'\"") for part in inner.split(",")]
+        # ROS has no empty array of texts with a type: one empty text stands for none
+        if not isinstance(value, (list, tuple)) or not all(isinstance(v, (str, int)) for v in value):
+            raise self._wrong_type(value)
+        return tuple(str(v) for v in value if str(v))
 
     def _from_text(self, text: str) -> Any:
         word = text.strip()
@@ -140,7 +160,9 @@ class Parameter:
         return value
 
     def _wrong_type(self, value: Any) -> InputError:
-        wanted = _KIND_TEXT.get(self.type, f"a list of {self.size} numbers")
+        wanted = _KIND_TEXT.get(
+            self.type, f"a list of {self.size} numbers" if self.size else "a list of numbers"
+        )
         return InputError(f"{value!r} is not {wanted}", do=f"write {wanted}", where=f"parameter {self.name}")
 
 

@@ -5,7 +5,9 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
+from ctr_dynamics.io.inputs.joint_readings import JointReadings
 from ctr_dynamics.io.messages.cdr import JointStateIn, PoseIn, WrenchIn
+from ctr_dynamics.parameters import pose_frame
 from ctr_dynamics.sensing.checks import CheckLimits, CheckOptions, Findings, InputChecks, Kind, Verdict
 from ctr_dynamics.sensing.interpolation import joint_order
 
@@ -37,6 +39,9 @@ class InputGate:
         x, y, z = tracker.translation.tolist()
         options = CheckOptions(
             frame_id=str(settings["output.frame_id"]),
+            pose_frame_id=pose_frame(settings),
+            unwrap=bool(settings["joints.unwrap"]),
+            turns=JointReadings(rotation_scale=settings["joints.rotation_scale"]).turns,
             translation=(x, y, z),
             lever=tuple(tracker.lever.tolist()),
             scale=float(tracker.scale),

@@ -26,7 +26,7 @@ def load(bag: Path, start_s: float = 0.0, duration_s: float = 0.0) -> list[RawMe
     """
     opened = open_bag(bag)
     opened.check_inputs()
-    messages = list(opened.messages({topic.name for topic in topics.INPUTS}))
+    messages = list(opened.standard_messages())
     if messages:
         begin = messages[0].log_ns + round(start_s * 1e9)
         end = begin + round(duration_s * 1e9) if duration_s > 0 else messages[-1].log_ns

@@ -24,9 +24,9 @@ from ctr_dynamics.estimation.monitoring.statuses import all_statuses, snap_ahead
 from ctr_dynamics.io.atomic_files import atomic_file, check_targets
 from ctr_dynamics.io.bag_reader import Bag, InputMessage, open_bag
 from ctr_dynamics.io.bag_writer import BagWriter, write_bag
-from ctr_dynamics.io.messages.cdr import CdrError, JointStateIn, PoseIn, decode_stamp
+from ctr_dynamics.io.messages.cdr import JointStateIn, PoseIn
 from ctr_dynamics.io.messages.topics import JOINT_STATES
-from ctr_dynamics.parameters import Settings
+from ctr_dynamics.parameters import Settings, input_mapping
 from ctr_dynamics.robot import Robot
 from ctr_dynamics.robot_files import load_robot
 from ctr_dynamics.runtime.clock_offset import ClockOffset, RisingStamps
@@ -68,11 +68,9 @@ def last_joints(bag: Bag) -> tuple[int, int]:
     """Last stamp and last log time of the joint states, ns; outliers far ahead are left out."""
     clock = ClockOffset(own=False)
     last_ns = last_log_ns = 0
-    for _, log_ns, data in bag.messages({JOINT_STATES}):
-        with contextlib.suppress(CdrError):
-            stamp_ns = decode_stamp(data)
-            if clock.sample(stamp_ns, log_ns):
-                last_ns, last_log_ns = max(last_ns, stamp_ns), log_ns
+    for _, log_ns, message in bag.inputs({JOINT_STATES}):
+        if clock.sample(message.stamp_ns, log_ns):
+            last_ns, last_log_ns = max(last_ns, message.stamp_ns), log_ns
     return last_ns, last_log_ns
 
 
@@ -116,7 +114,7 @@ class Player:
     def play(self, bag: Bag) -> Iterator[StepOutput]:
         """Steps in order, to the last joint stamp."""
         self._last_ns, last_log_ns = last_joints(bag)
-        for group in arrivals(bag.inputs()):
+        for group in arrivals(bag.inputs(n=self.estimator.robot.n_tubes)):
             log_ns = group[0].log_ns
             if log_ns > last_log_ns + AFTER_NS:
                 self.unused += len(group)
@@ -210,7 +208,7 @@ def plain(value: Any) -> Any:
 
 
 def replay(
-    bag: str | Path,
+    bag: str | Path | Bag,
     robot: Robot | str | Path,
     settings: Settings | Mapping[str, Any] | None = None,
     output: str | Path | None = None,
@@ -222,7 +220,7 @@ def replay(
     """Run a recorded bag through the estimator, without a ROS graph and as fast as it goes.
 
     Args:
-        bag: an ``.mcap`` file, a rosbag2 folder, or a folder that holds exactly one ``.mcap``.
+        bag: a file or folder, read as the ``joints`` and ``tracker`` settings say, or an opened bag.
         robot: a robot, the name of a shipped one, or a robot file.
         settings: parameters: all of them, or those that differ from replay's defaults. These are the node's, with ``output.policy`` ``wait``.
         output: MCAP file to write every output topic to; None for none. Files appear only when the
@@ -249,7 +247,7 @@ def replay(
     """
     if not isinstance(settings, Settings):
         settings = Settings({"output.policy": "wait", **(settings or {})})
-    opened = open_bag(bag)
+    opened = bag if isinstance(bag, Bag) else open_bag(bag, input_mapping(settings))
     opened.check_inputs()
     if not isinstance(robot, Robot):
         robot = load_robot(robot)
@@ -327,8 +325,7 @@ def _run(
     steps = withheld = 0
     stamps = RisingStamps()
     first_ns = last_ns = 0
-    blocks = [block for file in bag.files for block in file.blocks]
-    span_ns = max((b.end_ns for b in blocks), default=0) - min((b.start_ns for b in blocks), default=0)
+    span_ns = bag.span_ns[1] - bag.span_ns[0]
     begin = time.perf_counter()
     for out in player.play(bag):
         if not stamps.passes(out.stamp_ns):

@@ -6,6 +6,7 @@ from typing import Any
 
 from ctr_dynamics.errors import InputError
 from ctr_dynamics.io.bag_reader import Bag
+from ctr_dynamics.io.inputs.input_mapping import cure
 from ctr_dynamics.io.messages.topics import JOINT_STATES, STEP_NS, TRACKER_TIP
 from ctr_dynamics.parameters import PARAMETERS, Settings
 from ctr_dynamics.robot import Robot
@@ -69,12 +70,18 @@ def _without_effect(bag: Bag, settings: Settings) -> list[str]:
     notes = (
         []
         if tracker is not None and tracker.messages
-        else [f"no pose on {TRACKER_TIP}: the model runs in open loop"]
+        else [f"no pose on {TRACKER_TIP}: the model runs in open loop{_elsewhere(bag)}"]
     )
     live = [p.name for p in PARAMETERS if p.name.startswith(LIVE_ONLY) and settings[p.name] != p.default]
     if live:
         notes.append(f"parameters of the live node alone, without effect here: {', '.join(live)}")
     return notes
+
+
+def _elsewhere(bag: Bag) -> str:
+    """What to do where poses are in the bag under another name."""
+    advice = cure(TRACKER_TIP, bag.stored_topics)
+    return f"; {advice}" if advice.startswith("if ") else ""
 
 
 def _left_out(numbers: dict[str, Any]) -> list[str]:
@@ -102,7 +109,8 @@ def no_step(bag: Bag, robot: Robot, names: set[str], problems: dict[str, Any]) -
         f"no step was possible: no usable joint state of robot '{robot.name}' on {JOINT_STATES} (joints "
         f"found: {found}; needed: {expected}; readable messages: {_readable(bag)}{odd})",
         where=str(bag.path),
-        do="check joint names, units and robot with `ctr-dynamics info`",
+        do="name the joints with --set joints.rotation_names=A,B and joints.translation_names=C,D, "
+        "or look at units and robot with `ctr-dynamics info`",
     )
 
 

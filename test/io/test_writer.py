@@ -133,7 +133,7 @@ def test_killed_recorder_loses_little(tmp_path):
         from ctr_dynamics.io.messages.encode import encode_joint_state
         recorder = LiveRecorder({str(path)!r}, {{}})
         for i in range(20000):
-            recorder.write("/ctr/joint_states", i, encode_joint_state(i, ["tube1_rotation"], [0.1]))
+            recorder.write("/ctr/joint_states", i, encode_joint_state(i, ["tube1_rotation", "tube1_translation"], [0.1, -0.1]))
         os.kill(os.getpid(), signal.SIGKILL)
         """
     )

@@ -18,7 +18,7 @@ from ctr_dynamics.estimation.monitoring.health import Health
 from ctr_dynamics.estimation.timeline import Timeline
 from ctr_dynamics.io.messages.topics import STEP_NS
 from ctr_dynamics.model.model import Model
-from ctr_dynamics.parameters import Settings
+from ctr_dynamics.parameters import Settings, pose_frame
 from ctr_dynamics.sensing import ActuatorSignal, TrackerModel
 from ctr_dynamics.sensing.interpolation import Signal
 
@@ -89,7 +89,9 @@ class InputBuffer:
         self.timeout_ns = round(float(settings["input_timeout_s"]) * 1e9)
         self.extrapolating = settings["output.policy"] == "predict"
         self.timeline = Timeline()
-        self.measurements = MeasurementQueue(tracker, self.frame, self.window_ns, self.timeline, health)
+        self.measurements = MeasurementQueue(
+            tracker, pose_frame(settings), self.window_ns, self.timeline, health
+        )
         self._load_delay_ns = round(model.plant.load_delay * 1e9)
         self._least_change = model.load_slope_limit / (STEP_NS * 1e-9)  # of the load's rate, 1/s
         self.load = Signal(6)

@@ -62,7 +62,7 @@ def pose_values(
     if not accepts_frame(frame_id, frame):
         raise Unusable(
             "other frame",
-            f"pose in frame '{frame_id}', expected '{frame}'; register the tracker or rename its frame",
+            f"pose in frame '{frame_id}', expected '{frame}'; if that is the tracker's frame, set tracker.frame_id={frame_id}",
         )
     if not (finite(position) and finite(quaternion_xyzw)):
         raise Unusable(

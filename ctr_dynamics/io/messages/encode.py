@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from typing import NamedTuple, Protocol
 
-from ctr_dynamics.io.messages.cdr import CdrWriter
+from ctr_dynamics.io.messages.cdr import CdrWriter, JointStateIn, PoseIn, WrenchIn
 
 
 class Encoded(NamedTuple):
@@ -78,3 +78,14 @@ def encode_wrench_stamped(
     writer.header(stamp_ns, frame_id)
     writer.float64s([*force, *torque])
     return writer.done()
+
+
+def encode_input(message: JointStateIn | PoseIn | WrenchIn) -> bytes:
+    """An input in the type of its own topic."""
+    if isinstance(message, JointStateIn):
+        return encode_joint_state(message.stamp_ns, message.names, message.positions)
+    if isinstance(message, PoseIn):
+        return encode_pose_stamped(
+            message.stamp_ns, message.frame_id, message.position, message.quaternion_xyzw
+        )
+    return encode_wrench_stamped(message.stamp_ns, message.frame_id, message.force, message.torque)

@@ -100,8 +100,8 @@ class CheckOptions:
     """What the checks are told beside the robot file.
 
     Attributes:
-        frame_id: frame of poses and loads. translation: (3,) m, scale: -, of the registration; lever: (3,) m in the tip frame. None: as in
-            the robot file.
+        frame_id: frame of poses and loads; pose_frame_id: of poses, where it is another.
+        translation: (3,) m, scale: -, of the registration; lever: (3,) m in the tip frame. None: as in the robot file.
         orientation: whether the tracker's orientation is used at all.
         unwrap: whether angles are unwrapped. turns: rad, by which wrapped angles jump. After a gear it is 2 pi times the scale of the reading.
         limits: see :class:`CheckLimits`.
@@ -114,4 +114,5 @@ class CheckOptions:
     orientation: bool = True
     unwrap: bool = True
     turns: tuple[float, ...] = (2 * math.pi,)
+    pose_frame_id: str = ""
     limits: CheckLimits = field(default_factory=CheckLimits)

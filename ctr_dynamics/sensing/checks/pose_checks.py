@@ -127,8 +127,9 @@ class PoseChecks:
             expected_wxyz: (4,) orientation that the tracker should report, where the caller has an estimate of it.
         """
         at = stamp_ns if arrival_ns is None else arrival_ns
-        if not accepts_frame(frame_id, self.options.frame_id):
-            text = f"pose in frame '{frame_id}', expected '{self.options.frame_id}'; register the tracker or rename its frame"
+        expected = self.options.pose_frame_id or self.options.frame_id
+        if not accepts_frame(frame_id, expected):
+            text = f"pose in frame '{frame_id}', expected '{expected}'; if that is the tracker's frame, set tracker.frame_id={frame_id}"
             return self._drop(Kind.OTHER_FRAME, at, 0.0, "", text)
         pose: Pose = (tuple(position), tuple(quaternion_xyzw))
         if not all(map(math.isfinite, (*pose[0], *pose[1]))):

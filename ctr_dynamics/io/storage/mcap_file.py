@@ -8,9 +8,10 @@ so no content can make the reader allocate more than a block.
 
 from __future__ import annotations
 
+import heapq
 import struct
 import zlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from io import BytesIO
 from pathlib import Path
@@ -24,6 +25,7 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, ChunkIndex, Header, Metadata, MetadataIndex, Schema, Statistics
 
 from ctr_dynamics.errors import InputError
+from ctr_dynamics.io.storage.stored_file import HeldBytes, RawMessage, StoredTopic, ros2_type
 
 MAGIC = b"\x89MCAP0\r\n"
 # Recorders write chunks of 1 to 8 MB; a larger one holds one large message. What a chunk claims is bounded before it is unpacked.
@@ -57,11 +59,12 @@ class StoredMessage(NamedTuple):
 
 @dataclass
 class McapFile:
-    """What a file holds. `complete` is False when its closing summary is missing or unusable; `unchecked` is True once a chunk
-    without a checksum was read."""
+    """What a file holds; see :class:`StoredFile`. `complete` is False when its closing summary is missing or unusable; `unchecked` is
+    True once a chunk without a checksum was read. `read_path`: where its content lies, which is elsewhere where the file is compressed."""
 
     path: Path
     size: int
+    read_path: Path
     complete: bool = True
     unchecked: bool = False
     library: str = ""
@@ -77,6 +80,61 @@ class McapFile:
         line = f"{self.path.name}: {text}"
         if line not in self.notes:
             self.notes.append(line)
+
+    @property
+    def topics(self) -> list[StoredTopic]:
+        """See :attr:`StoredFile.topics`."""
+        return [
+            StoredTopic(
+                channel.topic, self._type(channel), channel.message_encoding, self.counts.get(channel.id, 0)
+            )
+            for channel in self.channels.values()
+        ]
+
+    def _type(self, channel: Channel) -> str:
+        schema = self.schemas.get(channel.schema_id)
+        return ros2_type(schema.name) if schema else ""
+
+    @property
+    def span_ns(self) -> tuple[int, int]:
+        """See :attr:`StoredFile.span_ns`."""
+        starts, ends = [b.start_ns for b in self.blocks], [b.end_ns for b in self.blocks]
+        return min(starts, default=0), max(ends, default=0)
+
+    def messages(self, name_of: Callable[[str], str | None], held: HeldBytes) -> Iterator[RawMessage]:
+        """See :meth:`StoredFile.messages`. Only chunks that overlap in time are held in memory."""
+        queue: list[tuple[int, str, int, int, int, bytes]] = []
+
+        def first() -> RawMessage:
+            log_ns, topic, _, _, number, data = heapq.heappop(queue)
+            held.release(data)
+            channel = self.channels[number]
+            return RawMessage(topic, log_ns, data, self._type(channel), channel.message_encoding)
+
+        try:
+            stream = self.read_path.open("rb")
+        except OSError as error:
+            raise InputError(f"cannot be read ({error.strerror})", where=str(self.path)) from None
+        with stream:
+            for block in sorted(self.blocks, key=lambda b: (b.start_ns, b.offset)):
+                # Everything before this block's first message can go; what is equal may tie with it.
+                while queue and queue[0][0] < block.start_ns:
+                    yield first()
+                try:
+                    for place, message in enumerate(self.load(stream, block)):
+                        channel = self.channels.get(message.channel_id)
+                        if channel is None:
+                            self.note(f"messages of the unknown channel {message.channel_id} are left out")
+                            continue
+                        topic = name_of(channel.topic)
+                        if topic is not None:
+                            entry = (message.log_ns, topic, block.offset, place, channel.id, message.data)
+                            heapq.heappush(queue, entry)
+                            held.take(message.data, message.log_ns, len(queue), self.path)
+                except OSError as error:
+                    self.note(f"byte {block.offset} cannot be read ({error.strerror})")
+            while queue:
+                yield first()
 
     def load(self, stream: IO[bytes], block: Block) -> Iterator[StoredMessage]:
         """Messages of one block in the order of the file. What is damaged, or larger than ``MAX_CHUNK_BYTES``, is left out and noted."""
@@ -179,20 +237,24 @@ def _records(data: bytes | bytearray) -> Iterator[tuple[int, int, int]]:
         position = start + length
 
 
-def read_mcap(path: Path) -> McapFile:
+def read_mcap(path: Path, read_path: Path | None = None) -> McapFile:
     """Index a file without holding its messages in memory.
+
+    Args:
+        path: of the file. read_path: of its content, if it lies elsewhere.
 
     Raises:
         InputError: the file is empty, not an MCAP file, or cannot be read.
     """
     try:
-        with path.open("rb") as stream:
+        content = read_path or path
+        with content.open("rb") as stream:
             size = stream.seek(0, 2)
             stream.seek(0)
             _check_magic(path, stream.read(16), size)
-            file = McapFile(path, size)
+            file = McapFile(path, size, content)
             if not _read_summary(file, stream):
-                file = McapFile(path, size, complete=False)
+                file = McapFile(path, size, content, complete=False)
                 _scan(file, stream)
             return file
     except OSError as error:
@@ -207,15 +269,11 @@ def _check_magic(path: Path, start: bytes, size: int) -> None:
         raise InputError("the file is empty (0 bytes)", where=str(path), do=do)
     if MAGIC.startswith(start):
         raise InputError(f"the file was cut after {size} bytes and holds nothing", where=str(path), do=do)
-    kinds = {
-        b"SQLite format 3": "an SQLite bag (.db3)",
-        b"#ROSBAG V": "a ROS 1 bag",
-        b"\x28\xb5\x2f\xfd": "a zstd-compressed file",
-    }
-    kind = next((text for head, text in kinds.items() if start.startswith(head)), "")
-    if kind:
-        raise InputError(f"is {kind}, not an MCAP file", where=str(path), do="convert it to MCAP first")
-    raise InputError(f"is not an MCAP file (begins with bytes {start[:8].hex(' ')})", where=str(path), do=do)
+    raise InputError(
+        f"is not an MCAP file, SQLite bag or ROS 1 bag (begins with bytes {start[:8].hex(' ')})",
+        where=str(path),
+        do=do,
+    )
 
 
 def _read_summary(file: McapFile, stream: IO[bytes]) -> bool:
