@@ -86,6 +86,7 @@ def _replay(server: ViewServer, opened: Bag, robot: Robot, settings: Settings, s
 
     estimator = Estimator(robot, settings)
     encoder = StepEncoder(settings["output.frame_id"], robot.name, settings["output.backbone_every"])
+    opened.tubes = robot.n_tubes
     inputs = opened.standard_messages()
     pending = next(inputs, None)
     pace = Pace(speed)

@@ -120,7 +120,7 @@ def inspect(path: str | Path, mapping: InputMapping | None = None, pose_frame: s
     times: dict[str, _Times] = {}
     inspectors: dict[str, Inspector] = {}
     decoder = InputDecoder(bag.mapping)
-    for topic, log_ns, data, ros_type, encoding in bag.messages():
+    for topic, log_ns, data, ros_type, encoding in bag.typed_messages():
         entry = times.get(topic)
         if entry is None:
             entry = times[topic] = _Times(

@@ -21,14 +21,22 @@ from ctr_dynamics.io.storage.open_file import open_file, unpacked_message
 from ctr_dynamics.io.storage.stored_file import (
     MAX_HELD_BYTES,
     HeldBytes,
-    RawMessage,
     StoredFile,
     StoredTopic,
+    TypedMessage,
 )
 
 __all__ = ["MAX_HELD_BYTES", "Bag", "BagTopic", "InputMessage", "RawMessage", "open_bag", "sha256_of"]
 INPUT_TOPICS = frozenset(topic.name for topic in INPUTS)
 ENCODINGS = ("cdr", "ros1")
+
+
+class RawMessage(NamedTuple):
+    """A message as recorded: topic, log time (arrival) and serialised bytes."""
+
+    topic: str
+    log_ns: int
+    data: bytes
 
 
 class InputMessage(NamedTuple):
@@ -56,6 +64,7 @@ class Bag:
 
     `notes` says what is missing or damaged; damage inside a chunk is found, and added, while iterating.
     `mapping` says what its topics, names, frames and units mean; `names` gives each topic the name that it has here.
+    `tubes`: number of the robot's, which tells when a joint state is whole; 0 where it is not known.
     """
 
     path: Path
@@ -64,6 +73,7 @@ class Bag:
     malformed: dict[str, int] = field(default_factory=dict)
     mapping: InputMapping = field(default_factory=InputMapping)
     names: dict[str, str] = field(default_factory=dict)
+    tubes: int = 0
     _first_fault: dict[str, str] = field(default_factory=dict)
     _input_notes: list[str] = field(default_factory=list)
 
@@ -172,6 +182,18 @@ class Bag:
         Raises:
             InputError: so many chunks overlap that their messages would not fit into ``MAX_HELD_BYTES``, or a file cannot be read.
         """
+        for message in self.typed_messages(only):
+            yield RawMessage(*message[:3])
+
+    def typed_messages(self, only: Collection[str] | None = None) -> Iterator[TypedMessage]:
+        """:meth:`messages` with type and encoding of each.
+
+        Args:
+            only: topics wanted, by the names that they have here; None for all.
+
+        Raises:
+            InputError: as :meth:`messages`.
+        """
 
         def name_of(recorded: str) -> str | None:
             # a topic that only the damaged part of a file tells of is not in the index
@@ -182,7 +204,7 @@ class Bag:
 
         held = HeldBytes()
         waiting = sorted(range(len(self.files)), key=lambda i: (self.files[i].span_ns[0], i), reverse=True)
-        heads: list[tuple[int, str, int, RawMessage, Iterator[RawMessage]]] = []
+        heads: list[tuple[int, str, int, TypedMessage, Iterator[TypedMessage]]] = []
         while waiting or heads:
             # a file is opened when its time has come: of a split bag, one after the other
             while waiting and (not heads or heads[0][0] >= self.files[waiting[-1]].span_ns[0]):
@@ -194,19 +216,19 @@ class Bag:
                 yield message._replace(data=unpacked_message(message.data))
                 _push(heads, number, stream)
 
-    def inputs(self, only: Collection[str] = INPUT_TOPICS, n: int = 0) -> Iterator[InputMessage]:
+    def inputs(self, only: Collection[str] = INPUT_TOPICS) -> Iterator[InputMessage]:
         """Decoded messages of the estimator's input topics, in arrival order.
 
         What cannot be decoded is counted in `malformed` and left out.
 
         Args:
-            only: topics wanted. n: number of tubes; 0 where it is not known.
+            only: topics wanted.
 
         Raises:
             InputError: an input topic has another type or encoding.
         """
         self.check_inputs(required=())
-        decoder = InputDecoder(self.mapping, n)
+        decoder = InputDecoder(self.mapping, self.tubes)
         self.malformed.clear()
         log_ns = 0
         for item in self._decoded(decoder, only):
@@ -232,10 +254,10 @@ class Bag:
         self.check_inputs(required=())
         decoder = InputDecoder(self.mapping)
         alike = self.mapping == InputMapping(self.mapping.remap)
-        for message in self.messages(only):
+        for message in self.typed_messages(only):
             plain = message.ros_type in ("", TYPES[message.topic][0]) and message.encoding == "cdr"
             if plain and alike and message.topic != JOINT_STATES:
-                yield message
+                yield RawMessage(*message[:3])
                 continue
             try:
                 values = decoder.decode(
@@ -243,19 +265,19 @@ class Bag:
                 )
                 names = [value.names for value in values if isinstance(value, JointStateIn)]
                 if plain and alike and names == [decode_joint_state(message.data).names]:
-                    yield message
+                    yield RawMessage(*message[:3])
                     continue
             except CdrError:
                 if plain:
-                    yield message  # whoever takes it counts it
+                    yield RawMessage(*message[:3])  # whoever takes it counts it
                 continue
             for value in values:
-                yield RawMessage(message.topic, message.log_ns, encode_input(value), TYPES[message.topic][0])
+                yield RawMessage(message.topic, message.log_ns, encode_input(value))
 
     def _decoded(self, decoder: InputDecoder, only: Collection[str]) -> Iterator[InputMessage]:
         """Messages of the inputs ``only``; of a topic with several types, those of the type that comes first in ``TYPES``."""
         kinds = {name: own_type(topic.ros_type) for name, topic in self.topics.items()}
-        for topic, log_ns, data, ros_type, encoding in self.messages(only):
+        for topic, log_ns, data, ros_type, encoding in self.typed_messages(only):
             if ros_type and own_type(ros_type) != kinds.get(topic, own_type(ros_type)):
                 note = f"{topic}: messages of type {ros_type} are left out"
                 if note not in self._input_notes:
@@ -276,9 +298,9 @@ class Bag:
 
 
 def _push(
-    heads: list[tuple[int, str, int, RawMessage, Iterator[RawMessage]]],
+    heads: list[tuple[int, str, int, TypedMessage, Iterator[TypedMessage]]],
     number: int,
-    stream: Iterator[RawMessage],
+    stream: Iterator[TypedMessage],
 ) -> None:
     """The next message of a file, among those of the others."""
     message = next(stream, None)

@@ -114,7 +114,7 @@ class Player:
     def play(self, bag: Bag) -> Iterator[StepOutput]:
         """Steps in order, to the last joint stamp."""
         self._last_ns, last_log_ns = last_joints(bag)
-        for group in arrivals(bag.inputs(n=self.estimator.robot.n_tubes)):
+        for group in arrivals(bag.inputs()):
             log_ns = group[0].log_ns
             if log_ns > last_log_ns + AFTER_NS:
                 self.unused += len(group)
@@ -251,6 +251,7 @@ def replay(
     opened.check_inputs()
     if not isinstance(robot, Robot):
         robot = load_robot(robot)
+    opened.tubes = robot.n_tubes
     settings = settings.replace({"robot": robot.source or robot.name})
     read = {"bag" if i == 0 else f"bag's part {i + 1}": file.path for i, file in enumerate(opened.files)}
     check_targets(

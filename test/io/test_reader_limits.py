@@ -9,9 +9,9 @@ from mcap.writer import Writer
 from ctr_dynamics.errors import InputError
 from ctr_dynamics.io.bag_info import inspect
 from ctr_dynamics.io.bag_reader import MAX_HELD_BYTES, open_bag
-from ctr_dynamics.io.storage.mcap_file import MAX_CHUNK_BYTES
 from ctr_dynamics.io.messages import topics
 from ctr_dynamics.io.messages.schemas import schema
+from ctr_dynamics.io.storage.mcap_file import MAX_CHUNK_BYTES
 
 
 def write(path, messages, **options):

@@ -25,7 +25,7 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, ChunkIndex, Header, Metadata, MetadataIndex, Schema, Statistics
 
 from ctr_dynamics.errors import InputError
-from ctr_dynamics.io.storage.stored_file import HeldBytes, RawMessage, StoredTopic, ros2_type
+from ctr_dynamics.io.storage.stored_file import HeldBytes, StoredTopic, TypedMessage, ros2_type
 
 MAGIC = b"\x89MCAP0\r\n"
 # Recorders write chunks of 1 to 8 MB; a larger one holds one large message. What a chunk claims is bounded before it is unpacked.
@@ -101,15 +101,15 @@ class McapFile:
         starts, ends = [b.start_ns for b in self.blocks], [b.end_ns for b in self.blocks]
         return min(starts, default=0), max(ends, default=0)
 
-    def messages(self, name_of: Callable[[str], str | None], held: HeldBytes) -> Iterator[RawMessage]:
+    def messages(self, name_of: Callable[[str], str | None], held: HeldBytes) -> Iterator[TypedMessage]:
         """See :meth:`StoredFile.messages`. Only chunks that overlap in time are held in memory."""
         queue: list[tuple[int, str, int, int, int, bytes]] = []
 
-        def first() -> RawMessage:
+        def first() -> TypedMessage:
             log_ns, topic, _, _, number, data = heapq.heappop(queue)
             held.release(data)
             channel = self.channels[number]
-            return RawMessage(topic, log_ns, data, self._type(channel), channel.message_encoding)
+            return TypedMessage(topic, log_ns, data, self._type(channel), channel.message_encoding)
 
         try:
             stream = self.read_path.open("rb")

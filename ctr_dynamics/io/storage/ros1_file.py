@@ -12,7 +12,7 @@ from typing import Any
 from rosbags.rosbag1 import Reader, ReaderError
 
 from ctr_dynamics.errors import InputError
-from ctr_dynamics.io.storage.stored_file import HeldBytes, RawMessage, StoredTopic, ros2_type
+from ctr_dynamics.io.storage.stored_file import HeldBytes, StoredTopic, TypedMessage, ros2_type
 
 _ERRORS = (ReaderError, struct.error, ValueError, KeyError, TypeError, IndexError, OSError, RuntimeError, EOFError)  # fmt: skip
 
@@ -33,7 +33,7 @@ class Ros1File:
     topics: list[StoredTopic] = field(default_factory=list)
     span_ns: tuple[int, int] = (0, 0)
 
-    def messages(self, name_of: Callable[[str], str | None], held: HeldBytes) -> Iterator[RawMessage]:
+    def messages(self, name_of: Callable[[str], str | None], held: HeldBytes) -> Iterator[TypedMessage]:
         """See :meth:`StoredFile.messages`."""
         try:
             with Reader(self.read_path) as reader:
@@ -49,7 +49,7 @@ class Ros1File:
                         held.take(together[-1][-1], log_ns, len(together), self.path)
                     for name, _, connection, content in sorted(together, key=lambda item: item[:2]):
                         held.release(content)
-                        yield RawMessage(name, log_ns, content, ros2_type(connection.msgtype), "ros1")
+                        yield TypedMessage(name, log_ns, content, ros2_type(connection.msgtype), "ros1")
         except _ERRORS as error:
             self.complete = False
             note = f"{self.path.name}: damaged, later messages are missing ({_short(error)})"

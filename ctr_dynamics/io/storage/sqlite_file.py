@@ -10,7 +10,7 @@ from pathlib import Path
 from urllib.parse import quote
 
 from ctr_dynamics.errors import InputError
-from ctr_dynamics.io.storage.stored_file import HeldBytes, RawMessage, StoredTopic, ros2_type
+from ctr_dynamics.io.storage.stored_file import HeldBytes, StoredTopic, TypedMessage, ros2_type
 
 
 @dataclass
@@ -29,7 +29,7 @@ class SqliteFile:
     topics: list[StoredTopic] = field(default_factory=list)
     span_ns: tuple[int, int] = (0, 0)
 
-    def messages(self, name_of: Callable[[str], str | None], held: HeldBytes) -> Iterator[RawMessage]:
+    def messages(self, name_of: Callable[[str], str | None], held: HeldBytes) -> Iterator[TypedMessage]:
         """See :meth:`StoredFile.messages`."""
         try:
             with closing(_connect(self.read_path)) as database:
@@ -51,7 +51,7 @@ class SqliteFile:
                 for number, log_ns, data in rows:
                     if isinstance(data, bytes) and isinstance(log_ns, int):
                         name, kind, encoding = topics[number]
-                        yield RawMessage(name, max(log_ns, 0), data, kind, encoding)
+                        yield TypedMessage(name, max(log_ns, 0), data, kind, encoding)
         except sqlite3.Error as error:
             self.complete = False
             note = f"{self.path.name}: damaged, later messages are missing ({error})"

@@ -12,7 +12,7 @@ MAX_HELD_BYTES = 128 * 2**20  # two of the largest chunks
 _ENTRY_BYTES = 256  # what a message takes beside its bytes while it waits for its turn
 
 
-class RawMessage(NamedTuple):
+class TypedMessage(NamedTuple):
     """A message as recorded: topic, log time (arrival), serialised bytes, and what they are."""
 
     topic: str
@@ -84,7 +84,7 @@ class StoredFile(Protocol):
         """First and last log time, (0, 0) where there are no messages."""
         ...
 
-    def messages(self, name_of: Callable[[str], str | None], held: HeldBytes) -> Iterator[RawMessage]:
+    def messages(self, name_of: Callable[[str], str | None], held: HeldBytes) -> Iterator[TypedMessage]:
         """Messages in the order of log time, ties by topic name, then in the order of the file.
 
         Args:
