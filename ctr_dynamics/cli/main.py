@@ -27,6 +27,7 @@ COMMANDS = {
     "replay": "Run a recorded bag through the estimator, without a ROS graph.",
     "diagnose": "Find what the simulation gets wrong about the recorded robot.",
     "simulate": "Write a bag of a simulated scenario.",
+    "evaluate": "Compare a replay's outputs with the truth of a simulated robot.",
     "statics": "Solve the static model for a table of actuator positions.",
     "snap": "Snap-through by the finite-difference solver.",
     "import": "Write CSV logs of actuators and tracker as a bag.",

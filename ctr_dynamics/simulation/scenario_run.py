@@ -18,6 +18,7 @@ from ctr_dynamics.errors import InputError
 from ctr_dynamics.io.bag_writer import write_bag
 from ctr_dynamics.io.messages import topics
 from ctr_dynamics.io.messages.encode import encode_joint_state, encode_pose_stamped, encode_wrench_stamped
+from ctr_dynamics.io.truth_files import Truth
 from ctr_dynamics.kernels.rotations import from_vector, matrix, multiply
 from ctr_dynamics.model.model import Model
 from ctr_dynamics.model.simulator import Inputs, Simulator
@@ -243,6 +244,20 @@ def _tip_at(recording: Recording) -> Callable[[Floats], Floats]:
         return tip
 
     return at
+
+
+def truth_of(scenario: Scenario, robot: Robot, recording: Recording) -> Truth:
+    """The tip of a run over time, its velocity by central differences, and what an ideal tracker would have reported at each time."""
+    tracker = make_plant(robot).tracker.corrected(delay=0.0)
+    velocity = np.gradient(recording.position, recording.t, axis=0, edge_order=2)
+    return Truth(
+        recording.t,
+        recording.position,
+        recording.quaternion,
+        velocity,
+        tracker.forward(recording.t, _tip_at(recording))[0],
+        scenario.start_stamp_s * 1_000_000_000,
+    )
 
 
 def messages(scenario: Scenario, robot: Robot, recording: Recording) -> list[tuple[int, str, bytes]]:
