@@ -27,17 +27,16 @@ TOLERANCE, LIMIT = 1e-7, 40
 
 
 @njit(cache=False, nogil=True, error_model="numpy")
-def _euler_cells(kind, W, v, present, cells, h, point, node, ust, c0):
+def _euler_cells(kind, W, v, present, first, last, cells, h, point, node, ust, c0):
     """As :func:`ctr_dynamics.kernels.sweep.cells_of_section`, with the slope at the beginning of every cell alone."""
     n = kind.tubes
     S, F, at = state_rows(n).size, field_rows(n).size, workspace_rows(n)
-    for cell in range(cells):
+    for cell in range(first, last):
         for r in range(S):
             v.nodes[(node + cell) * S + r] = W[at.state + r]
             W[at.stage + r] = W[at.state + r]
         here = point + 4 * cell
-        for r in range(F):
-            W[at.history + r] = v.history[here * F + r]
+        kernels.load_history(kind, W, v, here)
         kernels.derivative(kind, W, present, ust, here * 3 * n, c0)
         for r in range(F):
             v.fields[here * F + r] = W[at.fields + r]
