@@ -121,7 +121,7 @@ def page(result: Result) -> str:
         "- real-time ratio over step and spacing (Till et al. 2020, Fig. 13);\n"
         "- error over spacing (Fig. 14);\n"
         "- histogram of the times of the steps.\n\n"
-        "The default time scheme, `sdirk3`, has the smallest error at 3 ms below.\n\n"
+        "The default time scheme, `radau`, has the smallest error at 3 ms below.\n\n"
         f"```text\n{text(result)}\n```\n"
     )
 

@@ -21,7 +21,7 @@ from ctr_dynamics.benchmarks.sweeps import sweep_cost
 from ctr_dynamics.kernels.kinds import ONE_LANE
 from ctr_dynamics.model.model import Model
 
-SCHEMES = ("backward_euler", "bdf2", "bdf_alpha", "trapezoid", "sdirk2", "sdirk3")
+SCHEMES = ("backward_euler", "bdf2", "bdf_alpha", "trapezoid", "sdirk2", "sdirk3", "radau")
 
 
 def work(

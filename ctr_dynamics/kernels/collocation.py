@@ -339,17 +339,18 @@ def advance_stages(kind, damping, mesh, scheme, solver, run, inputs, x, fresh):
 
 @njit(nogil=True, error_model="numpy")
 def advance_two(kind, damping, mesh, scheme, solver, runs, inputs, x, fresh, outcome):
-    """A step of two ``runs`` in the same sweeps, as :func:`advance_stages` of one; ``inputs`` two arrays (stages, inputs), ``x`` (2, stages, mt).
+    """A step of two ``runs`` in the same sweeps, as :func:`advance_stages` of one; ``inputs`` (2, stages, inputs), ``x`` (2, stages, mt).
 
     ``outcome`` (2,) is set; unless both converge, both runs are as they were but for their Jacobians. Returns (sweeps, Jacobians).
     """
+    both = (runs.first, runs.second)
     for g in range(2):
-        prepare_stages(kind, TWO_RUNS, mesh, scheme, solver, g, runs[g].parameters, inputs[g], runs[g].bank)
-    factors = (runs[0].factors, runs[1].factors)
+        prepare_stages(kind, TWO_RUNS, mesh, scheme, solver, g, both[g].parameters, inputs[g], both[g].bank)
+    factors = (runs.first.factors, runs.second.factors)
     sweeps, jacobians = solve_stages(
         kind, damping, TWO_RUNS, mesh, scheme, solver, x, factors, fresh, outcome
     )
     if outcome[0] == CONVERGED and outcome[1] == CONVERGED:
         for g in range(2):
-            finish_stages(TWO_RUNS, scheme, solver, g, runs[g].bank, runs[g].nodes)
+            finish_stages(TWO_RUNS, scheme, solver, g, both[g].bank, both[g].nodes)
     return sweeps, jacobians

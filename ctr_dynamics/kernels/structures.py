@@ -215,6 +215,14 @@ class CollocationRun(NamedTuple):
     nodes: np.ndarray
 
 
+@structure
+class RunPair(NamedTuple):
+    """Two runs that take their steps together."""
+
+    first: CollocationRun
+    second: CollocationRun
+
+
 class SystemFactors(NamedTuple):
     """Inverses of multiple-shooting systems, one for each of E complex rates; axes of 2 are real and imaginary part, columns come before rows.
 

@@ -92,6 +92,7 @@ class Workspaces:
     def __init__(self, model: Model, scheme: Collocation, tolerance: float, lanes: Lanes = ONE_RUN) -> None:
         self.model, self.scheme, self.tolerance, self.lanes = model, scheme, tolerance, lanes
         self._known: dict[Key, Workspace] = {}
+        self._dt_of: dict[Key, float] = {}  # s, steps whose units the buffers hold
 
     def of(self, key: Key, mesh: Mesh, beta: Floats, scheme: Collocation) -> Workspace:
         """Buffers for the sections ``key`` of ``mesh`` at the translations ``beta`` (N,) m, with the units of steps by ``scheme``."""
@@ -101,9 +102,10 @@ class Workspaces:
         elif self.model.moving_precurvature:
             segments = segments_of(self.model, key, mesh, beta, self.scheme.coefficients.rates)
             known = known._replace(segments=segments)
-        point = known.solver.point
-        units, residuals = unknown_units(self.model, len(known.segments.nodes), scheme.rate)
-        point.units[:], point.residual_units[:] = units, residuals
+        if self._dt_of.get(key) != scheme.dt:
+            point, self._dt_of[key] = known.solver.point, scheme.dt
+            units, residuals = unknown_units(self.model, len(known.segments.nodes), scheme.rate)
+            point.units[:], point.residual_units[:] = units, residuals
         return known
 
     def _make(self, key: Key, mesh: Mesh, beta: Floats) -> Workspace:

@@ -12,6 +12,7 @@ from ctr_dynamics.errors import InputError
 from ctr_dynamics.kernels.collocation import TWO_RUNS, advance_two, predict
 from ctr_dynamics.kernels.coupling import DAMPED, STAGES, UNDAMPED
 from ctr_dynamics.kernels.shooting import CONVERGED
+from ctr_dynamics.kernels.structures import CollocationRun, RunPair
 from ctr_dynamics.model.collocation_buffers import Workspaces
 from ctr_dynamics.model.collocation_steps import CollocationSteps, accept, recorded
 from ctr_dynamics.model.simulator import Simulator
@@ -32,6 +33,7 @@ class CollocationPair:
         self.first, self.second = first, second
         self.scheme = first.scheme
         self._steps: tuple[CollocationSteps, CollocationSteps] = first.collocation, second.collocation
+        self._runs: RunPair | None = None
         self._workspaces = Workspaces(first.model, first.scheme, first.tolerance, TWO_RUNS)
 
     def step(
@@ -63,6 +65,12 @@ class CollocationPair:
         a.become(trials[0])
         b.become(trials[1])
         return divided([first for first, _ in parts]), divided([second for _, second in parts])
+
+    def _together(self, first: CollocationRun, second: CollocationRun) -> RunPair:
+        """Both runs; the same object while they are the same, of which the compiler knows the type."""
+        if self._runs is None or self._runs.first is not first or self._runs.second is not second:
+            self._runs = RunPair(first, second)
+        return self._runs
 
     def _part(
         self,
@@ -97,9 +105,11 @@ class CollocationPair:
             fresh[g] = not state.usable
         one, other = self._steps
         damping = DAMPED if one.damping is DAMPED or other.damping is DAMPED else UNDAMPED
-        runs = a.run(one.parameters, work.factors_in), b.run(other.parameters, work.factors_in)
+        runs = self._together(
+            a.run(one.parameters, work.factors_in), b.run(other.parameters, work.factors_in)
+        )
         sweeps, jacobians = advance_two(
-            model.kind, damping, work.segments.mesh, scheme.coefficients, work.solver, runs, (rows_a, rows_b), x, fresh, outcome
+            model.kind, damping, work.segments.mesh, scheme.coefficients, work.solver, runs, np.stack((rows_a, rows_b)), x, fresh, outcome
         )  # fmt: skip
         a.usable, b.usable = (bool(found == CONVERGED) for found in outcome)
         if not (a.usable and b.usable):

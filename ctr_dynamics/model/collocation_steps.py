@@ -55,6 +55,8 @@ class CollocationSteps:
     def __init__(self, model: Model, scheme: Collocation, tolerance: float, parameters: Floats) -> None:
         self.model, self.scheme, self.parameters = model, scheme, parameters
         self.workspaces = Workspaces(model, scheme, tolerance)
+        rows = model.layout.rows
+        self._damping_rows = np.concatenate([rows("bending_damping"), rows("torsion_damping")])
 
     def shift(self, state: State, change: Floats, nodes: Floats) -> None:
         """Move the unknowns of ``state`` with a correction: the first of them by ``change`` (5 + N,), those at the cuts as the ``nodes`` (P, S)."""
@@ -64,9 +66,7 @@ class CollocationSteps:
     @property
     def damping(self) -> Damping:
         """Whether a tube of the run has damping."""
-        layout, block = self.model.layout, self.parameters
-        damped = block[layout["bending_damping"]].any() or block[layout["torsion_damping"]].any()
-        return DAMPED if damped else UNDAMPED
+        return DAMPED if self.parameters[self._damping_rows].any() else UNDAMPED
 
     def rest(self, equilibrium: Equilibrium, inputs: Inputs) -> State:
         """State at rest in the ``equilibrium`` at ``inputs``."""

@@ -71,6 +71,7 @@ def test_quick_bench_writes_figures_and_plots(tmp_path, capsys):
     lanes = {(r["nodes"], r["lanes"]): r["lane_ratio_to_plain_sweep"] for r in result["sweeps"]}
     assert lanes[100, 8] < 0.6  # of a plain sweep a lane: lanes vectorise
     error = {r["scheme"]: r["error_m"] for r in result["time_error"]["schemes"]}
+    assert error["radau"] < 0.2 * error["sdirk3"]
     assert error["sdirk3"] < error["sdirk2"] < error["bdf2"] < error["backward_euler"]
     over = {round(1e6 * r["dt_s"]): r for r in result["time_error"]["steps"]}
     assert over[3000]["divided_error_m"] < over[3000]["error_m"]
