@@ -11,7 +11,9 @@ from typing import Annotated
 
 import typer
 
+from ctr_dynamics.cli.recording_options import Assignments, Params, Remap, settings_from
 from ctr_dynamics.errors import InputError
+from ctr_dynamics.io.inputs.input_mapping import parse_remap
 from ctr_dynamics.robot_files import load_robot
 
 EXIT = 0
@@ -38,6 +40,9 @@ def diagnose(
             help="Bags that are predicted only: what the extension is worth.",
         ),
     ] = None,
+    remap: Remap = None,
+    params: Params = None,
+    assignments: Assignments = None,
     workers: Annotated[int, typer.Option("--workers", min=1, max=64, help="Fits at once.")] = 2,
     cluster: Annotated[
         str,
@@ -61,6 +66,12 @@ def diagnose(
     command = "ctr-dynamics diagnose " + " ".join(shlex.quote(str(b)) for b in bags)
     if validate:
         command += " --validate " + " ".join(shlex.quote(str(b)) for b in validate)
+    for option, given in (
+        ("--remap", remap),
+        ("--params", [str(params)] if params else []),
+        ("--set", assignments),
+    ):
+        command += "".join(f" {option} {shlex.quote(value)}" for value in given or [])
     command += f" --robot {shlex.quote(robot)} --output {shlex.quote(str(output))}"
     request = Request(
         loaded,
@@ -70,6 +81,8 @@ def diagnose(
         command,
         workers,
         report,
+        settings_from(params, assignments),
+        parse_remap(remap or []),
     )
     begin = time.perf_counter()
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import Annotated
@@ -18,13 +19,13 @@ from ctr_dynamics.cli.recording_options import (
     settings_from,
 )
 from ctr_dynamics.io.bag_checks import Finding
-from ctr_dynamics.io.bag_info import BagReport, TopicReport, inspect
+from ctr_dynamics.io.bag_info import GAP_PERIODS, BagReport, TopicReport, inspect
 from ctr_dynamics.io.bag_reader import open_bag
 from ctr_dynamics.io.inputs.input_mapping import InputMapping
 from ctr_dynamics.io.messages.topics import JOINT_STATES, TIP_LOAD, TRACKER_TIP
 from ctr_dynamics.parameters import Settings, pose_frame
 from ctr_dynamics.runtime.replay import plain
-from ctr_dynamics.sensing.checks import CheckOptions, Kind
+from ctr_dynamics.sensing.checks import CheckLimits, CheckOptions, Kind
 from ctr_dynamics.sensing.checks.input_checks import check_messages
 
 STREAMS = {"joints": JOINT_STATES, "tracker": TRACKER_TIP, "load": TIP_LOAD}
@@ -98,15 +99,18 @@ def _text(report: BagReport) -> str:
     return "\n".join(lines)
 
 
-def _input_faults(bag: Path, start_ns: int, mapping: InputMapping, settings: Settings) -> list[Finding]:
-    """Faults of the inputs that node and replay leave out or mend, one line each, with times in s after ``start_ns``."""
+def _input_faults(bag: Path, report: BagReport, mapping: InputMapping, settings: Settings) -> list[Finding]:
+    """Faults of the inputs that node and replay leave out or mend, one line each, with times in s after its first message."""
+    rate_hz = next((t.rate_hz for t in report.topics if t.name == JOINT_STATES), None)
+    limits = CheckLimits()
     options = CheckOptions(
+        limits=replace(limits, gap_s=max(limits.gap_s, GAP_PERIODS / rate_hz if rate_hz else 0.0)),
         pose_frame_id=pose_frame(settings),
         unwrap=bool(settings["joints.unwrap"]),
         turns=mapping.joints.turns,
     )
     return [
-        Finding(found.level, STREAMS[found.stream], found.line(start_ns))
+        Finding(found.level, STREAMS[found.stream], found.line(report.start_ns))
         for found in check_messages(open_bag(bag, mapping).inputs(), options=options)
         if found.kind not in REPORTED
     ]
@@ -126,7 +130,7 @@ def info(
     settings = settings_from(params, assignments)
     mapping = mapping_from(settings, remap)
     report = inspect(bag, mapping, pose_frame(settings))
-    report.problems += _input_faults(bag, report.start_ns, mapping, settings)
+    report.problems += _input_faults(bag, report, mapping, settings)
     if as_json:
         print(json.dumps(plain(report.to_dict()), indent=1, allow_nan=False, ensure_ascii=False))
     else:

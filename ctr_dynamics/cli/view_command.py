@@ -18,6 +18,7 @@ from ctr_dynamics.io.bag_reader import Bag
 from ctr_dynamics.parameters import Settings
 from ctr_dynamics.robot import Robot
 from ctr_dynamics.robot_files import load_robot
+from ctr_dynamics.runtime.joint_rate import with_joint_rate
 from ctr_dynamics.runtime.step_encoder import StepEncoder
 from ctr_dynamics.view.server import Pace, ViewServer
 
@@ -84,9 +85,10 @@ def _replay(server: ViewServer, opened: Bag, robot: Robot, settings: Settings, s
     from ctr_dynamics.estimation.estimator import Estimator
     from ctr_dynamics.runtime.replay import Player, no_step
 
+    opened.tubes = robot.n_tubes
+    settings, _ = with_joint_rate(opened, settings)
     estimator = Estimator(robot, settings)
     encoder = StepEncoder(settings["output.frame_id"], robot.name, settings["output.backbone_every"])
-    opened.tubes = robot.n_tubes
     inputs = opened.standard_messages()
     pending = next(inputs, None)
     pace = Pace(speed)

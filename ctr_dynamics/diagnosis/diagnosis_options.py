@@ -29,6 +29,9 @@ class RecordingOptions:
     shortest_s: float = option(2.0, "s", "joints and tracker together; less shows too little of a vibration")
     longest_s: float = option(1000.0, "s", "joints that fit into memory with all that is kept of them")
     gap_s: float = option(0.1, "s", "without joint states; the motion in a longer gap is unknown")
+    gap_periods: float = option(
+        3.0, "periods of the joints", "likewise, for slow or uneven joints: two lost readings in a row"
+    )
     settling_s: float = option(0.5, "s", "after a gap; vibration from the unseen motion persists")
     pause_s: float = option(
         10.0, "s", "without joint states, or by which the clock was set: another recording"

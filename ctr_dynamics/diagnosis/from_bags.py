@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from ctr_dynamics.diagnosis.request import Request, run
 from ctr_dynamics.diagnosis.run_context import RunContext
+from ctr_dynamics.parameters import Settings
 from ctr_dynamics.robot import Robot
 from ctr_dynamics.robot_files import load_robot
 
@@ -22,6 +23,7 @@ def diagnose(
     workers: int = 2,
     report: bool = True,
     progress: Callable[[str], None] | None = None,
+    settings: Settings | Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
     """Find what the simulation of a robot gets wrong about recordings of it, and how much.
 
@@ -35,6 +37,7 @@ def diagnose(
         workers: simulations at once.
         report: whether to write the page.
         progress: is told of every stage as it begins.
+        settings: parameters, of which ``joints`` and ``tracker`` say what the bags' names, units and frames mean.
 
     Returns:
         The content of ``findings.json``: ``verdict`` ("clean", "named", "ambiguous", "unknown", ...), ``causes`` with their sizes in SI units,
@@ -58,6 +61,7 @@ def diagnose(
     fitted, predicted = [str(bag) for bag in bags], [str(bag) for bag in validate]
     words = ["ctr-dynamics", "diagnose", *fitted, *(["--validate", *predicted] if predicted else [])]
     words += ["--robot", loaded.source or loaded.name, "--output", str(output)]
-    request = Request(loaded, fitted, predicted, str(output), shlex.join(words), workers, report)
+    checked = settings if isinstance(settings, Settings) else Settings(settings)
+    request = Request(loaded, fitted, predicted, str(output), shlex.join(words), workers, report, checked)
     context = RunContext(workers=workers) if progress is None else RunContext(progress, workers)
     return run(request, context)

@@ -5,7 +5,7 @@ In: a bag and a robot. Out: joints, known loads and tracker poses as arrays on o
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -16,7 +16,10 @@ from ctr_dynamics.diagnosis.diagnosis_options import RecordingOptions
 from ctr_dynamics.errors import InputError
 from ctr_dynamics.io.bag_reader import Bag, open_bag
 from ctr_dynamics.io.messages.cdr import JointStateIn, PoseIn
+from ctr_dynamics.io.messages.topics import JOINT_STATES, TRACKER_TIP, accepts_frame
+from ctr_dynamics.parameters import Settings, axes_mask, input_mapping, pose_frame
 from ctr_dynamics.robot import Robot
+from ctr_dynamics.sensing.checks import CheckOptions, JointChecks, Kind
 from ctr_dynamics.sensing.interpolation import finite, joint_order
 
 Floats = NDArray[np.float64]
@@ -32,6 +35,7 @@ class Recording:
         joints: (k, 1 + 2N) t, alpha rad, beta m. load: (k, 7) t, force N, torque N m in ``ctr_base``; may be empty.
         stamps: (s,) s of the tracker poses; position: (s, 3) m; quaternion: (s, 4) wxyz.
         notes: what was left out or looks odd.
+        axes: measured axes of the tracker, as the parameter ``tracker.axes`` has them.
     """
 
     name: str
@@ -43,6 +47,7 @@ class Recording:
     position: Floats
     quaternion: Floats
     notes: tuple[str, ...]
+    axes: tuple[bool, ...] = (True,) * 6
 
     @property
     def duration(self) -> float:
@@ -62,28 +67,42 @@ class Recording:
         )
 
 
-def read_recording(path: str | Path, robot: Robot, options: RecordingOptions | None = None) -> Recording:
+def read_recording(
+    path: str | Path,
+    robot: Robot,
+    options: RecordingOptions | None = None,
+    settings: Settings | None = None,
+    remap: Mapping[str, str] | None = None,
+) -> Recording:
     """Read a bag for ``robot``.
+
+    Args:
+        path: of the bag. options: what is used of it.
+        settings: parameters; ``joints`` and ``tracker`` say what the bag's names, units and frames mean.
+        remap: topic of the bag to the product's.
 
     Raises:
         InputError: not a bag, no complete joint state of this robot, no tracker, or joints and tracker together shorter or longer than
             the options say.
     """
-    o = options or RecordingOptions()
-    bag = open_bag(path)
-    bag.check_inputs()
-    joints, poses, loads, notes, wrong = _collect(bag, robot)
+    o, settings = options or RecordingOptions(), settings or Settings()
+    bag = open_bag(path, input_mapping(settings, remap))
+    bag.tubes = robot.n_tubes
+    bag.check_inputs((JOINT_STATES, TRACKER_TIP))
+    joints, poses, loads, notes, wrong = _collect(bag, robot, settings)
     where = str(path)
     if not joints:
         wanted = ", ".join(f"tube{i + 1}_rotation, tube{i + 1}_translation" for i in range(robot.n_tubes))
         raise InputError(
             f"no complete joint state of robot '{robot.name}' ({wrong or 'none at all'}; needed: {wanted})",
-            do="check the robot and the joint names with `ctr-dynamics info`",
+            do="check the robot, and name the joints with joints.rotation_names and joints.translation_names (`--set`)",
             where=where,
         )
     if not poses:
         raise InputError(
-            "no usable tracker pose", do="diagnosis needs the tracker on /ctr/tracker/tip", where=where
+            "no usable tracker pose" + "".join(f"; {note}" for note in notes[-1:]),
+            do="diagnosis needs the tracker on /ctr/tracker/tip",
+            where=where,
         )
     joints, loads, parted = _longest_part(_once(joints), _once(loads), o)
     notes += [parted] if parted else []
@@ -127,7 +146,8 @@ def read_recording(path: str | Path, robot: Robot, options: RecordingOptions | N
     if len(load) and load[0, 0] > o.first_load_s:
         load = np.vstack([np.r_[load[0, 0] - 1e-9, np.zeros(6)], load])
     return Recording(
-        bag.path.name, where, bag.sha256(), table, load, tracker[:, 0], tracker[:, 1:4], _continuous(tracker[:, 4:8]), tuple(notes)
+        bag.path.name, where, bag.sha256(), table, load, tracker[:, 0], tracker[:, 1:4], _continuous(tracker[:, 4:8]), tuple(notes),
+        axes_mask(settings["tracker.axes"]),
     )  # fmt: skip
 
 
@@ -136,8 +156,8 @@ def measured_axes(recordings: Sequence[Recording], notes: list[str]) -> NDArray[
 
     ``notes`` takes what an engineer should know of them.
     """
-    mask = np.ones(6, bool)
-    if any(np.ptp(r.quaternion, axis=0).max(initial=0.0) < 1e-9 for r in recordings):
+    mask = np.all([r.axes for r in recordings], axis=0)
+    if mask[3:].any() and any(np.ptp(r.quaternion, axis=0).max(initial=0.0) < 1e-9 for r in recordings):
         mask[3:] = False
         notes.append(
             "the tracker sends no rotation (three degrees of freedom); causes are judged by position alone"
@@ -188,7 +208,12 @@ def _moving(joints: Floats, robot: Robot, options: RecordingOptions) -> str:
 
 def _unseen(joints: Floats, poses: Floats, options: RecordingOptions) -> tuple[NDArray[np.bool_], str]:
     """Which of ``poses`` (s) fall into gaps of ``joints`` (s), or so soon behind that vibration from them persists, and a note."""
-    gaps = np.flatnonzero(np.diff(joints) > options.gap_s)
+    limit = (
+        max(options.gap_s, options.gap_periods * float(np.median(np.diff(joints))))
+        if len(joints) > 1
+        else options.gap_s
+    )
+    gaps = np.flatnonzero(np.diff(joints) > limit)
     unseen = np.zeros(len(poses), bool)
     for i in gaps:
         unseen |= (poses > joints[i]) & (poses < joints[i + 1] + options.settling_s)
@@ -197,19 +222,24 @@ def _unseen(joints: Floats, poses: Floats, options: RecordingOptions) -> tuple[N
     longest = float(np.diff(joints).max())
     times = "once" if len(gaps) == 1 else f"{len(gaps)} times"
     return unseen, (
-        f"joints are missing {times}, for up to {longest:.2f} s (limit {options.gap_s:g} s): {int(unseen.sum())} of {len(poses)} tracker poses, "
+        f"joints are missing {times}, for up to {longest:.2f} s (limit {limit:.2g} s): {int(unseen.sum())} of {len(poses)} tracker poses, "
         f"up to {options.settling_s:g} s after, were left out"
     )
 
 
-def _collect(bag: Bag, robot: Robot) -> tuple[Samples, Samples, Samples, list[str], str]:
+def _collect(bag: Bag, robot: Robot, settings: Settings) -> tuple[Samples, Samples, Samples, list[str], str]:
+    """Joints, poses and loads, notes, and what is wrong with names of joints. Angles that wrap are made continuous."""
+    frame, n = pose_frame(settings), robot.n_tubes
+    options = CheckOptions(unwrap=settings["joints.unwrap"], turns=bag.mapping.joints.turns)
+    checks = JointChecks(n, robot, options)
     joints: Samples = []
     poses: Samples = []
     bare: Samples = []  # poses without a usable orientation
     loads: Samples = []
-    left, wrong = 0, ""
-    for item in bag.inputs():
-        message = item.message
+    left, wrong, foreign = 0, "", ""
+    start_ns = 0
+    for _, log_ns, message in bag.inputs():
+        start_ns = start_ns or log_ns
         if isinstance(message, JointStateIn):
             order = joint_order(tuple(message.names), robot.n_tubes)
             if isinstance(order, str):
@@ -220,11 +250,17 @@ def _collect(bag: Bag, robot: Robot) -> tuple[Samples, Samples, Samples, list[st
                 if len(message.positions) >= len(message.names)
                 else []
             )
-            if value and finite(value):
-                joints.append((message.stamp_ns, value))
-            else:
+            if not value or not finite(value):
                 left += 1
+                continue
+            verdict = checks.check(message.stamp_ns, log_ns or None, value[:n], value[n:])
+            if verdict.use == "drop" and any(found.kind is Kind.WRAPPED for found in checks.findings):
+                continue  # whole turns are not known
+            joints.append((message.stamp_ns, [*(verdict.rotations or value[:n]), *value[n:]]))
         elif isinstance(message, PoseIn):
+            if not accepts_frame(message.frame_id, frame):
+                foreign = message.frame_id
+                continue
             x, y, z, w = message.quaternion_xyzw
             norm = float(np.sqrt(x * x + y * y + z * z + w * w)) if finite(message.quaternion_xyzw) else 0.0
             if finite(message.position) and 0.9 <= norm <= 1.1:
@@ -240,9 +276,15 @@ def _collect(bag: Bag, robot: Robot) -> tuple[Samples, Samples, Samples, list[st
     if poses:
         left += len(bare)
     poses = poses or bare  # a tracker of positions alone sends zeros or NaN for the orientation
-    notes = [f"{left} messages hold values that cannot be used and were left out"] if left else []
+    notes = [found.line(start_ns) for found in checks.findings if found.kind is Kind.WRAPPED]
+    if left:
+        notes.append(f"{left} messages hold values that cannot be used and were left out")
     if wrong and joints:
         notes.append(f"some joint states were left out: {wrong}")
+    if foreign:
+        notes.append(
+            f"poses in frame '{foreign}' were left out, expected '{frame}': if that is the tracker's frame, set tracker.frame_id={foreign}"
+        )
     return joints, poses, loads, notes, wrong
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,9 @@ from ctr_dynamics.diagnosis.recording import Recording, read_recording
 from ctr_dynamics.diagnosis.run_context import RunContext
 from ctr_dynamics.errors import InputError
 from ctr_dynamics.io.atomic_files import atomic_file, output_folder, replaced_files
+from ctr_dynamics.parameters import Settings
 from ctr_dynamics.robot import Robot
+from ctr_dynamics.sensing.tracker_parameters import with_tracker_parameters
 
 SCENARIO, REPORT = "next_experiment.yaml", "report.html"
 # All that a diagnosis may write; the findings, which name the others, take their place last.
@@ -35,6 +37,8 @@ class Request:
     command: str
     workers: int = 2
     report: bool = True
+    settings: Settings = field(default_factory=Settings)
+    remap: dict[str, str] = field(default_factory=dict)
 
 
 def run(request: Request, context: RunContext | None = None) -> dict[str, Any]:
@@ -48,12 +52,15 @@ def run(request: Request, context: RunContext | None = None) -> dict[str, Any]:
     context = context or RunContext(workers=request.workers)
     directory = output_folder(Path(request.output))
     context.report("reading")
-    recordings = [read_recording(path, request.robot) for path in request.bags]
-    others = [read_recording(path, request.robot) for path in request.validation]
+    robot = with_tracker_parameters(request.robot, request.settings)
+    recordings, others = (
+        [read_recording(path, robot, None, request.settings, request.remap) for path in paths]
+        for paths in (request.bags, request.validation)
+    )
     _all_different([*recordings, *others])
     context.report("kernels: compiled at the first use")
-    warm_up(request.robot)
-    diagnosis = diagnose_recordings(request.robot, recordings, others, context=context)
+    warm_up(robot)
+    diagnosis = diagnose_recordings(robot, recordings, others, context=context)
     if not others:
         diagnosis.notes.append(
             "without a validation bag the gain is not measured, and a wrong cause that fits is not found out"

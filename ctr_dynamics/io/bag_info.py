@@ -24,6 +24,7 @@ from ctr_dynamics.io.messages.input_types import Decoded, accepts_type, has_stam
 from ctr_dynamics.io.messages.topics import JOINT_STATES, TIP_LOAD, TOPIC, TRACKER_TIP
 
 GAP_LIMIT_S = {JOINT_STATES: 0.1, TRACKER_TIP: 0.5}  # the joints' is the default of input_timeout_s
+GAP_PERIODS = 3.0  # two lost readings in a row are a gap at any rate; less is jitter, or one lost message
 LATE_LIMIT_S = 0.2  # default of filter.window_s
 START_LIMIT_S = 0.5
 CLOCK_LIMIT_S = 0.5
@@ -226,6 +227,8 @@ def _stamp_findings(
     found: list[Finding] = []
     limit = GAP_LIMIT_S.get(name)
     if limit is not None:
+        # slow streams have no gaps where nothing is lost
+        limit = max(limit, GAP_PERIODS / report.rate_hz if report.rate_hz else 0.0)
         wide = np.flatnonzero(steps > limit * 1e9)
         report.gaps = [
             {"at_s": float(ordered[i] - ordered[0]) * 1e-9, "length_s": float(steps[i]) * 1e-9}
@@ -237,7 +240,7 @@ def _stamp_findings(
                 Finding(
                     "warning",
                     name,
-                    f"{wide.size} gaps longer than {limit:g} s, the longest {steps[worst] * 1e-9:.3f} s at "
+                    f"{wide.size} gaps longer than {limit:.3g} s, the longest {steps[worst] * 1e-9:.3f} s at "
                     f"{(ordered[worst] - ordered[0]) * 1e-9:.3f} s after its first stamp; outputs are "
                     "invalid or open-loop there",
                 )

@@ -46,7 +46,11 @@ class InputGate:
             lever=tuple(tracker.lever.tolist()),
             scale=float(tracker.scale),
             orientation=bool(tracker.mask[3:].any()),
-            limits=replace(limits, late_s=max(limits.late_s, float(settings["filter.window_s"]))),
+            limits=replace(
+                limits,
+                late_s=max(limits.late_s, float(settings["filter.window_s"])),
+                gap_s=max(limits.gap_s, float(settings["input_timeout_s"])),
+            ),
         )
         self.checks = InputChecks(self._n, robot, options)
         self._started = False

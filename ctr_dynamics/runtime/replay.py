@@ -32,6 +32,7 @@ from ctr_dynamics.robot_files import load_robot
 from ctr_dynamics.runtime.clock_offset import ClockOffset, RisingStamps
 from ctr_dynamics.runtime.garbage_collection import rare_garbage_collection
 from ctr_dynamics.runtime.input_gate import InputGate
+from ctr_dynamics.runtime.joint_rate import with_joint_rate
 from ctr_dynamics.runtime.replay_notes import AFTER_NS, no_step, replay_notes, shortfall
 from ctr_dynamics.runtime.step_encoder import StepEncoder
 
@@ -252,6 +253,7 @@ def replay(
     if not isinstance(robot, Robot):
         robot = load_robot(robot)
     opened.tubes = robot.n_tubes
+    settings, rate_note = with_joint_rate(opened, settings)
     settings = settings.replace({"robot": robot.source or robot.name})
     read = {"bag" if i == 0 else f"bag's part {i + 1}": file.path for i, file in enumerate(opened.files)}
     check_targets(
@@ -275,7 +277,7 @@ def replay(
         log = _report_log(estimator, opened) if report_part is not None else None
         stack.enter_context(rare_garbage_collection())
         numbers, times_s = _run(opened, estimator, robot, settings, writer, progress, log)
-        notes = replay_notes(opened, settings, numbers)
+        notes = [*([rate_note] if rate_note else []), *replay_notes(opened, settings, numbers)]
         content = plain({**numbers, **provenance, "notes": notes})
         if summary_part is not None:
             text = json.dumps(content, indent=1, allow_nan=False, ensure_ascii=False)
