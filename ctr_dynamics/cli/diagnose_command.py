@@ -11,7 +11,7 @@ from typing import Annotated
 
 import typer
 
-from ctr_dynamics.cli.recording_options import Assignments, Params, Remap, settings_from
+from ctr_dynamics.cli.recording_options import RecordingChoice, settings_from, with_recording_options
 from ctr_dynamics.errors import InputError
 from ctr_dynamics.io.inputs.input_mapping import parse_remap
 from ctr_dynamics.robot_files import load_robot
@@ -19,6 +19,7 @@ from ctr_dynamics.robot_files import load_robot
 EXIT = 0
 
 
+@with_recording_options
 def diagnose(
     bags: Annotated[
         list[Path], typer.Argument(metavar="BAG [BAG ...]", help="Bags to fit: .mcap files or folders.")
@@ -40,9 +41,6 @@ def diagnose(
             help="Bags that are predicted only: what the extension is worth.",
         ),
     ] = None,
-    remap: Remap = None,
-    params: Params = None,
-    assignments: Assignments = None,
     workers: Annotated[int, typer.Option("--workers", min=1, max=64, help="Fits at once.")] = 2,
     cluster: Annotated[
         str,
@@ -54,6 +52,8 @@ def diagnose(
         bool, typer.Option("--json", help="One line of JSON on stdout instead of the summary.")
     ] = False,
     report: Annotated[bool, typer.Option("--report/--no-report", help="Write report.html.")] = True,
+    *,
+    choice: RecordingChoice,
 ) -> int:
     """Find what the simulation gets wrong about the recorded robot, name the cause, extend the model and measure the gain."""
     from ctr_dynamics.diagnosis.request import Request, run, run_on_cluster
@@ -66,12 +66,7 @@ def diagnose(
     command = "ctr-dynamics diagnose " + " ".join(shlex.quote(str(b)) for b in bags)
     if validate:
         command += " --validate " + " ".join(shlex.quote(str(b)) for b in validate)
-    for option, given in (
-        ("--remap", remap),
-        ("--params", [str(params)] if params else []),
-        ("--set", assignments),
-    ):
-        command += "".join(f" {option} {shlex.quote(value)}" for value in given or [])
+    command += "".join(f" {shlex.quote(word)}" for word in choice.words())
     command += f" --robot {shlex.quote(robot)} --output {shlex.quote(str(output))}"
     request = Request(
         loaded,
@@ -81,8 +76,8 @@ def diagnose(
         command,
         workers,
         report,
-        settings_from(params, assignments),
-        parse_remap(remap or []),
+        settings_from(choice.params, choice.assignments),
+        parse_remap(choice.remap),
     )
     begin = time.perf_counter()
 

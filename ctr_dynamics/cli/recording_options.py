@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import functools
+import inspect
+from collections.abc import Callable
+from inspect import Parameter
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple, get_type_hints
 
 import typer
 
@@ -57,3 +61,42 @@ def mapping_from(settings: Settings, remap: list[str] | None) -> InputMapping:
 def open_with(bag: Path, settings: Settings, remap: list[str] | None) -> Bag:
     """The bag, read as the options say; raises as :func:`open_bag` and :func:`mapping_from`."""
     return open_bag(bag, mapping_from(settings, remap))
+
+
+class RecordingChoice(NamedTuple):
+    """The three options together, for commands with many others."""
+
+    remap: list[str]
+    params: Path | None
+    assignments: list[str]
+
+    def words(self) -> list[str]:
+        """As they stand on a command line."""
+        given = [("--remap", self.remap), ("--params", [str(self.params)] if self.params else [])]
+        return [
+            word
+            for option, values in (*given, ("--set", self.assignments))
+            for v in values
+            for word in (option, v)
+        ]
+
+
+def with_recording_options(command: Callable[..., int]) -> Callable[..., int]:
+    """``command`` with the three options, which its argument ``choice`` holds together."""
+    options = {"remap": Remap, "params": Params, "assignments": Assignments}
+    signature = inspect.signature(command)
+    hints = get_type_hints(command, include_extras=True)
+    own = [p.replace(annotation=hints[p.name]) for p in signature.parameters.values() if p.name != "choice"]
+    added = [
+        Parameter(name, Parameter.KEYWORD_ONLY, default=None, annotation=hint)
+        for name, hint in options.items()
+    ]
+
+    @functools.wraps(command)
+    def run(*args: Any, remap: Any, params: Any, assignments: Any, **others: Any) -> int:
+        return command(*args, choice=RecordingChoice(remap or [], params, assignments or []), **others)
+
+    run.__annotations__ = {**{p.name: p.annotation for p in own}, **options, "return": int}
+    run.__signature__ = signature.replace(parameters=[*own, *added])  # type: ignore[attr-defined]
+    del run.__wrapped__
+    return run

@@ -26,14 +26,15 @@ from ctr_dynamics.estimation.monitoring.statuses import all_statuses, snap_ahead
 from ctr_dynamics.estimation.step_output import StepOutput
 from ctr_dynamics.io.atomic_files import atomic_file, check_targets
 from ctr_dynamics.io.bag_writer import LiveRecorder
+from ctr_dynamics.io.inputs.input_decoder import InputDecoder
 from ctr_dynamics.io.messages import topics
 from ctr_dynamics.io.messages.cdr import (
     CdrError,
-    decode_joint_state,
-    decode_pose_stamped,
-    decode_wrench_stamped,
+    JointStateIn,
+    PoseIn,
+    WrenchIn,
 )
-from ctr_dynamics.parameters import Settings
+from ctr_dynamics.parameters import Settings, input_mapping
 from ctr_dynamics.robot_files import load_robot
 from ctr_dynamics.ros import qos
 from ctr_dynamics.ros.node_runner import Stopped, run_in_thread, run_node
@@ -76,6 +77,7 @@ class EstimatorNode(Node):
             self.destroy_node()  # so that others hear of the end
             raise
         self._gate = InputGate(self._estimator)
+        self._decoder = InputDecoder(input_mapping(self.settings), self._robot.n_tubes)
         self._prepared: tuple[Settings, set[str], Estimator | None] | None = None
         self._use_sim_time = bool(self.get_parameter("use_sim_time").value)
 
@@ -168,16 +170,11 @@ class EstimatorNode(Node):
         return lambda: int(clock.now().nanoseconds)
 
     def _subscribe(self, topic: topics.Topic) -> Any:
-        take = {
-            topics.JOINT_STATES: self._take_joints,
-            topics.TRACKER_TIP: self._take_tracker,
-            topics.TIP_LOAD: self._take_load,
-        }[topic.name]
         loop, now_ns, record, ring_buffer = self.loop, self._now_ns, self.recorder, self.ring_buffer
 
         def arrived(data: bytes) -> None:
             arrival_ns = now_ns()
-            loop.offer(partial(take, data, arrival_ns), len(data))
+            loop.offer(partial(self._take, topic, data, arrival_ns), len(data))
             if record is not None:
                 record.put(topic.name, arrival_ns, data)
             if ring_buffer is not None:
@@ -198,12 +195,21 @@ class EstimatorNode(Node):
 
     # In the stepping thread.
 
-    def _take_joints(self, data: bytes, arrival_ns: int) -> None:
+    def _take(self, topic: topics.Topic, data: bytes, arrival_ns: int) -> None:
         try:
-            message = decode_joint_state(data)
+            values = self._decoder.decode(topic.name, topic.ros_type, "cdr", data, arrival_ns)
         except CdrError as error:
-            self._note_undecodable(topics.JOINT_STATES, error)
+            self._note_undecodable(topic.name, error)
             return
+        for value in values:
+            if isinstance(value, JointStateIn):
+                self._take_joints(value, arrival_ns)
+            elif isinstance(value, PoseIn):
+                self._take_tracker(value, arrival_ns)
+            else:
+                self._take_load(value, arrival_ns)
+
+    def _take_joints(self, message: JointStateIn, arrival_ns: int) -> None:
         given = self._gate.joint_state(message, arrival_ns)
         if given is None:
             return
@@ -218,24 +224,14 @@ class EstimatorNode(Node):
         self.timing.arrived(given.stamp_ns, clock.at(arrival_ns))
         self._estimator.add_joint_state(given.stamp_ns, given.names, given.positions)
 
-    def _take_tracker(self, data: bytes, arrival_ns: int) -> None:
-        try:
-            message = decode_pose_stamped(data)
-        except CdrError as error:
-            self._note_undecodable(topics.TRACKER_TIP, error)
-            return
+    def _take_tracker(self, message: PoseIn, arrival_ns: int) -> None:
         pose = self._gate.pose(message, arrival_ns)
         if pose is not None:
             self._estimator.add_tracker_pose(
                 pose.stamp_ns, pose.position, pose.quaternion_xyzw, pose.frame_id
             )
 
-    def _take_load(self, data: bytes, arrival_ns: int) -> None:
-        try:
-            message = decode_wrench_stamped(data)
-        except CdrError as error:
-            self._note_undecodable(topics.TIP_LOAD, error)
-            return
+    def _take_load(self, message: WrenchIn, arrival_ns: int) -> None:
         load = self._gate.load(message, arrival_ns)
         if load is not None:
             self._estimator.add_tip_load(load.stamp_ns, load.force, load.torque, load.frame_id)
@@ -358,6 +354,9 @@ class EstimatorNode(Node):
 
     def _prepare(self, settings: Settings, changes: set[str]) -> None:
         """Reject parameters that cannot be used; where a new estimator is needed, make it here."""
+        InputDecoder(
+            input_mapping(settings), self._robot.n_tubes
+        )  # names and numbers of joints for so many tubes
         fresh = Estimator(self._robot, settings) if changes - {"filter.enabled"} else None
         self._prepared = (settings, changes, fresh)
 
@@ -377,6 +376,7 @@ class EstimatorNode(Node):
         estimator.carry_load(self._estimator)
         self._estimator = estimator
         self._gate = InputGate(estimator)
+        self._decoder = InputDecoder(input_mapping(settings), self._robot.n_tubes)
         self.timing.policy = settings["output.policy"]
         self.loop.max_age_ns = round(settings["output.max_age_s"] * 1e9)
         self.timing.input_timeout_ns = round(settings["input_timeout_s"] * 1e9)

@@ -103,6 +103,8 @@ def _plain(value: Any) -> Any:
 
 
 def _ros_value(value: Any) -> Any:
+    if value == ():
+        return [""]  # an empty array has no type in ROS
     return list(value) if isinstance(value, tuple) else value
 
 
@@ -113,7 +115,7 @@ def _descriptor(entry: Parameter, value: Any) -> ParameterDescriptor:
         type=RosParameter.Type.from_parameter_value(value).value,
         description=text,
         read_only=entry.read_only,
-        additional_constraints=entry.range if entry.type in ("str", "floats") else "",
+        additional_constraints=entry.range if entry.type in ("str", "floats", "texts") else "",
     )
     if entry.low is not None and entry.high is not None:
         if entry.type == "float":

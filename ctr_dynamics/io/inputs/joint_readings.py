@@ -127,6 +127,8 @@ class JointConverter:
                 do="give one for each tube, innermost first",
             )
         self.readings, self.n = readings, n or declared
+        if self.n:
+            readings.matrices(self.n)  # so many numbers as there are tubes
         self.notes: list[str] = []
         self._plans: dict[tuple[tuple[str, ...], int], dict[str, int]] = {}
         self._from_zero = False
