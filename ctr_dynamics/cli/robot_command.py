@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -170,17 +169,12 @@ def _rest(robot: Robot) -> bool:
 
 
 def _accuracy(robot: Robot) -> None:
-    """Modes at rest, nodes, expected errors, and what a step of the model costs on this machine."""
-    from ctr_dynamics.estimation.discretisation import RESOLVED_HZ, discretise
+    """Modes at rest, nodes, and expected errors."""
+    from ctr_dynamics.estimation.discretisation import discretise
     from ctr_dynamics.parameters import Settings
 
     settings = Settings()
     found = discretise(robot, int(settings["model.nodes"]), float(settings["model.accuracy_m"]))
-    if not found.modes:
-        print(
-            "ctr-dynamics: warning: no vibration modes were found at rest; errors are not known",
-            file=sys.stderr,
-        )
     for i, mode in enumerate(found.modes, 1):
         share = f"{1e3 * mode.amplitude_m:8.3f} mm"
         print(
@@ -192,19 +186,9 @@ def _accuracy(robot: Robot) -> None:
     for name, error in (("nodes", found.space_error_m), ("steps", found.time_error_m)):
         print(f"error of {name}  {'not known' if error is None else f'{1e3 * error:.4f} mm'}")
     print("(rms of the tip over 4 s after a load is cut that deflects it by a third of the exposed length)")
-    lost = [mode for mode in found.modes if not mode.resolved]
-    size = math.hypot(*(mode.amplitude_m for mode in lost))
-    if size > float(settings["model.accuracy_m"]):
-        print(
-            f"ctr-dynamics: warning: modes above {RESOLVED_HZ:.0f} Hz are too fast for steps of 3 ms; such a load leaves vibrations of "
-            f"{1e3 * size:.2f} mm that the model damps, and follows their mean alone",
-            file=sys.stderr,
-        )
-    if found.space_error_m is not None and found.space_error_m > float(settings["model.accuracy_m"]):
-        print(
-            f"ctr-dynamics: warning: {found.nodes} nodes leave an error above model.accuracy_m; more would not run in real time",
-            file=sys.stderr,
-        )
+    shortfall = found.shortfall(float(settings["model.accuracy_m"]))
+    if shortfall:
+        print(f"ctr-dynamics: warning: {shortfall}", file=sys.stderr)
 
 
 def _question(key: str) -> tuple[str, str]:

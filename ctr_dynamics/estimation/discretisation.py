@@ -61,6 +61,22 @@ class Discretisation:
     time_error_m: float | None
     modes: tuple[Mode, ...]
 
+    def shortfall(self, accuracy_m: float) -> str:
+        """What of the accuracy that is asked cannot be had in steps of 3 ms; empty where nothing is missing."""
+        if not self.modes:
+            return "no vibration modes are found at rest; the errors of nodes and steps are not known"
+        lost = math.hypot(*(mode.amplitude_m for mode in self.modes if not mode.resolved), 0.0)
+        found = []
+        if lost > accuracy_m:
+            found.append(
+                f"modes above {RESOLVED_HZ:.0f} Hz are too fast for the steps: of the {1e3 * lost:.2f} mm that they vibrate after an abrupt load the "
+                "model follows the mean alone"
+            )
+        for name, error in (("nodes", self.space_error_m), ("steps", self.time_error_m)):
+            if error is not None and error > accuracy_m:
+                found.append(f"the {name} leave an error of {1e3 * error:.3f} mm")
+        return "; ".join(found)
+
     def numerics(self) -> dict[str, Any]:
         """For a summary."""
         unresolved = [mode.frequency_hz for mode in self.modes if not mode.resolved]

@@ -102,6 +102,7 @@ class Estimator:
         self.model = Model(robot, nodes=self.discretisation.nodes)
         self.tracker = tracker_of(self.model, settings)
         self.health = Health(consistency=consistency_monitor(settings, robot.tracker.noise.position.value))
+        self.health.shortfall = self.discretisation.shortfall(float(settings["model.accuracy_m"]))
         self.health.fusing = bool(settings["filter.enabled"])
         self.inputs = InputBuffer(self.model, self.tracker, settings, self.health)
         self.timeline = self.inputs.timeline
@@ -466,5 +467,9 @@ class Estimator:
 
     def summary(self) -> dict[str, Any]:
         """The estimator's part of a replay's summary."""
-        numerics = {**self.discretisation.numerics(), "substeps": self.health.substeps_summary()}
+        numerics = {
+            **self.discretisation.numerics(),
+            "substeps": self.health.substeps_summary(),
+            "shortfall": self.health.shortfall,
+        }
         return {**self.health.summary(), "numerics": numerics}

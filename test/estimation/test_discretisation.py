@@ -88,5 +88,8 @@ def test_fast_modes_are_declared_unresolved():
     numerics = discretise(load_robot("three_tube"), 12, 5e-5).numerics()
     assert min(numerics["unresolved_modes_hz"]) > RESOLVED_HZ
     assert numerics["time_error_m"] < 5e-5
+    said = discretise(load_robot("three_tube"), 12, 5e-5).shortfall(5e-5)
+    assert said.startswith("modes above 103 Hz are too fast for the steps")
+    assert discretise(load_robot("till2020_tissue"), 12, 5e-5).shortfall(5e-5) == ""
     slow = [mode["frequency_hz"] for mode in numerics["modes"] if mode["resolved"]]
     assert slow[0] == pytest.approx(16.0, abs=0.3)

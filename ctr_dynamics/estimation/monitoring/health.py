@@ -70,6 +70,7 @@ class Health:
     Attributes:
         joints, tracker, load: input problems by kind.
         problem: why the last output is invalid; empty when it is valid.
+        shortfall: what of the accuracy that is asked cannot be had; empty where nothing is missing.
         propagated: steps whose ``substeps_taken`` are counted, and ``most_substeps`` of one.
         steps, failures, restarts, substeps, sweeps: of the runs; reasons: failures by reason. corrected_steps: taken again for late inputs.
         accepted, rejected, dropped, late: measurements. fusing: whether they are fused.
@@ -101,6 +102,7 @@ class Health:
     recent: deque[tuple[float, bool]] = field(default_factory=lambda: deque(maxlen=RECENT))
     sweeps: int = 0
     substeps: int = 0
+    shortfall: str = ""
     propagated: int = 0
     substeps_taken: int = 0
     most_substeps: int = 0

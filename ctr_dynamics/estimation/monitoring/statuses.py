@@ -41,6 +41,7 @@ def solver(health: Health) -> Status:
         "failures": str(health.failures),
         "restarts": str(health.restarts),
         "steps in substeps": str(health.substeps),
+        "accuracy": health.shortfall or "as asked",
         "steps taken again": str(health.corrected_steps),
         "sweeps per step": f"{health.sweeps / health.steps:.1f}" if health.steps else "0",
     }
