@@ -332,6 +332,8 @@ class Estimator:
         runs.judge(result)
         if mark is not None:
             self.innovations.discard(mark)
+        elif result.ok and runs.fused.follow_delay(runs.open_loop, k):
+            late.history.restart(k)
         health.sweeps += result.sweeps
         return self._output(k, result) if result.ok else self._invalid(k, f"step failed: {result.reason}")
 

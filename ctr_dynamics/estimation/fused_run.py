@@ -13,6 +13,7 @@ from ctr_dynamics.estimation.filter.filter_records import FilterState, Update
 from ctr_dynamics.estimation.inputs.input_buffer import InputBuffer
 from ctr_dynamics.estimation.inputs.measurement_queue import DueMeasurement
 from ctr_dynamics.estimation.inputs.run_inputs import InterpolatedInputs, RunInputs
+from ctr_dynamics.estimation.monitoring.delay_search import DelaySearch
 from ctr_dynamics.estimation.monitoring.health import Health
 from ctr_dynamics.estimation.monitoring.innovation_log import InnovationLog
 from ctr_dynamics.estimation.open_loop import OpenLoopRun
@@ -55,12 +56,14 @@ class FusedRun:
         model = ekf.model
         rows = parameters_of_inputs(model.n)[: model.input_count]
         self._by_theta = ekf.uncertainty.effect[rows]  # encoder offsets and tip force
+        self.delay_search = DelaySearch(model.robot.tracker.noise.position.value)
         self.state: State | None = None
         self.measured_ns: int | None = None
 
     def clear(self) -> None:
         """Have no state, and the parameters of the robot file."""
         self.ekf.forget_parameters()
+        self.delay_search.clear()
         self.state, self.measured_ns = None, None
 
     def start(self, state: State, t: float) -> None:
@@ -79,10 +82,16 @@ class FusedRun:
         for measurement, time_s, position, quaternion in due:
             measurement.fused_k = k
             motion, residual = self.residuals(time_s, position, quaternion, open_loop)
+            if motion is not None:
+                tips, own_s = open_loop.tips, time_s - self.ekf.tracker.age
+                self.delay_search.add(
+                    measurement.stamp_ns, own_s, motion.position + motion.residual, *tips.positions()
+                )
             if self._inputs.missing_at(time_s - self.ekf.tracker.age):
                 update = Update.impossible("no joint states at its time")
             elif self._health.fusing:
                 update = self.ekf.update(self.state, time_s, position, quaternion)
+                self.delay_search.explained(self.ekf.adapted.sound and "outside" not in update.reason)
             else:
                 update = self.ekf.compare(time_s, position, quaternion)
             if update.dof:
@@ -128,6 +137,19 @@ class FusedRun:
         assert open_loop.state is not None
         self.start(open_loop.state.copy(), seconds(k))
         self._health.restarts += 1
+
+    def follow_delay(self, open_loop: OpenLoopRun, k: int) -> bool:
+        """Go on from the open-loop run at step ``k`` with another delay of the tracker, if measurements fit far better with it."""
+        if not self._health.fusing:
+            return False
+        delay = self.delay_search.found(self.ekf.delay)
+        if delay is None:
+            return False
+        text = f"poses are {1e3 * (self.ekf.tracker.delay + delay):.0f} ms older than their stamps"
+        self._health.note("tracker", "latency", f"{text}; check the tracker's clock, or set tracker.delay_s")
+        self.ekf.expect_delay(delay, self.delay_search.options.spacing_s)
+        self.reinitialise(open_loop, k)
+        return True
 
     def checkpoint(self) -> FusedState:
         """What :meth:`restore` returns to."""

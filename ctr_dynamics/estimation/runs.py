@@ -61,7 +61,9 @@ class Runs:
         self.fused = FusedRun(ekf, self._interpolated, load, inputs, health, innovations)
         no_effect = np.zeros((model.input_count, 0))
         self.open_loop = OpenLoopRun(
-            nominal, RunInputs(self._interpolated, load, no_effect, np.zeros(0)), ekf.tips.size
+            nominal,
+            RunInputs(self._interpolated, load, no_effect, np.zeros(0)),
+            ekf.tips.size + math.ceil(self.fused.delay_search.options.longest_s / DT),
         )
         self.clear()
 

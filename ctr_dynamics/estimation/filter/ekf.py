@@ -72,6 +72,10 @@ class RodEkf:
         self.factor = CovarianceFactor(self.model, self.uncertainty, options.rank)
         # a measurement at the edge of the window shows tips that are older still by the delay and the tracker's averaging
         dt = simulator.scheme.dt
+        self._delay, self._delay_sigma = (
+            0.0,
+            float(tracker.state_sigma[DELAY]),
+        )  # expected, beyond the nominal one
         oldest = options.window + max(0.0, tracker.delay) + tracker.averaging
         self.tips = TipWindow(math.ceil(oldest / dt) + 5)
         force = ForceRange(least, most, options.force_change)
@@ -97,9 +101,11 @@ class RodEkf:
             self._strides = ColumnStrides.of(self.model, state, self._block(inputs), self.simulator.scheme.dt)
         r = len(pi_aa)
         self.bias[:] = 0.0
+        self.bias[DELAY] = self._delay
         self.pi = np.zeros((r + STATES, r + STATES))
         self.pi[:r, :r] = pi_aa
         self.pi[r:, r:] = np.diag(self.tracker.state_sigma**2)
+        self.pi[r + DELAY, r + DELAY] = self._delay_sigma**2
         # the unknown force starts with its stationary deviation, in columns of its own
         scale = np.diag(self.factor.theta)[self._force]
         for axis, size in enumerate(scale):
@@ -110,6 +116,17 @@ class RodEkf:
         self._reduce()
         self.schedule.start(state.key)
         self._append_tip(state, stamp)
+
+    @property
+    def delay(self) -> float:
+        """Estimated delay of the tracker beyond the nominal one, s."""
+        return float(self.bias[DELAY])
+
+    def expect_delay(self, delay: float, sigma: float) -> None:
+        """Start with another ``delay`` of the tracker beyond the nominal one, and its deviation ``sigma``, both s; :meth:`start` is next."""
+        dt = self.simulator.scheme.dt
+        self.tips.size += math.ceil(max(delay, 0.0) / dt) - math.ceil(max(self._delay, 0.0) / dt)
+        self._delay, self._delay_sigma = delay, max(sigma, float(self.tracker.state_sigma[DELAY]))
 
     def _block(self, inputs: Inputs) -> Floats:
         par = self.simulator.parameters.copy()
@@ -317,7 +334,9 @@ class RodEkf:
         a = x[:r]
         self.bias += x[r:]
         # beyond these a measurement on time would show a tip outside the window, and no later one could mend the delay
-        self.bias[DELAY] = min(max(self.bias[DELAY], -self.simulator.scheme.dt), self.options.window)
+        self.bias[DELAY] = min(
+            max(self.bias[DELAY], -self.simulator.scheme.dt), self._delay + self.options.window
+        )
         self.theta += factor.theta @ a
         np.clip(self.theta, u.lowest, u.highest, out=self.theta)
         self._apply_theta()

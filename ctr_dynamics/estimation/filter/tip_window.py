@@ -89,6 +89,11 @@ class TipWindow:
         i = self.end - 1
         return Tip(self.stamps[i], self.means[i], self.columns[i])
 
+    def positions(self) -> tuple[Floats, Floats]:
+        """Stamps (k,) s and positions (k, 3) m of all tips."""
+        rows = slice(self.begin, self.end)
+        return self.stamps[rows], self.means[rows, :3]
+
     def at(self, time: float, dt: float, columns: bool = True) -> Tip | None:
         """Tip at ``time`` (s), at most one step ``dt`` (s) ahead of the newest; with its columns if asked for. None outside the window."""
         if not self.end:
