@@ -8,9 +8,14 @@ import pytest
 from ctr_dynamics.diagnosis.diagnosis_options import RecordingOptions
 from ctr_dynamics.diagnosis.recording import measured_axes, read_recording
 from ctr_dynamics.errors import InputError
+from ctr_dynamics.io.bag_reader import open_bag
 from ctr_dynamics.io.bag_writer import write_bag
 from ctr_dynamics.io.messages import topics
 from ctr_dynamics.io.messages.encode import encode_joint_state, encode_pose_stamped, encode_wrench_stamped
+from ctr_dynamics.parameters import Settings, axes_mask
+from ctr_dynamics.runtime.joint_rate import with_joint_rate
+from ctr_dynamics.sensing import TrackerModel
+from ctr_dynamics.sensing.tracker_parameters import with_tracker_parameters
 
 OPTIONS = RecordingOptions()
 START_NS = 1_700_000_000_000_000_000
@@ -22,7 +27,7 @@ def bag(tmp_path, robot):
     names = [f"tube{n}_{kind}" for n in (1, 2) for kind in ("rotation", "translation")]
     rest = [x for pair in zip(robot.rest.alpha.value, robot.rest.beta.value, strict=True) for x in pair]
 
-    def make(joints, poses, quaternions=lambda k: (0.0, 0.0, 0.0, 1.0), rate=0.0, loads=()):
+    def make(joints, poses, quaternions=lambda k: (0.0, 0.0, 0.0, 1.0), rate=0.0, loads=(), frame="ctr_base"):
         """The first tube turns at ``rate`` (rad/s); ``loads``: (s, N) in y."""
         path = tmp_path / "bag.mcap"
         with write_bag(path, {}) as writer:
@@ -36,7 +41,7 @@ def bag(tmp_path, robot):
                 writer.write(topics.TIP_LOAD, stamp, load)
             for k, t in enumerate(poses):
                 stamp = START_NS + round(1e9 * t)
-                pose = encode_pose_stamped(stamp, "ctr_base", (0.01, 0.0, 0.2), quaternions(k))
+                pose = encode_pose_stamped(stamp, frame, (0.01, 0.0, 0.2), quaternions(k))
                 writer.write(topics.TRACKER_TIP, stamp, pose)
         return path
 
@@ -116,3 +121,60 @@ def test_single_poses_without_orientation_are_left_out(robot, bag):
     found = read_recording(bag(joints, poses, lambda k: (0.0, 0.0, 0.0, float(k % 10 > 0))), robot)
     assert len(found.stamps) == len(poses) - len(poses[::10])
     assert found.notes == (f"{len(poses[::10])} messages hold values that cannot be used and were left out",)
+
+
+# What a lab's bag is told to mean.
+
+
+def test_poses_of_another_frame_need_its_name(robot, bag):
+    path = bag(np.arange(0.0, 5.0, 0.01), np.arange(0.0, 4.9, 0.025), frame="aurora")
+    with pytest.raises(InputError, match=r"expected 'ctr_base': .*set tracker\.frame_id=aurora"):
+        read_recording(path, robot)
+    found = read_recording(path, robot, settings=Settings({"tracker.frame_id": "aurora"}))
+    assert len(found.stamps) == 196
+
+
+def test_axes_are_those_of_the_parameter(robot, bag):
+    path = bag(np.arange(0.0, 5.0, 0.01), np.arange(0.0, 4.9, 0.025), lambda k: tuple(np.eye(4)[k % 4]))
+    for axes in ("xyzrpy", "xyzrp", "xyz"):
+        found = read_recording(path, robot, settings=Settings({"tracker.axes": axes}))
+        assert tuple(measured_axes([found], [])) == axes_mask(axes)
+
+
+def test_slow_and_uneven_joints_are_no_gaps(robot, bag):
+    rng = np.random.default_rng(1)
+    times = np.arange(0.0, 8.0, 0.1)
+    times[1:] += rng.uniform(-0.04, 0.04, len(times) - 1)  # some are 0.18 s apart
+    assert not read_recording(bag(times, np.arange(0.0, 7.5, 0.025)), robot).notes
+    gap = (times > 4.0) & (times < 4.9)
+    found = read_recording(bag(times[~gap], np.arange(0.0, 7.5, 0.025)), robot)
+    assert any("joints are missing once" in note for note in found.notes)
+
+
+def test_replay_waits_for_slow_joints_unless_told_otherwise(bag):
+    opened = open_bag(bag(np.arange(0.0, 5.0, 0.1), ()))
+    settings, note = with_joint_rate(opened, Settings())
+    assert settings["input_timeout_s"] == pytest.approx(0.3)
+    assert "10 Hz" in note
+    assert with_joint_rate(opened, Settings({"input_timeout_s": 0.11}))[0]["input_timeout_s"] == 0.11
+    quick = open_bag(bag(np.arange(0.0, 5.0, 0.01), ()))
+    assert with_joint_rate(quick, Settings()) == (Settings(), "")
+
+
+def test_parameters_of_the_tracker_change_the_robot_as_they_change_the_estimator(robot):
+    lever, rotation, translation = (0.001, 0.0, 0.002), (0.1, -0.2, 0.3), (0.05, 0.0, -0.1)
+    settings = Settings(
+        {
+            "tracker.delay_s": 0.01,
+            "tracker.lever_arm_m": lever,
+            "tracker.registration_rotation_rad": rotation,
+            "tracker.registration_translation_m": translation,
+        }
+    )
+    found = TrackerModel.of_robot(with_tracker_parameters(robot, settings))
+    expected = TrackerModel.of_robot(robot).corrected(
+        delay=0.01, lever=np.array(lever), rotation=np.array(rotation), translation=np.array(translation)
+    )
+    for name in ("delay", "lever", "rotation", "translation"):
+        np.testing.assert_allclose(getattr(found, name), getattr(expected, name), atol=1e-12)
+    assert with_tracker_parameters(robot, Settings()) is robot
