@@ -86,7 +86,7 @@ def test_package_never_unpickles_or_evaluates():
         for word in forbidden:
             hits = [
                 line
-                for line in text.splitlines()
+                for line in text.replace("allow_pickle=False", "").splitlines()
                 if word in line and "_eval(" not in line and "str_eval" not in line
             ]
             assert not hits, (file, hits)
