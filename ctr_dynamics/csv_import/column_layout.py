@@ -16,6 +16,8 @@ from ctr_dynamics.units import factor, units_of
 
 Kind = Literal["joints", "tracker", "load"]
 POSITION, QUATERNION = ("x", "y", "z"), ("qx", "qy", "qz", "qw")
+MATRIX = ("m00", "m01", "m02", "m10", "m11", "m12", "m20", "m21", "m22")
+EULER = ("roll", "pitch", "yaw")
 FORCE, TORQUE = ("fx", "fy", "fz"), ("mx", "my", "mz")
 _JOINT = re.compile(r"tube[1-9]_(rotation|translation)")
 _TIME = ("t", "time", "stamp", "timestamp")
@@ -40,11 +42,23 @@ class Column(Block):
 
 
 class TimeColumn(Block):
-    """The column of time; `start_s` is added to it, in s."""
+    """The column of time; `start_s` is added to it, in s.
+
+    `rate_hz`: instead of a unit, where the column counts frames. Cells such as 2023-11-14T22:13:20.012 or 22:13:20.012 need neither: the first
+    are taken for UTC unless they name an offset, the second go on over midnight.
+    """
 
     column: str
-    unit: str
+    unit: str = ""
+    rate_hz: Annotated[FiniteFloat, Field(gt=0)] | None = None
     start_s: FiniteFloat | None = None
+
+
+class Status(Block):
+    """A column that says which rows hold a measurement: those whose cell is one of `good`."""
+
+    column: str
+    good: list[str] = Field(default_factory=lambda: ["OK"], min_length=1)
 
 
 class Source(Block):
@@ -52,6 +66,8 @@ class Source(Block):
 
     Attributes:
         time: column of the stamp.
+        status: column that says which rows count; None where all do.
+        header_line: line with the names of the columns, from 1; 0 for a file without them, whose columns are then '1', '2', ..
         values: name (`tube1_rotation`, `x`, `qw`, `fx`, ..) to its column.
         frame: frame that poses and wrenches are given in.
         registration_rotation_rad: (3,) rotation vector of `ctr_base` in that frame, rad.
@@ -60,6 +76,8 @@ class Source(Block):
 
     time: TimeColumn
     values: dict[str, Column]
+    status: Status | None = None
+    header_line: Annotated[int, Field(ge=0)] | None = None
     frame: str = ""
     registration_rotation_rad: Vector | None = None
     registration_translation_m: Vector | None = None
@@ -77,7 +95,14 @@ def si_unit(name: str) -> str:
     """SI unit of a value; "1" for components of a quaternion."""
     if _JOINT.fullmatch(name):
         return "rad" if name.endswith("rotation") else "m"
-    for names, unit in ((POSITION, "m"), (QUATERNION, "1"), (FORCE, "N"), (TORQUE, "N m")):
+    for names, unit in (
+        (POSITION, "m"),
+        (QUATERNION, "1"),
+        (MATRIX, "1"),
+        (EULER, "rad"),
+        (FORCE, "N"),
+        (TORQUE, "N m"),
+    ):
         if name in names:
             return unit
     raise KeyError(name)
@@ -85,7 +110,7 @@ def si_unit(name: str) -> str:
 
 def known(kind: Kind, name: str) -> bool:
     """Whether a log of that kind has a value of that name."""
-    names = {"tracker": POSITION + QUATERNION, "load": FORCE + TORQUE, "joints": ()}[kind]
+    names = {"tracker": POSITION + QUATERNION + MATRIX + EULER, "load": FORCE + TORQUE, "joints": ()}[kind]
     return name in names or (kind == "joints" and _JOINT.fullmatch(name) is not None)
 
 
@@ -125,7 +150,8 @@ def layout_of_header(kind: Kind, header: list[str], where: str) -> Source:
     for cell in header:
         name, unit = _split(cell)
         if name in _TIME:
-            factor(unit or "none", "s", f"{where}: column '{cell}'")
+            if unit:
+                factor(unit, "s", f"{where}: column '{cell}'")
             time = time or TimeColumn(column=cell, unit=unit)
         elif known(kind, name):
             if si_unit(name) != "1":
@@ -144,7 +170,8 @@ def check_complete(kind: Kind, source: Source, header: list[str], where: str) ->
     Raises:
         InputError: the first that is not.
     """
-    for column in (source.time.column, *(column.column for column in source.values.values())):
+    extra = () if source.status is None else (source.status.column,)
+    for column in (source.time.column, *extra, *(column.column for column in source.values.values())):
         if column not in header:
             near = get_close_matches(column, header, 1)
             hint = f"did you mean '{near[0]}'?" if near else f"the file has {_some(header)}"
@@ -159,7 +186,7 @@ def check_complete(kind: Kind, source: Source, header: list[str], where: str) ->
         }
     else:
         needed = set(POSITION if kind == "tracker" else FORCE)
-        for group in (QUATERNION, TORQUE):
+        for group in (QUATERNION, MATRIX, EULER, TORQUE):
             needed |= set(group) if names & set(group) else set()
     missing = sorted(needed - names)
     if missing:
@@ -186,7 +213,7 @@ def _split(cell: str) -> tuple[str, str]:
 def _names(kind: Any) -> str:
     if kind == "joints":
         return "tube1_rotation, tube1_translation, tube2_rotation, .."
-    return ", ".join(POSITION + QUATERNION if kind == "tracker" else FORCE + TORQUE)
+    return ", ".join(POSITION + QUATERNION + MATRIX + EULER if kind == "tracker" else FORCE + TORQUE)
 
 
 def _some(header: list[str]) -> str:

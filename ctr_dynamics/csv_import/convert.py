@@ -13,7 +13,9 @@ from numpy.typing import NDArray
 
 from ctr_dynamics import __version__
 from ctr_dynamics.csv_import.column_layout import (
+    EULER,
     FORCE,
+    MATRIX,
     POSITION,
     QUATERNION,
     TORQUE,
@@ -24,7 +26,9 @@ from ctr_dynamics.csv_import.column_layout import (
     layout_of_header,
     si_unit,
 )
+from ctr_dynamics.csv_import.orientations import with_quaternions
 from ctr_dynamics.csv_import.table import CsvTable, Faults
+from ctr_dynamics.csv_import.time_cells import TimeCells
 from ctr_dynamics.errors import InputError
 from ctr_dynamics.io.bag_checks import FRAME, Finding, inspector_for
 from ctr_dynamics.io.bag_reader import sha256_of
@@ -78,8 +82,10 @@ def read_log(kind: Kind, path: Path, layout: Layout, frame: str) -> Log:
     Raises:
         InputError: unreadable, columns or units missing, no usable row, or a frame that cannot be used.
     """
-    table, where = CsvTable(path), str(path)
-    source: Source = getattr(layout, kind) or layout_of_header(kind, table.header, where)
+    given: Source | None = getattr(layout, kind)
+    where = str(path)
+    table = CsvTable(path, None if given is None else given.header_line)
+    source = given or layout_of_header(kind, table.header, where)
     check_complete(kind, source, table.header, where)
     names = sorted(source.values)
     scales = []
@@ -93,14 +99,22 @@ def read_log(kind: Kind, path: Path, layout: Layout, frame: str) -> Log:
     lines: list[int] = []
     last = Decimal("-Infinity")
     wanted = [source.time.column, *(source.values[name].column for name in names)]
+    if source.status is not None:
+        wanted.append(source.status.column)
+    clock = TimeCells(source.time, where)
     for number, cells in table.rows(wanted, faults):
+        if source.status is not None and (status := cells.pop()) not in source.status.good:
+            faults.add(number, f"{source.status.column} is '{status[:20]}'")
+            continue
         try:
-            time = Decimal(cells[0])
+            time = clock.read(cells[0])
             row = [
                 scale * float(cell) + offset for cell, (scale, offset) in zip(cells[1:], scales, strict=True)
             ]
+        except InputError:
+            raise
         except (InvalidOperation, ValueError):
-            bad = next((cell for cell in cells if not _finite(cell)), cells[0])
+            bad = next((cell for cell in cells[1:] if not _finite(cell)), cells[0])
             faults.add(number, f"'{bad[:20]}' is not a number")
             continue
         if not time.is_finite() or not all(map(math.isfinite, row)):
@@ -121,7 +135,7 @@ def read_log(kind: Kind, path: Path, layout: Layout, frame: str) -> Log:
             where=where,
         )
     log = Log(kind, names, [], np.array(rows), faults)
-    log.stamp_ns = _stamps(times, source, log, where)
+    log.stamp_ns = _stamps(times, source, log, where, clock)
     if kind == "tracker":
         _orientation(log, lines, where)
     if kind != "joints":
@@ -136,9 +150,9 @@ def _finite(cell: str) -> bool:
         return False
 
 
-def _stamps(times: list[Decimal], source: Source, log: Log, where: str) -> list[int]:
+def _stamps(times: list[Decimal], source: Source, log: Log, where: str, clock: TimeCells) -> list[int]:
     """Stamps in ns; logs on a clock that begins near zero are moved to a positive system time."""
-    per_unit = Decimal(repr(factor(source.time.unit, "s", where))) * 10**9
+    per_unit = clock.seconds_per_unit * 10**9
     start = source.time.start_s
     if start is None:
         first_s = times[0] * per_unit / 10**9
@@ -160,7 +174,7 @@ def _stamps(times: list[Decimal], source: Source, log: Log, where: str) -> list[
         low, high = RATES_HZ[log.kind]
         if not low <= rate <= high:
             raise InputError(
-                f"{log.kind} come at {rate:.4g} Hz, outside {low:g} to {high:g} Hz, with time in {source.time.unit}",
+                f"{log.kind} come at {rate:.4g} Hz, outside {low:g} to {high:g} Hz, with time {clock.text}",
                 do="check the unit of time",
                 where=where,
             )
@@ -169,6 +183,8 @@ def _stamps(times: list[Decimal], source: Source, log: Log, where: str) -> list[
 
 def _orientation(log: Log, lines: list[int], where: str) -> None:
     """Unit quaternions; without any, identities and a word about it."""
+    if QUATERNION[0] not in log.names and (MATRIX[0] in log.names or EULER[0] in log.names):
+        log.names, log.values = with_quaternions(log.names, log.values)
     if QUATERNION[0] not in log.names:
         log.names = [*log.names, *QUATERNION]
         log.values = np.hstack([log.values, np.tile([0.0, 0.0, 0.0, 1.0], (len(log.values), 1))])
@@ -280,7 +296,8 @@ def check(logs: list[Log], robot: Robot | None) -> list[Finding]:
         if log.kind == "tracker" and inside < 0.5 * len(log.stamp_ns):
             text = (
                 f"{inside} of {len(log.stamp_ns)} poses lie in the time of the joints ({begin * 1e-9:.3f} s to {end * 1e-9:.3f} s; "
-                f"poses {log.stamp_ns[0] * 1e-9:.3f} s to {log.stamp_ns[-1] * 1e-9:.3f} s): both logs need one clock"
+                f"poses {log.stamp_ns[0] * 1e-9:.3f} s to {log.stamp_ns[-1] * 1e-9:.3f} s): both logs need one clock; "
+                "start_s of a log's time in the layout moves it"
             )
             found.append(Finding("error", topics.TRACKER_TIP, text))
     if robot is not None:

@@ -14,6 +14,7 @@ from ctr_dynamics.io.text_files import check_regular
 
 MAX_LINE = 100_000  # characters; longer is no log
 _DELIMITERS = ",;\t"
+_DECIMAL_COMMA = re.compile(r"[-+]?\d*,\d+(?:[eE][-+]?\d+)?")
 
 
 @dataclass
@@ -32,28 +33,51 @@ class Faults:
 class CsvTable:
     """A CSV file with a header line; blank lines and lines that begin with # are passed over.
 
+    Cells are separated by commas, semicolons, tabs or white space. Between other separators a comma may stand for the decimal point.
+
+    Args:
+        path: of the file.
+        header_line: number of the line with the names of the columns, from 1; 0 where there is none, and columns are named "1", "2", ..;
+            None to find it.
+
     Attributes:
-        header: names of the columns, as written.
+        header: names of the columns, as written. A name that is there again is followed by #2, #3, ..
 
     Raises:
         InputError: the file cannot be read, is not text, or has no header.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, header_line: int | None = None) -> None:
         self.path = path
         with self._open() as stream:
-            self._first, line = _header_line(stream, path)
+            self._first, line = (
+                _header_line(stream, path) if header_line is None else _line(stream, path, header_line)
+            )
         if not line.strip():
             raise InputError("the file is empty", do="give a CSV file with a header", where=str(path))
-        self.delimiter = max(_DELIMITERS, key=line.count)
-        self.header = [cell.strip() for cell in next(csv.reader([line], delimiter=self.delimiter))]
-        if len(set(self.header)) < len(self.header):
-            twice = next(name for name in self.header if self.header.count(name) > 1)
-            raise InputError(f"column '{twice}' is there twice", do="rename one", where=str(path))
-        if all(_is_number(cell) for cell in self.header):
+        most = max(_DELIMITERS, key=line.count)
+        self.delimiter = most if most in line else " "
+        cells = self._cells(line)
+        self.header = [str(i + 1) for i in range(len(cells))] if header_line == 0 else _distinct(cells)
+        if header_line == 0:
+            self._first = 0
+        elif all(_is_number(cell) for cell in cells):
             raise InputError(
-                "the first line holds numbers, not names of columns", do="add a header line", where=str(path)
+                "the first line holds numbers, not names of columns",
+                do="add a header line, or give a layout with header_line: 0 and columns '1', '2', ..",
+                where=str(path),
             )
+
+    def _cells(self, line: str) -> list[str]:
+        """Cells of a line.
+
+        Raises:
+            ValueError, csv.Error: no row of a CSV file.
+        """
+        if self.delimiter == " ":
+            return line.split()
+        [cells] = csv.reader([line.strip("\r\n")], delimiter=self.delimiter)
+        return [cell.strip() for cell in cells]
 
     def _open(self) -> TextIO:
         check_regular(self.path, "give a CSV file")
@@ -76,14 +100,18 @@ class CsvTable:
                 if number <= self._first or not line.strip() or line.startswith("#"):
                     continue
                 try:
-                    [cells] = csv.reader([line.strip("\r\n")], delimiter=self.delimiter)
+                    cells = self._cells(line)
                 except (csv.Error, ValueError):
                     faults.add(number, "is not a row of a CSV file")
                     continue
                 if len(cells) < len(self.header):
                     faults.add(number, f"{len(cells)} cells for {len(self.header)} columns")
                     continue
-                chosen = [cells[place].strip() for place in places]
+                chosen = [cells[place] for place in places]
+                if self.delimiter != ",":
+                    chosen = [
+                        cell.replace(",", ".") if _DECIMAL_COMMA.fullmatch(cell) else cell for cell in chosen
+                    ]
                 if any(chosen[1:]):
                     yield number, chosen
 
@@ -99,6 +127,24 @@ def _header_line(stream: TextIO, path: Path) -> tuple[int, str]:
             first = re.split(f"[{_DELIMITERS}]", text)[0]
             return comment if comment[1] and _is_number(first) else (number, text)
     return comment
+
+
+def _line(stream: TextIO, path: Path, wanted: int) -> tuple[int, str]:
+    """Number and text of the line ``wanted``; of the first row where that is 0."""
+    for number, line in enumerate(_lines(stream, path), 1):
+        if number == wanted or (not wanted and line.strip() and not line.startswith("#")):
+            return number, line.strip("\r\n\ufeff").lstrip("# \t" if wanted else "\ufeff")
+    raise InputError(
+        f"has no line {wanted or 'of numbers'}", do="check header_line in the layout", where=str(path)
+    )
+
+
+def _distinct(cells: list[str]) -> list[str]:
+    """The names, each once: those that are there before are followed by #2, #3, .."""
+    return [
+        name if name not in cells[:i] else f"{name}#{cells[:i].count(name) + 1}"
+        for i, name in enumerate(cells)
+    ]
 
 
 def _lines(stream: TextIO, path: Path) -> Iterator[str]:

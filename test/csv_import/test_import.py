@@ -138,7 +138,7 @@ def test_frame_must_be_stated(logs, tmp_path, capsys):
     ("old", "new", "message"),
     [
         ("time [ms]", "time [s]", "outside 0 to 2147483647 s"),
-        ("time [ms]", "time", "unit 'none' is none of s"),
+        ("time [ms]", "time", "holds numbers of no stated unit"),
         ("tube1_rotation [deg]", "tube1_rotation [mm]", "unit 'mm' is none of rad"),
         ("tube1_rotation [deg]", "tube1_rotation", "unit 'none' is none of rad"),
         ("tube1_translation (mm)", "tube1_translation (m)", "millimetres? Give metres"),
