@@ -426,6 +426,12 @@ class Estimator:
         largest = largest or self.options.deviation_fraction * self.robot.tubes[0].length
         if deviation > largest:
             return f"the tip is known to {1e3 * deviation:.1f} mm only, limit {1e3 * largest:.1f} mm"
+        apart = self.health.apart_m if self.health.fusing and self.health.tracker_alive else 0.0
+        if apart > largest:
+            return (
+                f"tracker and model lie {1e3 * apart:.1f} mm apart, limit {1e3 * largest:.1f} mm: check the tracker's frame and sensor, the joints' "
+                "zeros and the robot file"
+            )
         if self.health.fusing and self.health.rejecting:
             return "the tracker contradicts the model: most of its last measurements are outside the gate"
         return self._settling.problem(stamp)

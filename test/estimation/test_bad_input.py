@@ -19,7 +19,7 @@ from estimation_cases import (
 
 from ctr_dynamics.estimation.monitoring.statuses import all_statuses, snap_ahead
 from ctr_dynamics.estimation.runs import MAX_FAILURES
-from ctr_dynamics.io.messages.topics import DIAGNOSTICS
+from ctr_dynamics.io.messages.topics import DIAGNOSTICS, STEP_NS
 from ctr_dynamics.robot_files import load_robot
 from ctr_dynamics.runtime.step_encoder import StepEncoder
 from ctr_dynamics.snap.scurve import s_curve
@@ -155,9 +155,10 @@ def test_stray_joint_from_the_future(sweep):
 
 
 def Run_without_restart(run):
-    """The steps before time went back."""
-    stamps = run.column("stamp_ns")
-    end = int(np.flatnonzero(np.diff(stamps) < 0)[0]) + 1 if np.any(np.diff(stamps) < 0) else len(stamps)
+    """The steps before the estimator began again, with other stamps."""
+    between = np.diff(run.column("stamp_ns"))
+    new = np.flatnonzero((between < 0) | (between % STEP_NS != 0))
+    end = int(new[0]) + 1 if len(new) else len(run.outputs)
     return type(run)(run.outputs[:end], run.estimator)
 
 
@@ -176,7 +177,8 @@ def test_bag_that_starts_again(sweep):
     assert again[0].stamp_ns < START_NS + 50_000_000
     assert again[-1].stamp_ns == START_NS + 600_000_000
     assert again[-1].valid
-    assert made.health.accepted > 40
+    assert len(made.health.recent) > 20
+    assert 20 < made.health.accepted < 30, "no measurement counts twice"
 
 
 def test_gap_in_the_joints(sweep):

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import math
+import statistics
 from collections import deque
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
+
+import numpy as np
 
 from ctr_dynamics import chi_square
 from ctr_dynamics.estimation.monitoring.consistency_monitor import ConsistencyMonitor
@@ -15,6 +18,7 @@ from ctr_dynamics.model.stability import Stability
 TRACKER_LIMIT_S = 1.0  # without a usable measurement for longer the status says so: 40 are missing at 40 Hz
 RECENT = 40  # measurements that the tracker is judged by: one second at 40 Hz
 FEWEST_RECENT = 20  # of them, below which nothing is said of a contradiction
+APART, FEWEST_APART = 20, 5  # measurements for the distance between tracker and model: half a second at 40 Hz
 WAITING = "waiting for the first complete joint state"
 
 
@@ -81,6 +85,7 @@ class Health:
         shift_m: m, by which measured positions lie beside what any force on the robot explains; 0 where they do not.
         noise_ratio: deviation of the tracker's noise by the stated one; 1 while nothing else is established.
         residuals: of the measurements that were used; unused_residuals: of those that were rejected or dropped.
+        distances: m, between measured and published positions, of the last measurements.
         consistency: watches the innovations. stability: of the equilibrium that belongs to the present actuators.
     """
 
@@ -117,6 +122,8 @@ class Health:
     residuals: Residuals = NOTHING_COMPARED
     unused_residuals: Residuals = NOTHING_COMPARED
 
+    distances: deque[float] = field(default_factory=lambda: deque(maxlen=APART))
+
     # -- counting --
 
     def note(self, group: str, kind: str, what: str, count: int = 1) -> None:
@@ -141,6 +148,8 @@ class Health:
         within = innovation.reason == FUSION_OFF or (innovation.accepted and not innovation.reason)
         if innovation.dof:
             self.recent.append((innovation.nis / innovation.dof, within))
+        if innovation.fused_residual is not None:
+            self.distances.append(float(np.linalg.norm(innovation.fused_residual)))
         if again:
             return
         used = bool(innovation.dof) and (innovation.accepted or not self.fusing)
@@ -186,6 +195,7 @@ class Health:
         """Wait for joints and watch afresh; counters of what was odd stay."""
         self.problem = WAITING
         self.recent.clear()
+        self.distances.clear()
         self.consistency.clear()
 
     # -- what it comes to --
@@ -199,6 +209,14 @@ class Health:
     def inconsistent(self) -> bool:
         """Whether the consistency monitor's alarm stands and measurements still come."""
         return self.consistency.alarm and self.tracker_alive
+
+    @property
+    def apart_m(self) -> float:
+        """How far the last measured positions lie from the tip that was published for their times, m, whatever the filter made of them.
+
+        The median of the last ``APART``: half of them may be outliers. 0 before there are ``FEWEST_APART``.
+        """
+        return statistics.median(self.distances) if len(self.distances) >= FEWEST_APART else 0.0
 
     @property
     def outside(self) -> int:

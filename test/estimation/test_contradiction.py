@@ -1,0 +1,38 @@
+"""A tracker and a model that lie far apart: nobody knows which of them is wrong, so that outputs are invalid until they agree again."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from estimation_cases import bag_messages, play
+
+FROM_S, TO_S = 1.0, 1.8
+
+
+def displaced(move):
+    """The first seconds of a sweep, with ``move`` (m) added to every tracker position between ``FROM_S`` and ``TO_S``."""
+    messages = []
+    for m in bag_messages("clean_sweep", 3.0):
+        if m.kind == "pose" and FROM_S <= m.stamp * 1e-9 < TO_S:
+            position, *rest = m.content
+            m = replace(m, content=(tuple(np.add(position, move())), *rest))
+        messages.append(m)
+    return messages
+
+
+@pytest.mark.parametrize("distance", [0.03, 0.12])
+def test_outputs_are_invalid_while_tracker_and_model_are_far_apart(distance):
+    run = play(displaced(lambda: (distance, 0.0, 0.0)))
+    valid, t = run.column("valid"), run.t
+    assert valid[t < FROM_S].all()
+    assert not valid[(t > FROM_S + 0.35) & (t < TO_S)].any()
+    assert valid[t > TO_S + 0.5].all()
+    reason = next(out.reason for out in run.outputs if not out.valid)
+    assert "tracker and model lie" in reason
+    assert "limit 19.9 mm" in reason
+
+
+def test_outliers_below_half_leave_the_outputs_valid():
+    rng = np.random.default_rng(3)
+    run = play(displaced(lambda: (0.05 * (rng.random() < 0.3), 0.0, 0.0)))
+    assert run.column("valid").all()
