@@ -31,12 +31,16 @@ from ctr_dynamics.csv_import.table import CsvTable, Faults
 from ctr_dynamics.csv_import.time_cells import TimeCells
 from ctr_dynamics.errors import InputError
 from ctr_dynamics.io.bag_checks import FRAME, Finding, inspector_for
-from ctr_dynamics.io.bag_reader import sha256_of
+from ctr_dynamics.io.bag_reader import InputMessage, sha256_of
 from ctr_dynamics.io.bag_writer import write_bag
 from ctr_dynamics.io.messages import topics
+from ctr_dynamics.io.messages.cdr import decode_joint_state, decode_pose_stamped, decode_wrench_stamped
 from ctr_dynamics.io.messages.encode import encode_joint_state, encode_pose_stamped, encode_wrench_stamped
+from ctr_dynamics.io.messages.input_types import Decoded
 from ctr_dynamics.kernels.rotations import conjugate, from_vector, matrix, multiply
 from ctr_dynamics.robot import Robot
+from ctr_dynamics.sensing.checks import Kind as Fault
+from ctr_dynamics.sensing.checks.input_checks import check_messages
 from ctr_dynamics.units import factor
 
 Floats = NDArray[np.float64]
@@ -45,6 +49,14 @@ TOPIC_OF: dict[Kind, str] = {
     "tracker": topics.TRACKER_TIP,
     "load": topics.TIP_LOAD,
 }
+DECODERS: dict[str, Callable[[bytes], Decoded]] = {
+    topics.JOINT_STATES: decode_joint_state,
+    topics.TRACKER_TIP: decode_pose_stamped,
+    topics.TIP_LOAD: decode_wrench_stamped,
+}
+_KIND_OF: dict[str, Kind] = {"joints": "joints", "tracker": "tracker", "load": "load"}
+# The other checks of a log have a line on these; gaps are what the rows left out leave.
+_SAID_BEFORE = {Fault.NOT_FINITE, Fault.QUATERNION, Fault.OUT_OF_RANGE, Fault.CLOCK_OFFSET, Fault.GAP}
 RELATIVE_BELOW_S = 1_000_000  # a clock below is no system clock
 RELATIVE_START_S = 1_000_000_000  # stamps of such logs begin about here; a stamp must not be negative
 MAX_STAMP_S = 2**31 - 1  # what a ROS stamp holds
@@ -302,7 +314,23 @@ def check(logs: list[Log], robot: Robot | None) -> list[Finding]:
             found.append(Finding("error", topics.TRACKER_TIP, text))
     if robot is not None:
         found += _actuator_findings(joints, robot)
-    return found
+    return found + _input_faults(logs, robot)
+
+
+def _input_faults(logs: list[Log], robot: Robot | None) -> list[Finding]:
+    """What replay and node would leave out or mend of these logs; none of it keeps the bag from being written."""
+    recorded = sorted((stamp, topic, data) for log in logs for stamp, topic, data in messages(log))
+    inputs = (InputMessage(topic, stamp, DECODERS[topic](data)) for stamp, topic, data in recorded)
+    begin = recorded[0][0]
+    return [
+        Finding(
+            "note" if found.level == "note" else "warning",
+            TOPIC_OF[_KIND_OF[found.stream]],
+            found.line(begin),
+        )
+        for found in check_messages(inputs, robot)
+        if found.kind not in _SAID_BEFORE
+    ]
 
 
 def _actuator_findings(joints: Log, robot: Robot) -> list[Finding]:

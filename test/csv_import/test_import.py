@@ -329,3 +329,15 @@ def test_measures(text, si, value):
 def test_measures_without_a_fitting_unit_are_rejected(text, si):
     with pytest.raises(InputError):
         measure(text, si, "x")
+
+
+def test_faults_that_a_replay_would_mend_are_said(logs, tmp_path, capsys):
+    """A tracker that was polled faster than it measures repeats its poses; angles may wrap."""
+    header, *rows = csv.reader(logs["--tracker"].read_text().splitlines())
+    time = header.index("t_s")
+    for row in rows[10:25]:
+        row[:] = [cell if i == time else rows[9][i] for i, cell in enumerate(row)]
+    write(logs["--tracker"], header, rows)
+    assert run(logs, tmp_path / "out.mcap", "--robot", ROBOT) == 0
+    lines = [line for line in capsys.readouterr().err.splitlines() if "/ctr/tracker/tip" in line]
+    assert any("equal" in line or "repeat" in line or "frozen" in line for line in lines), lines
