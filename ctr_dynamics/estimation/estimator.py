@@ -367,8 +367,7 @@ class Estimator:
             health.restarts += 1
             return self._invalid(k, "the estimate is not finite; the model is reinitialised at rest")
         stamp = self.timeline.stamp(k)
-        self._inflate(tip.covariance, tip.position, stamp)
-        deviation = math.sqrt(max(tip.covariance[0, 0] + tip.covariance[1, 1] + tip.covariance[2, 2], 0.0))
+        deviation = position_deviation(tip.covariance)
         if (
             deviation > self.robot.tubes[0].length
         ):  # a tip that is known no better than that is not estimated any more
@@ -380,6 +379,8 @@ class Estimator:
                 f"the tracker has led the estimate astray: deviation of the tip {deviation:.2g} m, limit "
                 f"{self.robot.tubes[0].length:g} m; the filter is reinitialised from the open-loop run",
             )
+        self._inflate(tip.covariance, tip.position, stamp)
+        deviation = position_deviation(tip.covariance)
         since = fused.measured_ns if fused.measured_ns is not None else self.t0_ns
         health.tracker_age_s = max(0.0, (stamp - (since or stamp)) * 1e-9)
         innovations = self.innovations.take()
@@ -425,7 +426,7 @@ class Estimator:
         largest = float(self.settings["output.largest_deviation_m"])
         largest = largest or self.options.deviation_fraction * self.robot.tubes[0].length
         if deviation > largest:
-            return f"the tip is known to {1e3 * deviation:.1f} mm only, limit {1e3 * largest:.1f} mm"
+            return f"the tip is known to no better than the limit of {1e3 * largest:.1f} mm (output.largest_deviation_m)"
         apart = self.health.apart_m if self.health.fusing and self.health.tracker_alive else 0.0
         if apart > largest:
             return (
@@ -481,3 +482,8 @@ class Estimator:
             "shortfall": self.health.shortfall,
         }
         return {**self.health.summary(), "numerics": numerics}
+
+
+def position_deviation(covariance: Floats) -> float:
+    """m, root of the trace of the position in the tip's ``covariance`` (12, 12)."""
+    return math.sqrt(max(covariance[0, 0] + covariance[1, 1] + covariance[2, 2], 0.0))

@@ -89,4 +89,4 @@ def test_outputs_are_invalid_where_the_tip_is_not_known_well_enough():
     assert all(out.valid for out in usual.outputs)
     invalid = [out for out in strict.outputs if not out.valid]
     assert invalid
-    assert all("is known to" in out.reason and "limit 0.1 mm" in out.reason for out in invalid)
+    assert all("is known to" in out.reason and "limit of 0.1 mm" in out.reason for out in invalid)

@@ -111,7 +111,4 @@ class Settling:
         if self._agreed >= options.agreeing or waited > options.longest_s:
             self._since_ns = None
             return ""
-        return (
-            f"{self._why}: how it moves is not known yet; {self._agreed} measurements in a row agree, limit {options.agreeing}, "
-            f"{waited:.2f} s have passed, limit {options.longest_s:g} s"
-        )
+        return f"{self._why}: how it moves is not known until {options.agreeing} measurements in a row agree, or for {options.longest_s:g} s"
