@@ -241,6 +241,17 @@ class ValidationOptions:
 
 
 @dataclass(frozen=True)
+class ToleranceOptions:
+    """Tolerances: whether those of the robot file are too tight."""
+
+    widest: float = option(5.0, "tolerances", "beyond it a departure is a cause by itself")
+    factors: int = option(12, COUNT, "a fifth apart at most, finer than one draw can tell")
+    listed: float = option(
+        1.15, LOG, "half of ln 10, from which Jeffreys (1961) calls evidence for one tolerance substantial"
+    )
+
+
+@dataclass(frozen=True)
 class VerdictOptions:
     """Verdict: what is named."""
 
@@ -297,6 +308,7 @@ class DiagnosisOptions:
     residual_tests: ResidualTestOptions = ResidualTestOptions()
     validation: ValidationOptions = ValidationOptions()
     verdict: VerdictOptions = VerdictOptions()
+    tolerances: ToleranceOptions = ToleranceOptions()
     unexplained_force: UnexplainedForceOptions = UnexplainedForceOptions()
     report: ReportOptions = ReportOptions()
 

@@ -14,6 +14,7 @@ from ctr_dynamics.diagnosis.inference.evidence import WeighedHypotheses
 from ctr_dynamics.diagnosis.inference.fit_problem import Problem
 from ctr_dynamics.diagnosis.inference.map_fit import Fit
 from ctr_dynamics.diagnosis.inference.sensitivities import Sensitivities
+from ctr_dynamics.diagnosis.inference.tolerance_evidence import ToleranceEvidence
 from ctr_dynamics.diagnosis.recording import Recording
 from ctr_dynamics.diagnosis.verdict.residual_tests import Whiteness
 from ctr_dynamics.diagnosis.verdict.separability import Cause
@@ -41,6 +42,7 @@ class Diagnosis:
         mistake: of the configuration, with the misfit that it makes.
         sensitivities: at the extended fit, where causes are named.
         seconds: of the diagnosis.
+        tolerances: evidence that those of the robot file are too tight; None where it was not asked for. Verdict `tolerances` rests on it.
     """
 
     robot: Robot
@@ -63,6 +65,7 @@ class Diagnosis:
     mistake: FoundMistake | None = None
     notes: list[str] = field(default_factory=list)
     seconds: float = 0.0
+    tolerances: ToleranceEvidence | None = None
     residual_recalibrated: list[Floats] = field(default_factory=list)
     residual_extended: list[Floats] = field(default_factory=list)
     sensitivities: Sensitivities | None = None

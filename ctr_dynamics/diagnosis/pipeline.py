@@ -20,6 +20,7 @@ from ctr_dynamics.diagnosis.inference.evidence import weigh_by_prediction
 from ctr_dynamics.diagnosis.inference.fit_problem import make_problem
 from ctr_dynamics.diagnosis.inference.fit_quality import is_wrong
 from ctr_dynamics.diagnosis.inference.hypothesis_search import search_hypotheses
+from ctr_dynamics.diagnosis.inference.tolerance_evidence import tolerance_evidence
 from ctr_dynamics.diagnosis.recording import Recording, measured_axes
 from ctr_dynamics.diagnosis.run_context import RunContext
 from ctr_dynamics.diagnosis.verdict.decision import Evidence, Verdict, decide, needed_hypothesis
@@ -120,6 +121,13 @@ def diagnose_recordings(
     # output: residuals for findings and report
     result.residual_recalibrated = problem.residuals(recalibrated.point)
     result.residual_extended = problem.residuals(best.fit.point)
+
+    # tolerances: without a cause, whether the robot's values scatter more than the robot file says
+    if result.verdict == "clean":
+        result.tolerances = tolerance_evidence(found.no_cause.fit, problem.numerics, options.tolerances)
+        if result.tolerances.evidence > options.verdict.needed_gain and result.tolerances.wider:
+            result.verdict = "tolerances"
+
     result.seconds = context.elapsed_s - begin
     return result
 

@@ -14,6 +14,7 @@ from ctr_dynamics import __version__
 from ctr_dynamics.diagnosis.diagnosis_result import Diagnosis
 from ctr_dynamics.diagnosis.inference.candidates import Candidate
 from ctr_dynamics.diagnosis.inference.map_fit import Fit
+from ctr_dynamics.diagnosis.inference.tolerance_evidence import WiderTolerance
 from ctr_dynamics.diagnosis.output.robot_export import robot_with
 from ctr_dynamics.diagnosis.verdict.residual_tests import rms
 from ctr_dynamics.diagnosis.verdict.separability import Cause
@@ -101,6 +102,9 @@ def findings(diagnosis: Diagnosis, command: str, experiment: dict[str, Any] | No
                 "nis_after": v.nis_after,
             },
             "next_experiment": experiment,
+            "tolerances": [_tolerance(w) for w in d.tolerances.wider]
+            if d.tolerances is not None and d.verdict == "tolerances"
+            else [],
             "extended_robot": EXTENDED if d.extended is not None else None,
             "recalibrated_robot": RECALIBRATED if d.recalibrated is not None else None,
             "reproduce": command,
@@ -137,6 +141,22 @@ def _cause(d: Diagnosis, cause: Cause) -> dict[str, Any]:
         "probability": cause.probability,
         "separation": cause.separation,
         "not_separable_from": cause.rivals,
+    }
+
+
+def _tolerance(wider: WiderTolerance) -> dict[str, Any]:
+    """One tolerance that is too tight, in the contract's unit."""
+    q = wider.quantity
+
+    def shown(deviation: float) -> float:
+        return abs(q.parameter.value(q.off + deviation) - q.parameter.value(q.off))
+
+    return {
+        "parameter": f"{q.effect}.{q.name}",
+        "unit": q.parameter.unit,
+        "stated": shown(wider.stated),
+        "suggested": shown(wider.suggested),
+        "evidence": wider.evidence,
     }
 
 

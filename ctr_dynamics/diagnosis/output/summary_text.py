@@ -12,6 +12,7 @@ VERDICTS = {
     "ambiguous": "The simulation is wrong; several causes explain it about as well.",
     "unknown": "The simulation is wrong in a way that no cause of the catalogue explains.",
     "not_excited": "These bags hardly move the robot: they cannot show what is wrong.",
+    "tolerances": "No cause is needed, but values of the robot scatter more than the tolerances of the robot file say.",
 }
 # Units for people: factor and text.
 SHOWN = {
@@ -73,6 +74,9 @@ def summary(content: dict[str, Any]) -> list[str]:
             f"On bags that were not fitted: {_mm(v['rms_recalibrated_m'])} -> {_mm(v['rms_extended_m'])}, "
             f"gain {v['gain']:.3f} [{v['ci95'][0]:.3f}, {v['ci95'][1]:.3f}]."
         )
+    for w in content["tolerances"]:
+        stated, suggested = shown(w["stated"], w["unit"]), shown(w["suggested"], w["unit"])
+        lines.append(f"Tolerance of {w['parameter']}: {suggested} instead of {stated}.")
     e = content["next_experiment"]
     if e is not None:
         worth = ""
