@@ -26,6 +26,9 @@ def option(value: T, unit: str, reason: str) -> T:
 class RecordingOptions:
     """Data: what is used of a bag."""
 
+    time_left: float = option(
+        3.0, "whitened", "difference of a quarter of the step from half of it, likewise"
+    )
     shortest_s: float = option(2.0, "s", "joints and tracker together; less shows too little of a vibration")
     longest_s: float = option(1000.0, "s", "joints that fit into memory with all that is kept of them")
     gap_s: float = option(0.1, "s", "without joint states; the motion in a longer gap is unknown")
@@ -108,6 +111,15 @@ class DiscretisationOptions:
     deviation: float = option(0.6, "of the difference", "what stays free to vary after the correction")
     space_limit: float = option(3.0, "whitened", "difference to twice the nodes from which these are used")
     most_nodes: int = option(40, COUNT, "cost grows with them")
+    time_limit: float = option(
+        20.0, "whitened", "a correction is right where it was measured; a tenth of it changes with the fit"
+    )
+    time_left: float = option(
+        3.0, "whitened", "difference of a quarter of the step from half of it, likewise"
+    )
+    shortest_s: float = option(
+        0.0015, "s", "step of fits; what is left of the error stays in the covariance, and cost grows"
+    )
     renewed: float = option(
         3.0, "whitened", "change of the correction from which that of another point counts"
     )
@@ -126,6 +138,9 @@ class PriorOptions:
     single: float = option(0.38, "probability", "of one cause, shared among the effects")
     pair: float = option(0.1, "probability", "of two causes")
     triple: float = option(0.02, "probability", "of three causes")
+    discrepancy: float = option(
+        0.1, "probability", "of something outside the catalogue, causes or none beside it"
+    )
     behind_plane: float = option(0.1, FRACTION, "of the positions behind a contact plane to begin with")
 
 
@@ -223,6 +238,19 @@ class EvidenceOptions:
 
 
 @dataclass(frozen=True)
+class DiscrepancyOptions:
+    """Discrepancy: what models leave as a correlated process."""
+
+    times_s: tuple[float, ...] = option(
+        (0.03, 0.1, 0.3, 1.0), "s", "correlation times; slower is the drift of the tracker"
+    )
+    smallest: float = option(0.1, "of the position noise", "size that no bag of usual length shows")
+    largest: float = option(100.0, "of the position noise", "larger is a configuration mistake")
+    hypotheses: int = option(12, COUNT, "likeliest that are weighed with it, that without causes beside them")
+    dominant: float = option(0.5, "of the misfit", "that causes explain which are named beside a remainder")
+
+
+@dataclass(frozen=True)
 class ResidualTestOptions:
     """Residual tests: whether what is left is noise."""
 
@@ -264,10 +292,6 @@ class VerdictOptions:
     observable: float = option(3.0, "whitened", "size of a sensitivity at prior scale that a bag can see")
     strong: float = option(24.0, "whitened", "size that can be told from most others")
     excited: float = option(0.2, "of the effects", "that a bag must show strongly")
-    mistake: float = option(0.97, "probability", "of a configuration mistake that explains nearly all")
-    unknown: float = option(0.95, "probability", "of a cause outside the catalogue when nothing fits")
-    beside_unknown: float = option(0.05, "probability", "that the likeliest sets of causes share with that")
-    unknown_beside: float = option(0.6, "probability", "of one beside causes that are named")
 
 
 @dataclass(frozen=True)
@@ -305,6 +329,7 @@ class DiagnosisOptions:
     contact_plane: ContactPlaneOptions = ContactPlaneOptions()
     search: SearchOptions = SearchOptions()
     evidence: EvidenceOptions = EvidenceOptions()
+    discrepancy: DiscrepancyOptions = DiscrepancyOptions()
     residual_tests: ResidualTestOptions = ResidualTestOptions()
     validation: ValidationOptions = ValidationOptions()
     verdict: VerdictOptions = VerdictOptions()

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,14 +17,20 @@ from ctr_dynamics.diagnosis.diagnosis_options import DiagnosisOptions
 from ctr_dynamics.diagnosis.diagnosis_result import Diagnosis
 from ctr_dynamics.diagnosis.inference.calibration import calibrate, nuisances_of
 from ctr_dynamics.diagnosis.inference.candidates import candidates
-from ctr_dynamics.diagnosis.inference.evidence import weigh_by_prediction
+from ctr_dynamics.diagnosis.inference.evidence import weigh_by_prediction, weigh_discrepancy
 from ctr_dynamics.diagnosis.inference.fit_problem import make_problem
 from ctr_dynamics.diagnosis.inference.fit_quality import is_wrong
 from ctr_dynamics.diagnosis.inference.hypothesis_search import search_hypotheses
 from ctr_dynamics.diagnosis.inference.tolerance_evidence import tolerance_evidence
 from ctr_dynamics.diagnosis.recording import Recording, measured_axes
 from ctr_dynamics.diagnosis.run_context import RunContext
-from ctr_dynamics.diagnosis.verdict.decision import Evidence, Verdict, decide, needed_hypothesis
+from ctr_dynamics.diagnosis.verdict.decision import (
+    Evidence,
+    Verdict,
+    decide,
+    is_unexplained,
+    needed_hypothesis,
+)
 from ctr_dynamics.diagnosis.verdict.residual_tests import rms, whiteness
 from ctr_dynamics.diagnosis.verdict.separability import Cause, observability
 from ctr_dynamics.diagnosis.verdict.validation import validate
@@ -112,11 +119,31 @@ def diagnose_recordings(
         context.report("validation")
         result.validation = validate(held_out, found.no_cause.fit, best.fit)
 
+    # discrepancy: something outside the catalogue competes where noise does not explain what is left
+    weighed = None
+    if result.whiteness_extended.p < options.residual_tests.noise_p and best.resolved:
+        context.report("evidence of a discrepancy")
+        weighed = weigh_discrepancy(found, problem, context)
+        unexplained = is_unexplained(
+            problem, found, best, Evidence(result.whiteness_extended, result.validation, True)
+        )
+        if unexplained and weighed.leading is not best:
+            best = weighed.leading
+            result.extended, result.whiteness_extended = best.fit, whiteness(problem, best.fit)
+            if held_out is not None:
+                result.validation = validate(held_out, found.no_cause.fit, best.fit)
+
     # verdict
     seen = observability(problem, effects, found.sensitivities)
     result.not_observable = seen.not_observable
-    evidence = Evidence(result.whiteness_extended, result.validation, seen.excited)
-    _take(result, decide(problem, found, best, evidence, context))
+    evidence = Evidence(result.whiteness_extended, result.validation, seen.excited, weighed, result.numerics)
+    verdict = decide(problem, found, best, evidence, context)
+    _take(result, verdict)
+    if verdict.discrepancy is not None and best.members:
+        # intervals with the remainder as a correlated process instead of larger noise
+        result.extended = replace(
+            best.fit, covariance=verdict.discrepancy.covariance, chi2=min(best.fit.chi2, float(problem.size))
+        )
 
     # output: residuals for findings and report
     result.residual_recalibrated = problem.residuals(recalibrated.point)
@@ -134,10 +161,9 @@ def diagnose_recordings(
 
 def _mistaken(result: Diagnosis, misfit: float, seconds: float) -> Diagnosis:
     """A mistake of the configuration ends the diagnosis: everything else would be fitted to it."""
-    probability = result.options.verdict.mistake
     result.verdict = "named"
-    result.causes = [Cause(None, "config_mistake", probability)]
-    result.cause_sets = [(("config_mistake",), probability)]
+    result.causes = [Cause(None, "config_mistake", None)]
+    result.cause_sets = [(("config_mistake",), None)]
     result.nominal_rms, result.seconds = misfit, seconds
     return result
 
@@ -145,4 +171,5 @@ def _mistaken(result: Diagnosis, misfit: float, seconds: float) -> Diagnosis:
 def _take(result: Diagnosis, verdict: Verdict) -> None:
     result.verdict, result.causes, result.cause_sets = verdict.word, verdict.causes, verdict.cause_sets
     result.sensitivities, result.unexplained_force = verdict.sensitivities, verdict.unexplained_force
+    result.discrepancy = verdict.discrepancy
     result.notes += verdict.notes

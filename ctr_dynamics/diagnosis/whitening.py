@@ -51,6 +51,13 @@ class Whitener:
         out = np.concatenate(parts)
         return out if values.ndim == 3 else out[:, 0]
 
+    def covariance(self, process: Floats, position: bool) -> Floats:
+        """Whitened covariance (n, n) of a process on one axis, whose covariance at the poses that count is ``process`` (m^2 or rad^2)."""
+        if not position:
+            return process / self._rotation**2
+        half = solve_triangular(self._factor, process, lower=True)
+        return np.asarray(solve_triangular(self._factor, half.T, lower=True))
+
 
 def noise_floor(robot: Robot) -> float:
     """3-D rms in m of the tracker's position noise."""

@@ -1,5 +1,6 @@
 """The solver's own error: measured, corrected, and measured again where causes are found."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -41,9 +42,11 @@ def test_the_error_of_the_solver_is_that_of_the_point(recording, robot, known, m
     assert renew_correction(problem, there.point, SILENT) is None  # about the same: all stays
     np.testing.assert_array_equal(problem.residual(there.point), there.residual)
     measured = discretisation_error.differences
-    monkeypatch.setattr(
-        discretisation_error, "differences", lambda *given: tuple(20.0 * part for part in measured(*given))
-    )
+
+    def larger(found):
+        return replace(found, directions=20.0 * found.directions)
+
+    monkeypatch.setattr(discretisation_error, "differences", lambda *given: larger(measured(*given)))
     change = renew_correction(problem, there.point, SILENT)
     assert change is not None
     assert np.linalg.norm(change) >= OPTIONS.discretisation.renewed
@@ -77,4 +80,32 @@ def test_a_shorter_step_that_fails_is_followed_by_a_longer_one(recording, robot,
         "residual_at",
         lambda model, point: None if model.scheme.dt < dt else plain(model, point),
     )
-    assert errors()[0] == 0.0
+    assert math.isnan(errors()[0])
+
+
+def test_a_step_too_long_for_the_vibration_is_halved(recording, robot):
+    """Until the difference to half of it is small, and the error named is that of the last refinement."""
+    problem = make_problem(robot, [recording], [], np.ones(6, bool))
+    plain = correct_discretisation(problem, {}, SILENT)
+    dt = problem.forward_models[0].scheme.dt
+    assert dt == OPTIONS.forward_model.dt_s
+    keen = DiscretisationOptions(time_limit=0.0)
+    problem.options = replace(OPTIONS, discretisation=keen)
+    finer = correct_discretisation(problem, {}, SILENT)
+    assert problem.forward_models[0].scheme.dt == keen.shortest_s
+    assert finer["time_error_m"] < 0.3 * plain["time_error_m"]
+
+
+def test_an_error_that_the_correction_leaves_halves_the_step(recording, robot, monkeypatch):
+    measured = discretisation_error.differences
+    monkeypatch.setattr(
+        discretisation_error,
+        "differences",
+        lambda problem, *given: replace(
+            measured(problem, *given),
+            second=10.0 if problem.forward_models[0].scheme.dt > 0.002 else 0.0,
+        ),
+    )
+    problem = make_problem(robot, [recording], [], np.ones(6, bool))
+    correct_discretisation(problem, {}, SILENT)
+    assert problem.forward_models[0].scheme.dt == 0.5 * OPTIONS.forward_model.dt_s

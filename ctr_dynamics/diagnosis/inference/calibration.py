@@ -33,7 +33,15 @@ def calibrate(problem: Problem, context: RunContext) -> tuple[Fit, dict[str, flo
             "the model cannot be simulated near the nominal robot", do="check the robot file and the bag"
         )
     context.report("discretisation error")
+    before = problem.forward_models[0].options
     numerics = correct_discretisation(problem, first.point, context)
     here = problem.residual(first.point)
-    known = None if here is None else Local(here, first.by_key)
-    return fit(problem, (), first.point, known) or first, numerics
+    if here is None:
+        return first, numerics
+    refined = problem.forward_models[0].options != before  # the columns of a coarse solution are others
+    again = fit(problem, (), first.point, None if refined else Local(here, first.by_key)) or first
+    if refined:
+        numerics = correct_discretisation(problem, again.point, context)
+        there = problem.residual(again.point)
+        again = fit(problem, (), again.point, None if there is None else Local(there, again.by_key)) or again
+    return again, numerics

@@ -6,6 +6,7 @@ In: a problem and a point. Out: its residual corrected by the differences, and t
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 
 import numpy as np
 from joblib import delayed
@@ -19,25 +20,47 @@ from ctr_dynamics.diagnosis.run_context import RunContext
 Floats = NDArray[np.float64]
 
 
+@dataclass(frozen=True)
+class Differences:
+    """Differences from finer solutions.
+
+    Attributes:
+        directions: (m, 2) whitened, to the shortest step that was simulated and to twice the nodes; zero where none could be.
+        rms: (2,) m, of what the last refinement of step and of nodes still changed; NaN where none could be simulated.
+        first, second: whitened sizes of the differences to the first shorter step, and from there to half of that; the second is zero
+            where the first is too small to ask.
+    """
+
+    directions: Floats
+    rms: Floats
+    first: float
+    second: float
+
+
 def correct_discretisation(
     problem: Problem, point: Mapping[Key, float], context: RunContext
 ) -> dict[str, float]:
     """Compare with finer solutions at ``point``: correct the residual by the differences, and let them vary.
 
-    Where the data can see the error in space, the problem goes on with twice the nodes.
+    Where the data can see the error in space, the problem goes on with twice the nodes. Where the error in time is large, or what the
+    correction leaves of it can be seen, it goes on with half the step: a correction holds at one point only.
 
     Returns:
-        rms differences in m: ``time_error_m`` (half the step), ``space_error_m`` (twice the nodes).
+        rms in m of what the last refinement changed: ``time_error_m`` (half the step), ``space_error_m`` (twice the nodes); NaN where it
+        cannot be measured.
     """
     o = problem.options.discretisation
-    D, squares = differences(problem, point, context)
-    nodes = 2 * problem.forward_models[0].nodes
-    if float(np.linalg.norm(D[:, 1])) > o.space_limit and nodes <= o.most_nodes:
-        problem.forward_models = [e.resolved(nodes, e.scheme.dt) for e in problem.forward_models]
+    found = differences(problem, point, context)
+    nodes, dt = problem.forward_models[0].nodes, problem.forward_models[0].scheme.dt
+    more_nodes = float(np.linalg.norm(found.directions[:, 1])) > o.space_limit and 2 * nodes <= o.most_nodes
+    coarse = found.first > o.time_limit or found.second > o.time_left
+    shorter = coarse and 0.5 * dt >= o.shortest_s and bool(np.isfinite(found.rms[0]))
+    if more_nodes or shorter:
+        nodes, dt = (2 * nodes if more_nodes else nodes), (0.5 * dt if shorter else dt)
+        problem.forward_models = [e.resolved(nodes, dt) for e in problem.forward_models]
         return correct_discretisation(problem, point, context)
-    _apply(problem, D)
-    rms = np.sqrt(squares / max(sum(len(w.used) for w in problem.whiteners), 1))
-    return {"time_error_m": float(rms[0]), "space_error_m": float(rms[1])}
+    _apply(problem, found.directions)
+    return {"time_error_m": float(found.rms[0]), "space_error_m": float(found.rms[1])}
 
 
 def renew_correction(problem: Problem, point: Mapping[Key, float], context: RunContext) -> Floats | None:
@@ -46,7 +69,7 @@ def renew_correction(problem: Problem, point: Mapping[Key, float], context: RunC
     Returns:
         Change (m,) of the whitened correction; None where it is too small to count, and all is left as it was.
     """
-    D, _ = differences(problem, point, context)
+    D = differences(problem, point, context).directions
     change = D.sum(axis=1) - problem.offset
     if not np.any(D[:, 0]) or float(np.linalg.norm(change)) < problem.options.discretisation.renewed:
         return None
@@ -54,15 +77,16 @@ def renew_correction(problem: Problem, point: Mapping[Key, float], context: RunC
     return change
 
 
-def differences(problem: Problem, point: Mapping[Key, float], context: RunContext) -> tuple[Floats, Floats]:
-    """Whitened differences (m, 2) to shorter steps and to twice the nodes at ``point``, and sums (2,) m^2 of their squares in position.
+def differences(problem: Problem, point: Mapping[Key, float], context: RunContext) -> Differences:
+    """Differences to shorter steps and to twice the nodes at ``point``.
 
-    They are zero for a recording that cannot be simulated so.
+    A quarter of the step is simulated where the data can see the difference to half of it.
     """
     o = problem.options.discretisation
+    models, whiteners = problem.forward_models, problem.whiteners
     jobs = [
         job
-        for e in problem.forward_models
+        for e in models
         for job in (
             delayed(ForwardModel.residual_at)(e, point),
             delayed(with_shorter_step)(e, point, o),
@@ -70,16 +94,43 @@ def differences(problem: Problem, point: Mapping[Key, float], context: RunContex
         )
     ]
     done = context.run(jobs)
-    parts: list[list[Floats]] = [[], []]
-    squares = np.zeros(2)
-    for number, whiten in enumerate(problem.whiteners):
-        base, *others = done[3 * number : 3 * number + 3]
-        for i, (finer, factor) in enumerate(others):
-            failed = base is None or finer is None
-            difference = np.zeros((len(whiten.used), 6)) if failed else factor * (base - finer)
-            parts[i].append(whiten(difference))
-            squares[i] += float(np.sum(difference[:, :3] ** 2))
-    return np.stack([np.concatenate(p) for p in parts], axis=1), squares
+    base, half, finer = done[::3], done[1::3], done[2::3]
+    time = [_difference(b, f, factor) for b, (f, factor) in zip(base, half, strict=True)]
+    space = [_difference(b, f, factor) for b, (f, factor) in zip(base, finer, strict=True)]
+    total = _whitened(problem, time)
+    last, first, second = time, float(np.linalg.norm(total)), 0.0
+    halved = all(f is not None and factor == 1.0 for f, factor in half)
+    if halved and first > o.time_left:
+        quarter = context.run(
+            delayed(ForwardModel.residual_at)(e.resolved(e.nodes, 0.25 * e.scheme.dt), point) for e in models
+        )
+        if all(x is not None for x in quarter):
+            last = [_difference(f, x, 1.0) for (f, _), x in zip(half, quarter, strict=True)]
+            further = _whitened(problem, last)
+            total, second = total + further, float(np.linalg.norm(further))
+    rows = max(sum(len(w.used) for w in whiteners), 1)
+    rms = [
+        np.sqrt(sum(np.nan if d is None else float(np.sum(d[:, :3] ** 2)) for d in parts) / rows)
+        for parts in (last, space)
+    ]
+    return Differences(
+        np.stack([total, _whitened(problem, space)], axis=1), np.array(rms, dtype=float), first, second
+    )
+
+
+def _difference(base: Floats | None, finer: Floats | None, factor: float) -> Floats | None:
+    """(s, 6), None where a simulation failed."""
+    return None if base is None or finer is None else factor * (base - finer)
+
+
+def _whitened(problem: Problem, parts: list[Floats | None]) -> Floats:
+    """(m,) of the differences of all recordings; zero where there is none."""
+    return np.concatenate(
+        [
+            whiten(np.zeros((len(whiten.used), 6)) if d is None else d)
+            for whiten, d in zip(problem.whiteners, parts, strict=True)
+        ]
+    )
 
 
 def _apply(problem: Problem, D: Floats) -> None:

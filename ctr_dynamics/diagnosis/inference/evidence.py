@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from ctr_dynamics.diagnosis.diagnosis_options import DiagnosisOptions
 from ctr_dynamics.diagnosis.forward_model import Key
 from ctr_dynamics.diagnosis.inference.candidates import Candidate, log_prior
+from ctr_dynamics.diagnosis.inference.discrepancy import CorrelatedNoise, discrepancy_of
 from ctr_dynamics.diagnosis.inference.fit_problem import Problem
 from ctr_dynamics.diagnosis.inference.gaussian_posterior import posterior
 from ctr_dynamics.diagnosis.inference.hypotheses import Hypothesis, fit_exactly
@@ -100,6 +101,71 @@ def _evidence(found: Sequence[Hypothesis]) -> list[float]:
     """Log evidence of each with that of its prediction; a hypothesis that was not asked predicts no better than the worst."""
     worst = min((e.predicted for e in found if e.predicted is not None), default=0.0)
     return [e.fit.log_evidence + (worst if e.predicted is None else e.predicted) for e in found]
+
+
+@dataclass(frozen=True)
+class WithDiscrepancy:
+    """Probabilities where a discrepancy competes with causes; together they are one.
+
+    Attributes:
+        alone: of sets of causes that explain all, likeliest first. beside: of sets with a discrepancy beside them; () is one alone.
+        leading: the likeliest hypothesis of all, with a discrepancy or without.
+    """
+
+    alone: list[tuple[tuple[str, ...], float]]
+    beside: list[tuple[tuple[str, ...], float]]
+    leading: Hypothesis
+
+    def of(self, effects: tuple[str, ...]) -> float:
+        """Sum for all sets that hold ``effects``, with a discrepancy or without."""
+        return sum(p for names, p in (*self.alone, *self.beside) if set(effects) <= set(names))
+
+    @property
+    def discrepancy(self) -> float:
+        """Of a discrepancy, whatever is beside it."""
+        return sum(p for _, p in self.beside)
+
+
+def weigh_discrepancy(found: WeighedHypotheses, problem: Problem, context: RunContext) -> WithDiscrepancy:
+    """Let a discrepancy of unknown size compete with the likeliest hypotheses, by itself and beside each of them.
+
+    The likeliest hypothesis and that without causes are asked with every correlation time, the others with those that came out. Only the
+    fitted bags choose: those that were not fitted are left to judge.
+    """
+    o = problem.options
+    first = [found.best] if found.best is found.no_cause else [found.best, found.no_cause]
+    others = [e for e in found.hypotheses if e not in first][: o.discrepancy.hypotheses]
+    processes = context.run(delayed(CorrelatedNoise)(problem, time) for time in o.discrepancy.times_s)
+
+    def ask(those: Sequence[Hypothesis], models: list[CorrelatedNoise]) -> None:
+        answers = context.run(delayed(discrepancy_of)(problem, e.fit, models) for e in those)
+        for e, answer in zip(those, answers, strict=True):
+            e.discrepancy = answer
+
+    ask(first, processes)
+    stood = [e.discrepancy.correlation_time_s for e in first if e.discrepancy is not None]
+    near = [min(processes, key=lambda p: abs(np.log(p.time / time))) for time in stood]
+    ask(others, list(dict.fromkeys(near)))
+    asked = [*first, *others]
+    priors = np.array([log_prior(e.members, found.pool, o.prior) for e in asked])
+    share, temperature = o.prior.discrepancy, o.evidence.temperature
+    plain = np.array([e.fitted_score for e in asked]) - priors
+    more = np.array([0.0 if e.discrepancy is None else e.discrepancy.log_bayes for e in asked])
+    scores = np.concatenate(
+        [
+            plain / temperature + priors + np.log(1.0 - share),
+            (plain + more) / temperature + priors + np.log(share),
+        ]
+    )
+    weights = np.exp(scores - scores.max())
+    weights /= weights.sum()
+    count = len(asked)
+    pooled: list[dict[tuple[str, ...], float]] = [{}, {}]
+    for i, p in enumerate(weights):
+        part, effects = pooled[i // count], asked[i % count].effects
+        part[effects] = part.get(effects, 0.0) + float(p)
+    alone, beside = (sorted(part.items(), key=lambda item: -item[1]) for part in pooled)
+    return WithDiscrepancy(alone, beside, asked[int(np.argmax(weights)) % count])
 
 
 def weigh_by_prediction(

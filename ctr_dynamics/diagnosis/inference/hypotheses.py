@@ -16,6 +16,7 @@ from scipy.optimize import minimize_scalar
 
 from ctr_dynamics.diagnosis.forward_model import Key
 from ctr_dynamics.diagnosis.inference.candidates import Candidate, causes_of, keys_of
+from ctr_dynamics.diagnosis.inference.discrepancy import Discrepancy
 from ctr_dynamics.diagnosis.inference.fit_problem import Local, Problem
 from ctr_dynamics.diagnosis.inference.gaussian_posterior import posterior, variances
 from ctr_dynamics.diagnosis.inference.map_fit import Fit, fit
@@ -36,6 +37,7 @@ class Hypothesis:
         predicted: log likelihood of bags that were not fitted, up to a constant, if known.
         exact: whether it was fitted with exact Jacobians.
         resolved: whether the error in time is small against what is left.
+        discrepancy: beside its causes, where it was asked for.
     """
 
     members: tuple[Candidate, ...]
@@ -45,6 +47,7 @@ class Hypothesis:
     predicted: float | None = None
     exact: bool = False
     resolved: bool = True
+    discrepancy: Discrepancy | None = None
 
     @property
     def effects(self) -> tuple[str, ...]:

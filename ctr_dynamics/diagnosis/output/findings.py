@@ -38,10 +38,10 @@ def interval(q: EffectQuantity, value: float, sigma: float, width: float) -> lis
     return [x if math.isfinite(x) else None for x in ends]
 
 
-def parameters(fit: Fit, candidate: Candidate, inflation: float) -> dict[str, Any]:
-    """Values of one cause's parameters; ``inflation`` multiplies the posterior deviations of ``fit``."""
+def parameters(fit: Fit, candidate: Candidate) -> dict[str, Any]:
+    """Values of one cause's parameters, with intervals of the posterior deviations of ``fit``."""
     out: dict[str, Any] = {}
-    for q, value, sigma in zip(fit.active, fit.values, fit.sigma * inflation, strict=True):
+    for q, value, sigma in zip(fit.active, fit.values, fit.sigma, strict=True):
         if q.key not in candidate.keys:
             continue
         if q.parameter.period:
@@ -75,7 +75,8 @@ def findings(diagnosis: Diagnosis, command: str, experiment: dict[str, Any] | No
         "whiteness_p": d.whiteness_extended.p if d.whiteness_extended else None,
     }
     limit = d.options.report.numerics_limit * noise_floor(d.robot)
-    within = bool(d.numerics) and max(d.numerics.values()) < limit
+    measured = bool(d.numerics) and all(math.isfinite(x) for x in d.numerics.values())
+    within = measured and max(d.numerics.values()) < limit
     return plain(
         {
             "schema": SCHEMA,
@@ -88,9 +89,16 @@ def findings(diagnosis: Diagnosis, command: str, experiment: dict[str, Any] | No
             "numerics": {
                 "time_error_m": d.numerics.get("time_error_m"),
                 "space_error_m": d.numerics.get("space_error_m"),
-                "within_noise": within if d.numerics else None,
+                "within_noise": within if measured else None,
             },
             "residual": residual,
+            "discrepancy": None
+            if d.discrepancy is None
+            else {
+                "rms_m": d.discrepancy.rms_m,
+                "correlation_time_s": d.discrepancy.correlation_time_s,
+                "share_of_misfit": d.share_of_misfit,
+            },
             "validation": None
             if v is None
             else {
@@ -132,9 +140,8 @@ def _cause(d: Diagnosis, cause: Cause) -> dict[str, Any]:
     if cause.effect == "config_mistake" and d.mistake is not None:
         which = {"value": d.mistake.name, "ci90": None, "ci99": None, "unit": "name", "nominal": "none"}
         values = {"which": which}
-    elif cause.candidate is not None and d.extended is not None and d.problem is not None:
-        inflation = math.sqrt(max(1.0, d.extended.chi2 / d.problem.size))
-        values = parameters(d.extended, cause.candidate, inflation)
+    elif cause.candidate is not None and d.extended is not None:
+        values = parameters(d.extended, cause.candidate)
     return {
         "effect": cause.effect,
         "parameters": values,

@@ -29,7 +29,9 @@ def write_report(path: Path, diagnosis: Diagnosis, content: dict[str, Any]) -> N
     """Write the page."""
     page = Page(f"Diagnosis of {', '.join(r.name for r in diagnosis.recordings)}")
     first, *others = summary(content)
-    page.paragraph(first, "note" if diagnosis.verdict in ("clean", "named") else "warning")
+    page.paragraph(
+        first, "note" if diagnosis.verdict in ("clean", "named", "named_with_remainder") else "warning"
+    )
     for text in others:
         page.paragraph(text)
     for text in content["notes"]:

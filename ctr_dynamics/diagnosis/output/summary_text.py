@@ -9,6 +9,7 @@ from ctr_dynamics.effects import EFFECTS
 VERDICTS = {
     "clean": "The simulation agrees with the data within the tolerances of the robot file.",
     "named": "The simulation is wrong, and the cause is named.",
+    "named_with_remainder": "The simulation is wrong. The cause is named; beside it something smaller is left that is not noise.",
     "ambiguous": "The simulation is wrong; several causes explain it about as well.",
     "unknown": "The simulation is wrong in a way that no cause of the catalogue explains.",
     "not_excited": "These bags hardly move the robot: they cannot show what is wrong.",
@@ -46,8 +47,8 @@ def cause(entry: dict[str, Any]) -> str:
         parts.append(
             f"{name} {shown(p['value'], p['unit'])} [{shown(low, p['unit'])}, {shown(high, p['unit'])}], robot file {shown(p['nominal'], p['unit'])}"
         )
-    sentence = (
-        f"Cause: {effect.replace('_', ' ')}, {'; '.join(parts)}; probability {entry['probability']:.2f}."
+    sentence = f"Cause: {effect.replace('_', ' ')}, {'; '.join(parts)}" + (
+        f"; probability {entry['probability']:.2f}." if entry["probability"] is not None else "."
     )
     if entry["not_separable_from"]:
         sentence += (
@@ -67,6 +68,16 @@ def summary(content: dict[str, Any]) -> list[str]:
         lines.append(
             f"Residual rms against the tracker: nominal {_mm(r['nominal_rms_m'])}, re-calibrated {_mm(r['recalibrated_rms_m'])}, "
             f"extended {_mm(r['extended_rms_m'])}, noise floor {_mm(r['noise_floor_m'])}."
+        )
+    left = content["discrepancy"]
+    if left is not None:
+        share = (
+            ""
+            if left["share_of_misfit"] is None
+            else f", {100 * left['share_of_misfit']:.0f} % of the squared misfit"
+        )
+        lines.append(
+            f"What remains is not noise: {_mm(left['rms_m'])} rms, correlated over {left['correlation_time_s']:.2g} s{share}."
         )
     v = content["validation"]
     if v is not None:

@@ -6,10 +6,12 @@ In: weighed hypotheses, the validation, and whether the bags excite the robot. O
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
-from ctr_dynamics.diagnosis.inference.evidence import WeighedHypotheses
+from ctr_dynamics.diagnosis.diagnosis_options import DiagnosisOptions
+from ctr_dynamics.diagnosis.inference.discrepancy import Discrepancy
+from ctr_dynamics.diagnosis.inference.evidence import WeighedHypotheses, WithDiscrepancy
 from ctr_dynamics.diagnosis.inference.fit_problem import Problem
 from ctr_dynamics.diagnosis.inference.fit_quality import is_wrong
 from ctr_dynamics.diagnosis.inference.hypotheses import Hypothesis
@@ -20,8 +22,9 @@ from ctr_dynamics.diagnosis.verdict.residual_tests import Whiteness
 from ctr_dynamics.diagnosis.verdict.separability import Cause, cause_with_rivals
 from ctr_dynamics.diagnosis.verdict.unexplained_force import UnexplainedForce, unexplained_force
 from ctr_dynamics.diagnosis.verdict.validation import Validation
+from ctr_dynamics.diagnosis.whitening import noise_floor
 
-CauseSets = list[tuple[tuple[str, ...], float]]
+CauseSets = list[tuple[tuple[str, ...], float | None]]
 
 
 @dataclass
@@ -29,10 +32,11 @@ class Verdict:
     """Outcome of a diagnosis.
 
     Attributes:
-        word: `clean`, `named`, `ambiguous`, `unknown` or `not_excited`.
+        word: `clean`, `named`, `named_with_remainder`, `ambiguous`, `unknown` or `not_excited`.
         cause_sets: sets of effects with their probabilities, likeliest first.
         sensitivities: at the likeliest hypothesis, where causes are named.
         unexplained_force: description of what no cause explains.
+        discrepancy: what remains and is more than noise.
     """
 
     word: str
@@ -41,6 +45,7 @@ class Verdict:
     notes: list[str] = field(default_factory=list)
     sensitivities: Sensitivities | None = None
     unexplained_force: UnexplainedForce | None = None
+    discrepancy: Discrepancy | None = None
 
 
 @dataclass(frozen=True)
@@ -50,11 +55,15 @@ class Evidence:
     Attributes:
         whiteness: of what the best hypothesis leaves. validation: None without bags for it.
         excited: whether the bags excite the robot.
+        weighed: probabilities with a discrepancy; None where the residual is noise.
+        numerics: discretisation error in m by name, NaN where it could not be measured.
     """
 
     whiteness: Whiteness
     validation: Validation | None
     excited: bool
+    weighed: WithDiscrepancy | None = None
+    numerics: Mapping[str, float] = field(default_factory=dict)
 
 
 def needed_hypothesis(hypotheses: Sequence[Hypothesis], needed_gain: float) -> Hypothesis:
@@ -71,31 +80,60 @@ def needed_hypothesis(hypotheses: Sequence[Hypothesis], needed_gain: float) -> H
     return min(fewer, key=lambda e: (len(e.members), -e.score))
 
 
-def decide(
-    problem: Problem, found: WeighedHypotheses, best: Hypothesis, evidence: Evidence, context: RunContext
-) -> Verdict:
-    """Verdict with ``best`` as the hypothesis that is needed."""
+def is_unexplained(problem: Problem, found: WeighedHypotheses, best: Hypothesis, evidence: Evidence) -> bool:
+    """Whether ``best`` leaves what is neither noise, nor small and without effect on the bags that were not fitted."""
     o = problem.options
     is_noise = evidence.whiteness.p >= o.residual_tests.noise_p
     predicted = evidence.validation is not None and evidence.validation.confirms(o.validation)
     too_much = _fraction_left(problem, found, best) > (
         o.search.left if best.resolved else o.search.left_impacts
     )
-    if not is_noise and (not best.members or is_wrong(problem, best) or (too_much and not predicted)):
-        return _unknown(problem, found, best)
-    result = Verdict("clean", cause_sets=found.cause_sets(o))
-    if best.members:
-        context.report("separability")
-        forms = [s.candidate for s in one_form_each(found.screened)]
-        known = found.at_best if best is found.best else None
-        result.sensitivities = known or sensitivities_at(
-            problem, best.fit.point, forms, context, again=best.fit
+    return not is_noise and (not best.members or is_wrong(problem, best) or (too_much and not predicted))
+
+
+def decide(
+    problem: Problem, found: WeighedHypotheses, best: Hypothesis, evidence: Evidence, context: RunContext
+) -> Verdict:
+    """Verdict with ``best`` as the hypothesis that is needed."""
+    if is_unexplained(problem, found, best, evidence):
+        result = _with_remainder(problem, found, best, evidence, context)
+    else:
+        result = _without_remainder(problem, found, best, evidence, context)
+    unmeasured = [name for name, error in evidence.numerics.items() if not math.isfinite(error)]
+    if unmeasured and result.word in ("clean", "named", "named_with_remainder"):
+        result.word, result.causes = "unknown", [Cause(None, "unknown", None)]
+        result.notes.append(
+            f"{' and '.join(unmeasured)} could not be measured: finer simulations fail, and the error of the model may be the cause"
         )
-        there = result.sensitivities or found.sensitivities
-        result.causes = [cause_with_rivals(problem, found, best, c, there) for c in best.members]
+    return result
+
+
+def _separate(
+    result: Verdict, problem: Problem, found: WeighedHypotheses, best: Hypothesis, context: RunContext
+) -> None:
+    """Causes of ``best`` with their separations and rivals into ``result``."""
+    context.report("separability")
+    forms = [s.candidate for s in one_form_each(found.screened)]
+    known = found.at_best if best is found.best else None
+    result.sensitivities = known or sensitivities_at(problem, best.fit.point, forms, context, again=best.fit)
+    there = result.sensitivities or found.sensitivities
+    result.causes = [cause_with_rivals(problem, found, best, c, there) for c in best.members]
+
+
+def _without_remainder(
+    problem: Problem, found: WeighedHypotheses, best: Hypothesis, evidence: Evidence, context: RunContext
+) -> Verdict:
+    """What ``best`` leaves is noise, or so small that it changes nothing."""
+    o = problem.options
+    is_noise = evidence.whiteness.p >= o.residual_tests.noise_p
+    predicted = evidence.validation is not None and evidence.validation.confirms(o.validation)
+    sets = found.cause_sets(o)
+    result = Verdict("clean", cause_sets=list(sets))
+    if best.members:
+        _separate(result, problem, found, best, context)
     apart = all(cause.is_apart(o.verdict) for cause in result.causes)
     # who names more names these too
-    probability = sum(p for effects, p in result.cause_sets if set(best.effects) <= set(effects))
+    probability = sum(p for effects, p in sets if set(best.effects) <= set(effects))
     sure = probability >= o.verdict.named
     if not evidence.excited and not (best.members and apart and sure):
         result.word, result.causes = "not_excited", []
@@ -123,7 +161,8 @@ def _name(
             else "what is left is of the size of the model's own error in time"
         )
         if not complete and best.resolved:
-            result.causes.append(Cause(None, "unknown", o.verdict.unknown_beside))
+            probability = evidence.weighed.discrepancy if evidence.weighed is not None else None
+            result.causes.append(Cause(None, "unknown", probability))
 
 
 def _fraction_left(problem: Problem, found: WeighedHypotheses, best: Hypothesis) -> float:
@@ -133,18 +172,63 @@ def _fraction_left(problem: Problem, found: WeighedHypotheses, best: Hypothesis)
     return (best.fit.chi2 - dof) / beyond if beyond > 3.0 * math.sqrt(2.0 * dof) else 0.0
 
 
-def _unknown(problem: Problem, found: WeighedHypotheses, best: Hypothesis) -> Verdict:
+def _with_remainder(
+    problem: Problem, found: WeighedHypotheses, best: Hypothesis, evidence: Evidence, context: RunContext
+) -> Verdict:
+    """More than noise is left: is it small, stands it beside causes that are sure all the same, or is the cause outside the catalogue."""
+    o, weighed, validation = problem.options, evidence.weighed, evidence.validation
+    remainder = best.discrepancy
+    if weighed is None or remainder is None:
+        return _unknown(problem, found, weighed)
+    if not best.members:
+        small = remainder.rms_m < noise_floor(problem.robot)
+        if small and validation is not None and validation.nis_before <= o.validation.predicted:
+            text = (
+                f"{1e3 * remainder.rms_m:.2f} mm rms are left that are not noise: less than the tracker's noise, and the bags that "
+                "were not fitted are predicted down to the noise"
+            )
+            return Verdict("clean", cause_sets=_sets(weighed, o), notes=[text], discrepancy=remainder)
+        return _unknown(problem, found, weighed)
+    explained = 1.0 - _fraction_left(problem, found, best)
+    sure = weighed.of(best.effects) >= o.verdict.named and explained >= o.discrepancy.dominant
+    worse = validation is not None and validation.interval[1] < 0.0
+    if not sure or worse:
+        return _unknown(problem, found, weighed)
+    result = Verdict("named_with_remainder", cause_sets=_sets(weighed, o), discrepancy=remainder)
+    _separate(result, problem, found, best, context)
+    left = math.sqrt(max(1.0, best.fit.chi2 / problem.size))
+    for cause in result.causes:
+        cause.probability = weighed.of((cause.effect,))
+        if cause.separation is not None:  # noise is not what limits it
+            cause.separation /= left
+    if not all(cause.is_apart(o.verdict) for cause in result.causes):
+        return _unknown(problem, found, weighed)
+    return result
+
+
+def _sets(weighed: WithDiscrepancy, options: DiagnosisOptions) -> CauseSets:
+    """Sets of causes, `unknown` among them where there is a discrepancy, as few as hold the probability of the options."""
+    every = [*weighed.alone, *(((*effects, "unknown"), p) for effects, p in weighed.beside)]
+    out: CauseSets = []
+    held = 0.0
+    for effects, p in sorted(every, key=lambda item: -item[1]):
+        out.append((effects, p))
+        held += p
+        if held >= options.evidence.set_probability:
+            break
+    return out
+
+
+def _unknown(problem: Problem, found: WeighedHypotheses, weighed: WithDiscrepancy | None) -> Verdict:
     """No cause of the catalogue explains what is left; it is described as a force at the tip."""
-    o = problem.options.verdict
     force = unexplained_force(
         problem.forward_models[0], found.no_cause.fit.point, problem.options.unexplained_force
     )
-    sets = found.cause_sets(problem.options)
-    rest = [(s, o.beside_unknown * p) for s, p in sets[:2] if s] if best.members else []
     return Verdict(
         "unknown",
-        [Cause(None, "unknown", o.unknown)],
-        [(("unknown",), o.unknown), *rest],
+        [Cause(None, "unknown", None if weighed is None else weighed.discrepancy)],
+        [(("unknown",), None)] if weighed is None else _sets(weighed, problem.options),
         [force.text] if force is not None else [],
         unexplained_force=force,
+        discrepancy=found.no_cause.discrepancy,
     )

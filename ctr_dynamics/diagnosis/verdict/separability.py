@@ -22,6 +22,7 @@ class Cause:
     """One cause of a verdict.
 
     Attributes:
+        probability: None where none can be given.
         candidate: None for a configuration mistake and for a cause outside the catalogue.
         separation: from the nearest rival, in whitened units; None where there is no candidate.
         rivals: effects that cannot be told from it, nearest first.
@@ -29,7 +30,7 @@ class Cause:
 
     candidate: Candidate | None
     effect: str
-    probability: float
+    probability: float | None
     separation: float | None = None
     rivals: list[str] = field(default_factory=list)
 
