@@ -76,7 +76,7 @@ class Diagnosis:
     discrepancy: Discrepancy | None = None
 
     @property
-    def share_of_misfit(self) -> float | None:
+    def fraction_of_misfit(self) -> float | None:
         """Fraction of the re-calibrated model's squared misfit beyond noise that is the discrepancy; None without one."""
         if self.discrepancy is None or self.recalibrated is None:
             return None

@@ -148,13 +148,13 @@ def weigh_discrepancy(found: WeighedHypotheses, problem: Problem, context: RunCo
     ask(others, list(dict.fromkeys(near)))
     asked = [*first, *others]
     priors = np.array([log_prior(e.members, found.pool, o.prior) for e in asked])
-    share, temperature = o.prior.discrepancy, o.evidence.temperature
+    outside, temperature = o.prior.discrepancy, o.evidence.temperature
     plain = np.array([e.fitted_score for e in asked]) - priors
     more = np.array([0.0 if e.discrepancy is None else e.discrepancy.log_bayes for e in asked])
     scores = np.concatenate(
         [
-            plain / temperature + priors + np.log(1.0 - share),
-            (plain + more) / temperature + priors + np.log(share),
+            plain / temperature + priors + np.log(1.0 - outside),
+            (plain + more) / temperature + priors + np.log(outside),
         ]
     )
     weights = np.exp(scores - scores.max())

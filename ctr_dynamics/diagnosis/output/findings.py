@@ -97,7 +97,7 @@ def findings(diagnosis: Diagnosis, command: str, experiment: dict[str, Any] | No
             else {
                 "rms_m": d.discrepancy.rms_m,
                 "correlation_time_s": d.discrepancy.correlation_time_s,
-                "share_of_misfit": d.share_of_misfit,
+                "share_of_misfit": d.fraction_of_misfit,
             },
             "validation": None
             if v is None

@@ -71,13 +71,13 @@ def summary(content: dict[str, Any]) -> list[str]:
         )
     left = content["discrepancy"]
     if left is not None:
-        share = (
+        fraction = (
             ""
             if left["share_of_misfit"] is None
             else f", {100 * left['share_of_misfit']:.0f} % of the squared misfit"
         )
         lines.append(
-            f"What remains is not noise: {_mm(left['rms_m'])} rms, correlated over {left['correlation_time_s']:.2g} s{share}."
+            f"What remains is not noise: {_mm(left['rms_m'])} rms, correlated over {left['correlation_time_s']:.2g} s{fraction}."
         )
     v = content["validation"]
     if v is not None:
