@@ -197,10 +197,10 @@ class Live:
 
 @pytest.fixture
 def start(tmp_path):
-    """Makes a `Live` with parameters of the node."""
+    """Makes a `Live` with parameters of the node. Outputs may be old: a busy machine holds up what is tested here."""
 
     def make(parameters: dict | None = None, **options) -> Live:
-        return Live(tmp_path, parameters or {}, **options)
+        return Live(tmp_path, {"output.max_age_s": 30.0, **(parameters or {})}, **options)
 
     return make
 
