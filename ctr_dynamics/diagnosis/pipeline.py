@@ -139,7 +139,7 @@ def diagnose_recordings(
     evidence = Evidence(result.whiteness_extended, result.validation, seen.excited, weighed, result.numerics)
     verdict = decide(problem, found, best, evidence, context)
     _take(result, verdict)
-    if verdict.discrepancy is not None and best.members:
+    if verdict.word == "named_with_remainder" and verdict.discrepancy is not None:
         # intervals with the remainder as a correlated process instead of larger noise
         result.extended = replace(
             best.fit, covariance=verdict.discrepancy.covariance, chi2=min(best.fit.chi2, float(problem.size))
