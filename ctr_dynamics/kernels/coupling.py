@@ -107,10 +107,24 @@ def _mix(context, builder, signature, args):
     return total
 
 
+TORSION, BENDING, DRIVE, GROUPS = (
+    0,
+    1,
+    2,
+    3,
+)  # groups of inverses in the table, of one matrix a tube each, behind C
+
+
+@njit(nogil=True)
+def _number(n, group, tube):
+    """Number of the matrix of ``tube`` in ``group``."""
+    return 1 + group * n + tube
+
+
 def table_size(n: int, width: int) -> int:
     """Numbers in the table of a coupling for ``n`` tubes: C, and the inverses: those with torsion of every tube, with bending of the first one, two
     .. tubes together, and with every drive."""
-    return (1 + 3 * n) * STAGES * width
+    return _number(n, GROUPS, 0) * STAGES * width
 
 
 @njit(nogil=True)
@@ -155,12 +169,12 @@ def fill_coupling(kind, C, parameters, table, width, first):
     stiffness, damping = 0.0, 0.0
     for i in range(n):
         give, loss = parameters[rows.torsional_stiffness + i], parameters[rows.torsion_damping + i]
-        _set_inverse(table, 1 + i, width, first, C, give, loss, work)
+        _set_inverse(table, _number(n, TORSION, i), width, first, C, give, loss, work)
         stiffness += parameters[rows.bending_stiffness + i]
         damping += parameters[rows.bending_damping + i]
-        _set_inverse(table, 1 + n + i, width, first, C, stiffness, damping, work)
+        _set_inverse(table, _number(n, BENDING, i), width, first, C, stiffness, damping, work)
         inertia = parameters[rows.drive_compliance + i] * parameters[rows.drive_inertia + i]
         if inertia > 0.0:
-            _set(table, 1 + 2 * n + i, width, first, np.linalg.inv(np.eye(STAGES) + (C @ C) * inertia))
+            _set(table, _number(n, DRIVE, i), width, first, np.linalg.inv(np.eye(STAGES) + (C @ C) * inertia))
         else:
-            _set_inverse(table, 1 + 2 * n + i, width, first, C, 1.0, 0.0, work)
+            _set_inverse(table, _number(n, DRIVE, i), width, first, C, 1.0, 0.0, work)

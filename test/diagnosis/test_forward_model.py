@@ -51,7 +51,7 @@ def test_columns_together_are_those_apart(recording, robot, known, monkeypatch):
         return np.abs((together[:, :, 0] - alone) / np.abs(alone).max(axis=0)).max(), together
 
     difference, together = apart()
-    assert difference < 1e-3  # rounding: changes are as small as strong friction needs
+    assert difference < 2e-3  # rounding: changes are as small as strong friction needs
     with monkeypatch.context() as patch:
         patch.setattr(trajectory, "EPSILON", 1e-6)
         for model in forward_model.models.values():

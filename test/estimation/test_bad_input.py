@@ -258,7 +258,8 @@ def test_joints_that_are_wrong_for_a_while_beside_a_tracker_that_is_not(bag, tur
         np.sqrt(np.mean(np.sum(error**2, axis=1))) < 6e-3
     )  # m; 7 and 28 mm where measurements were shut out
     health = run.estimator.health
-    assert health.dropped <= health.restarts  # a new start knows no tip of the moment before
+    # a new start knows no tip of the time before: at 40 Hz, 12 poses lie in the 0.3 s that a latency may reach back
+    assert health.dropped <= 12 * health.restarts
 
 
 def test_joints_that_stay_out_of_range():

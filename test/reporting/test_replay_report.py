@@ -111,7 +111,7 @@ def test_report_of_a_bag_with_faults_says_them(tmp_path):
     assert cli.main(["replay", str(bag), "--report", str(out)]) in (0, 1)
     text = out.read_text()
     assert "Invalid from 1." in text
-    assert re.search(r"rejected, late, dropped</th><td>\d+, \d+, 1\d</td>", text)
+    assert re.search(r"rejected, late, dropped</th><td>\d+, \d+, [1-3]\d</td>", text)
 
 
 def test_report_must_not_be_the_bag(tmp_path, capsys):
