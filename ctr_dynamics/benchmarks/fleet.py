@@ -49,7 +49,6 @@ def scenario_for(robot: Robot, seed: int) -> Scenario:
     model, rest = Model(robot), robot.rest
     beta, alpha = np.array(rest.beta.value), np.array(rest.alpha.value)
     gravity = np.array(robot.gravity.value)
-    exposed = robot.lengths[0] + beta[0]
     push = 1e-4 * model.scale[0] * gravity / max(float(np.linalg.norm(gravity)), 1e-9)
     statics = Statics(model)
     free, loaded = statics.solve(beta, alpha), statics.solve(beta, alpha, push)
@@ -70,7 +69,9 @@ def scenario_for(robot: Robot, seed: int) -> Scenario:
             Load(
                 end_s=CUT_S,
                 fall_s=0.01,
-                hung_mass_kg=float(DEFLECTION * exposed / (compliance * np.linalg.norm(gravity))),
+                hung_mass_kg=float(
+                    DEFLECTION * robot.exposed_length / (compliance * np.linalg.norm(gravity))
+                ),
             )
         ],
         solver=Solver(nodes=30),

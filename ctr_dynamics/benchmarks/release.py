@@ -178,5 +178,4 @@ def rms(differences: Floats) -> float:
 
 def tip_length() -> float:
     """Length of the robot beyond the plate in m."""
-    robot = release_robot()
-    return float(robot.lengths[0] + robot.rest.beta.value[0])
+    return release_robot().exposed_length

@@ -111,8 +111,7 @@ def resolved(scheme: Collocation, frequency_hz: Floats) -> NDArray[np.bool_]:
 def discretise(robot: Robot, least: int, accuracy_m: float) -> Discretisation:
     """Nodes for which the error of the mesh stays below ``accuracy_m``, at ``least`` so many."""
     scheme = collocation(DT)
-    coarse, reach = _modes_at(robot, COARSE)
-    fine, _ = _modes_at(robot, FINE)
+    coarse, fine = _modes_at(robot, COARSE), _modes_at(robot, FINE)
     model = Model(robot, nodes=COARSE)
     beta = np.array(robot.rest.beta.value)
     try:
@@ -127,7 +126,7 @@ def discretise(robot: Robot, least: int, accuracy_m: float) -> Discretisation:
         return Discretisation(least, None, None, ())
     count = min(len(coarse.frequency_hz), len(fine.frequency_hz))
     frequency, damping = fine.frequency_hz[:count], np.maximum(fine.damping[:count], 0.0)
-    amplitude = _amplitudes(fine, robot.n_tubes, reach)[:count]
+    amplitude = _amplitudes(fine, robot)[:count]
     followed = np.minimum(DURATION, 1.0 / np.maximum(damping * 2 * np.pi * frequency, 1e-12))
     kept = resolved(scheme, frequency)
     # of 4th order: the coarse mesh errs by 16/15 of what the two differ
@@ -145,25 +144,24 @@ def discretise(robot: Robot, least: int, accuracy_m: float) -> Discretisation:
     return Discretisation(nodes, at_coarse * (COARSE / nodes) ** 4, time_error, modes)
 
 
-def _modes_at(robot: Robot, nodes: int) -> tuple[ModalBasis | None, float]:
-    """Modes at rest on a mesh of ``nodes``, and the length (m) of tube 1 in front of the plate."""
+def _modes_at(robot: Robot, nodes: int) -> ModalBasis | None:
+    """Modes at rest on a mesh of ``nodes``; None where there is no equilibrium, or no mode."""
     model = Model(robot, nodes=nodes)
     beta, alpha = np.array(robot.rest.beta.value), np.array(robot.rest.alpha.value)
-    reach = float(robot.lengths[0] + beta[0])
     par = model.parameters.copy()
     par[model.layout["alpha"]], par[model.layout["beta"]] = alpha, beta
     try:
         rest = Statics(model).solve(beta, alpha)
     except InputError:
-        return None, reach
-    return (modal_basis(model, rest, par, beta, MODES) if rest.converged else None), reach
+        return None
+    return modal_basis(model, rest, par, beta, MODES) if rest.converged else None
 
 
-def _amplitudes(basis: ModalBasis, n: int, reach: float) -> Floats:
+def _amplitudes(basis: ModalBasis, robot: Robot) -> Floats:
     """(m, 3) m, how much of every mode the reference force on the tip excites along each axis of ``ctr_base``."""
-    m = len(basis.frequency_hz)
+    m, n = len(basis.frequency_hz), robot.n_tubes
     by_force = 2.0 * np.abs(basis.by_inputs[:m, 2 * n : 2 * n + 3])
-    return DEFLECTION * reach * by_force / max(float(by_force.sum(axis=0).max()), 1e-300)
+    return DEFLECTION * robot.exposed_length * by_force / max(float(by_force.sum(axis=0).max()), 1e-300)
 
 
 def _tip_error(amplitude: Floats, phase: Floats) -> float:

@@ -76,7 +76,7 @@ class Model:
         )
         self.extended = extended or self.plant.extended
         self.kind = RobotKind(n, Physics.EXTENDED if self.extended else Physics.PLAIN)
-        reach = float(robot.lengths[0] + robot.rest.beta.value[0])
+        reach = robot.exposed_length
         stiffness = robot.tubes[0].bending_stiffness
         force, moment = stiffness / reach**2, stiffness / reach
         self.scale = np.array([force] * 3 + [moment] * (2 + n))

@@ -193,6 +193,11 @@ class Robot(Block):
         return np.array([tube.length for tube in self.tubes])
 
     @property
+    def exposed_length(self) -> float:
+        """Length of tube 1 in front of the base plate, m, at rest; no tube reaches farther."""
+        return float(self.lengths[0] + self.rest.beta.value[0])
+
+    @property
     def source(self) -> str:
         """Shipped name or path the robot was loaded from; empty when built in memory."""
         return self._source

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ctr_dynamics.diagnosis.inference.discrepancy import CorrelatedNoise, discrepancy_of, exposed_length
+from ctr_dynamics.diagnosis.inference.discrepancy import CorrelatedNoise, discrepancy_of
 from ctr_dynamics.diagnosis.inference.fit_problem import make_problem
 from ctr_dynamics.diagnosis.inference.map_fit import fit
 
@@ -35,7 +35,7 @@ def _noise(problem, rng, size, time):
     whiten, t = problem.whiteners[0], problem.forward_models[0].recording.stamps
     root = np.linalg.cholesky(np.exp(-np.abs(t[:, None] - t) / time) + 1e-10 * np.eye(len(t)))
     values = size * root @ rng.normal(size=(len(t), 6))
-    values[:, 3:] *= 1.5 / exposed_length(problem.robot)
+    values[:, 3:] *= 1.5 / problem.robot.exposed_length
     return rng.normal(size=problem.size) + whiten(values)
 
 

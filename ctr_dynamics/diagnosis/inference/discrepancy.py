@@ -18,7 +18,6 @@ from scipy.special import log_ndtr, logsumexp
 from ctr_dynamics.diagnosis.inference.fit_problem import Problem
 from ctr_dynamics.diagnosis.inference.gaussian_posterior import posterior, variances, within_tolerance
 from ctr_dynamics.diagnosis.inference.map_fit import Fit
-from ctr_dynamics.robot import Robot
 
 Floats = NDArray[np.float64]
 
@@ -47,9 +46,8 @@ class CorrelatedNoise:
     """
 
     def __init__(self, problem: Problem, time: float) -> None:
-        turn = 1.5 / exposed_length(
-            problem.robot
-        )  # rad at the tip of a cantilever for each m of its deflection
+        # rad at the tip of a cantilever for each m of its deflection
+        turn = 1.5 / problem.robot.exposed_length
         self.time = time
         self._axes: list[tuple[Floats, Floats]] = []
         for forward_model, whiten in zip(problem.forward_models, problem.whiteners, strict=True):
@@ -69,13 +67,6 @@ class CorrelatedNoise:
             parts.append(vectors.T @ whitened[start : start + len(size)])
             start += len(size)
         return np.concatenate(parts)
-
-
-def exposed_length(robot: Robot) -> float:
-    """Length in m of the robot in front of the plate, as it stands at rest."""
-    return max(
-        tube.length + float(beta) for tube, beta in zip(robot.tubes, robot.rest.beta.value, strict=True)
-    )
 
 
 def discrepancy_of(problem: Problem, fit: Fit, processes: list[CorrelatedNoise]) -> Discrepancy:

@@ -91,8 +91,7 @@ def tip_compliance(robot: Robot) -> float:
 def force_range(robot: Robot, least: float, most: float) -> tuple[float, float]:
     """Deviations (N) between which that of the unknown tip force lies; those given as 0 come from the robot's compliance."""
     compliance = tip_compliance(robot)
-    exposed = float(robot.lengths[0] + robot.rest.beta.value[0])
-    most = most or max(MOST_MOVED * exposed / compliance, least)
+    most = most or max(MOST_MOVED * robot.exposed_length / compliance, least)
     return least or min(LEAST_MOVED * robot.tracker.noise.position.value / compliance, most), most
 
 

@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctr_dynamics.estimation.vibration_modes import modal_basis
-from ctr_dynamics.kernels.sections import section_lengths
 from ctr_dynamics.kernels.structures import PartialFractions
 from ctr_dynamics.model.model import Model
+from ctr_dynamics.model.segments import growth
 from ctr_dynamics.model.simulator import State
 from ctr_dynamics.model.statics import Equilibrium
 
@@ -86,18 +86,6 @@ def exposed(model: Model, state: State) -> float:
     return float(model.robot.lengths[0] + state.inputs.beta[0])
 
 
-def growth(model: Model, state: State) -> float:
-    """sqrt(s): perturbations grow along the robot like exp(growth sqrt(c0)), by E I w_ssss + c0^2 rho A w = 0 in every section."""
-    mesh, layout, par = state.mesh, model.layout, model.parameters
-    lengths = np.zeros(len(mesh.sec_cells))
-    section_lengths(mesh.bp_tube, mesh.bp_offset, state.inputs.beta, lengths)
-    total = 0.0
-    for length, present in zip(lengths, mesh.sec_tubes, strict=True):
-        mass = par[layout["mass_per_length"]][:present].sum()
-        total += length * (mass / par[layout["bending_stiffness"]][:present].sum()) ** 0.25
-    return float(total / math.sqrt(2.0))
-
-
 class Stride(NamedTuple):
     """Over how many steps at once columns are followed, and by which rational function."""
 
@@ -126,7 +114,9 @@ class ColumnStrides:
         )
         basis = modal_basis(model, rest, par, state.inputs.beta, count=MODES)
         frequency = np.zeros(0) if basis is None else basis.frequency_hz
-        return cls(frequency, exposed(model, state), growth(model, state), dt)
+        # at the rate 1/s, of whose root the growth is a multiple
+        by_root = float(growth(model, state.mesh, state.inputs.beta, 1.0).sum())
+        return cls(frequency, exposed(model, state), by_root, dt)
 
     def at(self, length: float) -> Stride:
         """For the exposed ``length`` (m). Frequencies go as its inverse square, as those of bending do."""
