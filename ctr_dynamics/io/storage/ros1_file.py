@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
 from itertools import groupby
 from pathlib import Path
 from typing import Any
@@ -12,26 +11,15 @@ from typing import Any
 from rosbags.rosbag1 import Reader, ReaderError
 
 from ctr_dynamics.errors import InputError
-from ctr_dynamics.io.storage.stored_file import HeldBytes, StoredTopic, TypedMessage, ros2_type
+from ctr_dynamics.io.storage.stored_file import HeldBytes, IndexedFile, StoredTopic, TypedMessage, ros2_type
 
 _ERRORS = (ReaderError, struct.error, ValueError, KeyError, TypeError, IndexError, OSError, RuntimeError, EOFError)  # fmt: skip
 
 
-@dataclass
-class Ros1File:
-    """A ROS 1 bag; see :class:`StoredFile`. ``read_path``: where its content lies, which is elsewhere where the file is compressed."""
+class Ros1File(IndexedFile):
+    """A ROS 1 bag; see :class:`StoredFile`."""
 
-    path: Path
-    size: int
-    read_path: Path
-    complete: bool = True
-    unchecked: bool = False  # the format has no checksums
-    library: str = "rosbag"
-    profile: str = "ros1"
-    metadata: dict[str, dict[str, str]] = field(default_factory=dict)
-    notes: list[str] = field(default_factory=list)
-    topics: list[StoredTopic] = field(default_factory=list)
-    span_ns: tuple[int, int] = (0, 0)
+    library, profile = "rosbag", "ros1"
 
     def messages(self, name_of: Callable[[str], str | None], held: HeldBytes) -> Iterator[TypedMessage]:
         """See :meth:`StoredFile.messages`."""
@@ -51,10 +39,7 @@ class Ros1File:
                         held.release(content)
                         yield TypedMessage(name, log_ns, content, ros2_type(connection.msgtype), "ros1")
         except _ERRORS as error:
-            self.complete = False
-            note = f"{self.path.name}: damaged, later messages are missing ({_short(error)})"
-            if note not in self.notes:
-                self.notes.append(note)
+            self.damaged(_short(error))
 
 
 def _short(error: Exception) -> str:

@@ -5,29 +5,17 @@ from __future__ import annotations
 import sqlite3
 from collections.abc import Callable, Iterator
 from contextlib import closing
-from dataclasses import dataclass, field
 from pathlib import Path
 from urllib.parse import quote
 
 from ctr_dynamics.errors import InputError
-from ctr_dynamics.io.storage.stored_file import HeldBytes, StoredTopic, TypedMessage, ros2_type
+from ctr_dynamics.io.storage.stored_file import HeldBytes, IndexedFile, StoredTopic, TypedMessage, ros2_type
 
 
-@dataclass
-class SqliteFile:
-    """An SQLite bag; see :class:`StoredFile`. ``read_path``: where its content lies, which is elsewhere where the file is compressed."""
+class SqliteFile(IndexedFile):
+    """An SQLite bag; see :class:`StoredFile`."""
 
-    path: Path
-    size: int
-    read_path: Path
-    complete: bool = True
-    unchecked: bool = False  # the format has no checksums
-    library: str = "rosbag2_storage_sqlite3"
-    profile: str = "ros2"
-    metadata: dict[str, dict[str, str]] = field(default_factory=dict)
-    notes: list[str] = field(default_factory=list)
-    topics: list[StoredTopic] = field(default_factory=list)
-    span_ns: tuple[int, int] = (0, 0)
+    library, profile = "rosbag2_storage_sqlite3", "ros2"
 
     def messages(self, name_of: Callable[[str], str | None], held: HeldBytes) -> Iterator[TypedMessage]:
         """See :meth:`StoredFile.messages`."""
@@ -53,10 +41,7 @@ class SqliteFile:
                         name, kind, encoding = topics[number]
                         yield TypedMessage(name, max(log_ns, 0), data, kind, encoding)
         except sqlite3.Error as error:
-            self.complete = False
-            note = f"{self.path.name}: damaged, later messages are missing ({error})"
-            if note not in self.notes:
-                self.notes.append(note)
+            self.damaged(str(error))
 
 
 def _connect(path: Path) -> sqlite3.Connection:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple, Protocol
 
@@ -92,6 +93,31 @@ class StoredFile(Protocol):
             held: counts what waits in memory.
         """
         ...
+
+
+@dataclass
+class IndexedFile:
+    """What the readers of formats that have an index of their own hold of a file; see :class:`StoredFile`. These formats have no checksums.
+
+    ``read_path``: where its content lies, which is elsewhere where the file is compressed.
+    """
+
+    path: Path
+    size: int
+    read_path: Path
+    complete: bool = True
+    unchecked: bool = False
+    metadata: dict[str, dict[str, str]] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
+    topics: list[StoredTopic] = field(default_factory=list)
+    span_ns: tuple[int, int] = (0, 0)
+
+    def damaged(self, reason: str) -> None:
+        """Note that messages are missing from here on, once."""
+        self.complete = False
+        note = f"{self.path.name}: damaged, later messages are missing ({reason})"
+        if note not in self.notes:
+            self.notes.append(note)
 
 
 def ros2_type(name: str) -> str:
