@@ -7,9 +7,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from ctr_dynamics.errors import InputError
+from ctr_dynamics.io.text_files import decode_text, read_bytes
+from ctr_dynamics.io.yaml_files import read_yaml
 
 METADATA = "metadata.yaml"
 _MAX_METADATA_BYTES = 16 * 2**20
@@ -112,14 +112,12 @@ def _parts(present: list[Path]) -> list[Path]:
 def _read_metadata(path: Path, notes: list[str]) -> dict[str, Any] | None:
     """The rosbag2 information, or None with a note when the file is unusable."""
     try:
-        if path.stat().st_size > _MAX_METADATA_BYTES:
-            raise ValueError(f"larger than {_MAX_METADATA_BYTES} bytes")
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+        content = read_yaml(decode_text(read_bytes(path, _MAX_METADATA_BYTES), path.name), path.name)
         information = content["rosbag2_bagfile_information"]
         if not isinstance(information, dict):
             raise ValueError("not a rosbag2 description")
         return information
-    except (OSError, ValueError, KeyError, TypeError, RecursionError, yaml.YAMLError) as error:
+    except (ValueError, KeyError, TypeError) as error:
         reason = " ".join(str(error).split())[:120]
         notes.append(
             f"{path.name} is not usable ({type(error).__name__}: {reason}); the files beside it are read without it"

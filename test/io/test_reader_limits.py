@@ -72,3 +72,13 @@ def test_a_file_without_checksums_is_said(tmp_path):
         )
         assert bag.unchecked == expected
         assert [p.text for p in inspect(path).problems if "checksums" in p.text] == expected
+
+
+def test_a_description_of_a_bag_that_multiplies_itself_is_noted_and_left_out(tmp_path):
+    write(tmp_path / "a.mcap", [(k, bytes(40)) for k in range(3)])
+    merges = ["a: &a0 {x: 1}"]
+    merges += [f"k{i}: &a{i} {{<<: [{','.join(10 * [f'*a{i - 1}'])}]}}" for i in range(1, 10)]
+    (tmp_path / "metadata.yaml").write_text("\n".join(merges))
+    bag = open_bag(tmp_path)
+    assert len(list(bag.messages())) == 3
+    assert any("metadata.yaml is not usable" in note and "aliases and merges" in note for note in bag.notes)
