@@ -20,11 +20,12 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from ctr_dynamics.estimation.estimator import Estimator
+from ctr_dynamics.estimation.monitoring.statuses import all_statuses
 from ctr_dynamics.io.bag_reader import InputMessage, open_bag
 from ctr_dynamics.io.bag_writer import write_bag
 from ctr_dynamics.io.messages import topics
 from ctr_dynamics.io.messages.cdr import JointStateIn, PoseIn, WrenchIn
-from ctr_dynamics.io.messages.encode import encode_joint_state, encode_pose_stamped, encode_wrench_stamped
+from ctr_dynamics.io.messages.encode import encode_input
 from ctr_dynamics.io.messages.topics import STEP_NS
 from ctr_dynamics.io.shipped_bags import shipped_bag
 from ctr_dynamics.parameters import Settings
@@ -69,18 +70,6 @@ def endless(bag: Path) -> Iterator[InputMessage]:
         moved += period
 
 
-def serialised(item: InputMessage) -> bytes:
-    """The message of an input topic as it goes over the wire."""
-    message = item.message
-    if isinstance(message, JointStateIn):
-        return encode_joint_state(message.stamp_ns, message.names, message.positions)
-    if isinstance(message, PoseIn):
-        return encode_pose_stamped(
-            message.stamp_ns, message.frame_id, message.position, message.quaternion_xyzw
-        )
-    return encode_wrench_stamped(message.stamp_ns, message.frame_id, message.force, message.torque)
-
-
 def resident_mb(process: int | str = "self") -> float:
     """Resident memory of a process in MB (Linux)."""
     pages = int(Path(f"/proc/{process}/statm").read_text(encoding="utf-8").split()[1])
@@ -110,7 +99,7 @@ def replayed(bag: Path, robot_name: str, minutes: int) -> list[float]:
         for out in estimator.advance(message.stamp_ns):
             steps += 1
             invalid += not out.valid
-            for _ in encoder.encode(out, estimator.health.statuses):
+            for _ in encoder.encode(out, all_statuses(estimator.health)):
                 pass
         if message.stamp_ns >= end_ns:
             memory.append(resident_mb())
@@ -146,7 +135,7 @@ def live(bag: Path, robot_name: str, minutes: int) -> list[float]:
                 end_ns = item.log_ns + minutes * MINUTE_NS if end_ns is None else end_ns
                 if item.log_ns > end_ns:
                     break
-                writer.write(item.topic, item.log_ns, serialised(item))
+                writer.write(item.topic, item.log_ns, encode_input(item.message))
         report = live_punctuality.run(long, {"robot": robot_name}, 60.0 * minutes, listen=False, watch=watch)
     print(f"\n{json.dumps(report)}")
     return memory
