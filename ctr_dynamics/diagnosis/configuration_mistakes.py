@@ -118,7 +118,7 @@ MISTAKES: dict[str, Callable[[Recording, Robot], Pair]] = {
 def misfit(recording: Recording, robot: Robot, resolution: ForwardModelOptions) -> float:
     """3-D rms in m of the measurement against the nominal model, infinity where it fails.
 
-    Rotations count by the ratio of the noise of positions to theirs.
+    Measured rotations count by the ratio of the noise of positions to theirs.
     """
     try:
         forward_model = ForwardModel(recording, robot, resolution)
@@ -129,7 +129,7 @@ def misfit(recording: Recording, robot: Robot, resolution: ForwardModelOptions) 
         return math.inf
     residual = forward_model.residual(prediction)
     noise = robot.tracker.noise
-    rotation = residual[:, 3:] * (noise.position.value / max(noise.rotation.value, 1e-6))
+    rotation = residual[:, 3:] * recording.axes[3:] * (noise.position.value / max(noise.rotation.value, 1e-6))
     squares = np.sum(residual[:, :3] ** 2, axis=1) + np.sum(rotation**2, axis=1)
     return math.sqrt(float(np.nanmean(squares)))
 

@@ -24,6 +24,7 @@ from ctr_dynamics.model.time_scheme import make_scheme
 from ctr_dynamics.model.trajectory import InputRows, Trajectory, run
 from ctr_dynamics.robot import Robot
 from ctr_dynamics.sensing.interpolation import Signal
+from ctr_dynamics.sensing.tracker import free_axis, pose_differences
 
 Floats = NDArray[np.float64]
 Key = tuple[str, str]
@@ -65,6 +66,7 @@ class ForwardModel:
         self.scheme = make_scheme("sdirk3", dt)
         self.models = {False: Model(robot, nodes=nodes), True: Model(robot, nodes=nodes, extended=True)}
         self.nominal = make_plant(robot)
+        self._free = free_axis(np.array(recording.axes))
         load = Signal(6)
         for time, *wrench in recording.load.tolist():
             load.add(round(time * 1e9), np.array(wrench))
@@ -156,14 +158,11 @@ class ForwardModel:
         )
 
     def residual(self, prediction: Prediction) -> Floats:
-        """(s, 6) measurement minus prediction: position in m in the tracker's axes, rotation vector in rad in the sensor's axes."""
-        return np.hstack(
-            [
-                self.recording.position - prediction.position,
-                to_vector_rows(
-                    multiply_rows(conjugate_rows(prediction.quaternion), self.recording.quaternion)
-                ),
-            ]
+        """(s, 6) measurement minus prediction: position in m in the tracker's axes, rotation vector in rad in the sensor's axes, without the turn
+        about the one axis that is not measured."""
+        measured = self.recording
+        return pose_differences(
+            measured.position, measured.quaternion, prediction.position, prediction.quaternion, self._free
         )
 
     def residual_at(self, point: Point) -> Floats | None:

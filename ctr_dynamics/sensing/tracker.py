@@ -26,6 +26,7 @@ from ctr_dynamics.kernels.rotations import (
     multiply,
     multiply_rows,
     rotate_rows,
+    to_vector_rows,
 )
 from ctr_dynamics.kernels.tracker_measurement import innovation_rows, pose_in_base, registered_pose
 from ctr_dynamics.robot import Robot
@@ -51,6 +52,29 @@ DRIFT, SHIFT = slice(10, 13), slice(13, 16)
 # Gauss and Legendre's rule of five points on [0, 1]: the mean over the averaging window
 AVERAGE_POINTS = np.array([0.04691008, 0.23076534, 0.5, 0.76923466, 0.95308992])
 AVERAGE_WEIGHTS = np.array([0.11846344, 0.23931434, 0.28444444, 0.23931434, 0.11846344])
+
+
+def free_axis(mask: NDArray[np.bool_]) -> int:
+    """1 to 3: the one rotation axis that the ``mask`` (6,) of measured axes leaves out; 0 where it leaves out none or several."""
+    return 1 + int(np.argmin(mask[3:])) if np.sum(mask[3:]) == 2 else 0
+
+
+def pose_differences(
+    position: Floats, quaternion: Floats, expected_position: Floats, expected_quaternion: Floats, free: int
+) -> Floats:
+    """(s, 6) measured poses minus expected ones: positions (s, 3) m, then rotation vectors in the sensor's axes of the quaternions (s, 4) wxyz.
+
+    The turn about the axis ``free`` (:func:`free_axis`) is taken off first, as for one measurement (:meth:`TrackerModel.innovation`).
+    """
+    error = multiply_rows(conjugate_rows(expected_quaternion), quaternion)
+    if free:
+        twist = np.zeros_like(error)
+        twist[:, 0], twist[:, free] = error[:, 0], error[:, free]
+        size = np.linalg.norm(twist, axis=1, keepdims=True)
+        whole = size[:, 0] < 1e-6  # half a turn about another axis: no turn about this one is defined
+        twist[whole], size[whole] = [1.0, 0.0, 0.0, 0.0], 1.0
+        error = multiply_rows(error, conjugate_rows(twist / size))
+    return np.hstack([position - expected_position, to_vector_rows(error)])
 
 
 class TrackerCorrection(Protocol):
@@ -163,7 +187,7 @@ class TrackerModel:
     @cached_property
     def free(self) -> int:
         """1 to 3: the one rotation axis of the sensor that is not measured; 0 where none or several are not."""
-        return 1 + int(np.argmin(self.mask[3:])) if self.mask[3:].sum() == 2 else 0
+        return free_axis(self.mask)
 
     # -- time --
 

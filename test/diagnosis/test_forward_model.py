@@ -1,10 +1,13 @@
 """Predictions and derivatives of one second of a motion: interpolation, columns, smoothness."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from ctr_dynamics.diagnosis.diagnosis_options import DiagnosisOptions
 from ctr_dynamics.diagnosis.forward_model import ForwardModel, at_times, smooth
 from ctr_dynamics.diagnosis.recording import Recording
+from ctr_dynamics.kernels.rotations import from_vector, multiply_rows
 from ctr_dynamics.model import trajectory
 
 OPTIONS = DiagnosisOptions()
@@ -90,3 +93,14 @@ def test_the_misfit_is_a_smooth_function_of_delays(robot, known):
     base, moved = seen(0.0, 0.004), seen(0.0, 0.0)
     shifts = [seen(d, 0.004 - d) for d in (0.0003, 0.0007, 0.0013, 0.0019, 0.0026, 0.004)]
     assert max(np.abs(shift - base).max() for shift in shifts) < 0.02 * np.abs(moved - base).max()
+
+
+def test_the_roll_of_a_sensor_with_five_degrees_of_freedom_is_no_misfit(recording, robot):
+    """It is whatever the tracker makes of it, and turns with time here."""
+    seen = ForwardModel(recording, robot).predict({})
+    roll = np.outer(1.0 + recording.stamps, [0.0, 0.0, 1.0])
+    rolled = multiply_rows(seen.quaternion, np.stack([from_vector(r) for r in roll]))
+    blind = replace(recording, position=seen.position, quaternion=rolled, axes=(True,) * 5 + (False,))
+    np.testing.assert_allclose(ForwardModel(blind, robot).residual(seen), 0.0, atol=1e-9)
+    whole = ForwardModel(replace(blind, axes=(True,) * 6), robot).residual(seen)
+    np.testing.assert_allclose(whole[:, 5], roll[:, 2], atol=1e-9)

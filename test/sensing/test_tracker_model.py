@@ -13,10 +13,10 @@ from ctr_dynamics.kernels.rotations import (
     rotate_rows,
     to_vector_rows,
 )
-from ctr_dynamics.kernels.tracker_measurement import expected_measurement
+from ctr_dynamics.kernels.tracker_measurement import expected_measurement, pose_difference
 from ctr_dynamics.robot_files import load_robot
 from ctr_dynamics.sensing import Tip, TrackerModel
-from ctr_dynamics.sensing.tracker import STATE_NAMES, STATES
+from ctr_dynamics.sensing.tracker import STATE_NAMES, STATES, free_axis, pose_differences
 
 RNG = np.random.default_rng(4)
 STAMPS = np.linspace(0.1, 0.9, 17)
@@ -159,3 +159,34 @@ def test_rotations_of_arrays_are_those_of_one():
     np.testing.assert_allclose(
         rotate_rows(h, v), [matrix(q) @ x for q, x in zip(h, v, strict=True)], atol=1e-14
     )
+
+
+@pytest.mark.parametrize("free", [0, 1, 2, 3])
+def test_rows_of_differences_are_those_of_one_pose_and_forget_the_turn_that_is_not_measured(free):
+    mask = np.ones(6, dtype=bool)
+    if free:
+        mask[2 + free] = False
+    assert free_axis(mask) == free
+    expected, measured = RNG.normal(size=(2, 9, 3))
+    away, turns = 0.3 * RNG.normal(size=(9, 3)), np.zeros((9, 3))
+    if free:
+        away[:, free - 1] = 0.0
+        turns[:, free - 1] = RNG.uniform(-3.0, 3.0, 9)
+    there = np.stack([from_vector(r) for r in RNG.normal(size=(9, 3))])
+    swung = multiply_rows(there, np.stack([from_vector(r) for r in away]))
+    seen = multiply_rows(swung, np.stack([from_vector(r) for r in turns]))
+    found = pose_differences(measured, seen, expected, there, free)
+    np.testing.assert_allclose(found, np.hstack([measured - expected, away]), atol=1e-12)
+    for k in range(9):
+        one = pose_difference(measured[k], seen[k], expected[k], there[k], free)
+        np.testing.assert_allclose(found[k], one, atol=1e-12)
+
+
+def test_a_sensor_half_a_turn_away_has_a_finite_difference():
+    there, seen = np.array([[1.0, 0.0, 0.0, 0.0]]), np.array([[0.0, 1.0, 0.0, 0.0]])
+    found = pose_differences(np.zeros((1, 3)), seen, np.zeros((1, 3)), there, 3)
+    np.testing.assert_allclose(np.abs(found[0, 3:]), [np.pi, 0.0, 0.0], atol=1e-9)
+
+
+def test_two_rotation_axes_that_are_not_measured_leave_none_free():
+    assert free_axis(np.array([True, True, True, False, False, True])) == 0
