@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctr_dynamics.calibration.rigid_motion import mean_rotation, rigid_motion, shortest_turn
+from ctr_dynamics.calibration.tip_errors import TipErrors, tip_errors
 from ctr_dynamics.calibration.tip_fit import (
     DELAY,
     MOUNT,
@@ -61,19 +62,21 @@ class Alignment:
         file_delay: s, the robot file's part of it.
         rotation, rotation_sigma: (3,) rad, translation, translation_sigma: (3,) m: composed with the robot file's registration.
         mount, mount_sigma: (3,) rotation vector of the sensor in the tip frame.
-        error: (s, 3) m left. fit: all that was fitted.
+        file_delay_sigma: s, its tolerance.
+        errors: what is left. fit: all that was fitted.
     """
 
     lag: float
     lag_sigma: float
     file_delay: float
+    file_delay_sigma: float
     rotation: Floats
     rotation_sigma: Floats
     translation: Floats
     translation_sigma: Floats
     mount: Floats
     mount_sigma: Floats
-    error: Floats
+    errors: TipErrors
     fit: TipFit
 
     @property
@@ -101,6 +104,7 @@ def align(
     robot: Robot,
     samples: TipSamples,
     *,
+    file: Robot | None = None,
     mount: Floats | None = None,
     unknown_registration: bool = False,
     most_lag: float = MOST_LAG_S,
@@ -108,6 +112,7 @@ def align(
     """Time, registration and mount between the tracker and joints of ``samples``.
 
     Args:
+        robot: with the registration and delay to start from. file: what the result is told against, by default the same.
         mount: (4,) wxyz, the mount that the samples' orientations are already rid of.
         unknown_registration: whether the robot file says nothing of it; else its tolerance holds.
         most_lag: s, largest lag that is looked for, to both sides.
@@ -134,7 +139,7 @@ def align(
     if here.axes[3:].any():
         coordinates += mount_coordinates()
     found = fit_tips(model, coordinates, {DELAY: extra})
-    return _alignment(robot, start, model, found, mount)
+    return _alignment(file or robot, model, found, mount)
 
 
 def first_lag(
@@ -213,7 +218,7 @@ def registered(robot: Robot, rotation: Floats, translation: Floats) -> Robot:
     return robot.model_copy(update={"tracker": tracker.model_copy(update=changed)})
 
 
-def _alignment(robot: Robot, start: Robot, model: TipModel, found: TipFit, mount: Floats | None) -> Alignment:
+def _alignment(robot: Robot, model: TipModel, found: TipFit, mount: Floats | None) -> Alignment:
     """``found`` in the terms of parameters, which are composed with the file of ``robot``."""
     point, sigma = found.point, found.deviations()
     tracker = model.plant(point).tracker
@@ -233,12 +238,13 @@ def _alignment(robot: Robot, start: Robot, model: TipModel, found: TipFit, mount
         lag=tracker.delay,
         lag_sigma=sigma[DELAY],
         file_delay=own.delay.value,
+        file_delay_sigma=own.delay.tolerance,
         rotation=to_vector(extra),
         rotation_sigma=deviation("registration_rotation", ("rx_rad", "ry_rad", "rz_rad")),
         translation=shift,
         translation_sigma=deviation("registration_translation", ("tx_m", "ty_m", "tz_m")),
         mount=to_vector(total),
         mount_sigma=np.array([sigma.get(key, 0.0) for key in MOUNT]),
-        error=found.residual[:, :3],
+        errors=tip_errors(found.residual, model),
         fit=found,
     )

@@ -43,8 +43,8 @@ class StaticTips:
     A bag's samples are solved in the order of time, each from the one before: the robot stays on its branch.
     """
 
-    def __init__(self, robot: Robot, samples: TipSamples) -> None:
-        self.model = Model(robot, nodes=NODES)
+    def __init__(self, robot: Robot, samples: TipSamples, nodes: int = NODES) -> None:
+        self.model = Model(robot, nodes=nodes)
         self.samples = samples
         self._statics = Statics(self.model)
 

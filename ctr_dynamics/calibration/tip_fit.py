@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from ctr_dynamics.calibration.static_tips import StaticTips, Tips
+from ctr_dynamics.calibration.static_tips import NODES, StaticTips, Tips
 from ctr_dynamics.calibration.tip_samples import TipSamples
 from ctr_dynamics.effects import EffectQuantity, Plant, apply_effects, make_plant
 from ctr_dynamics.errors import InputError
@@ -110,10 +110,12 @@ class TipModel:
         mount: (4,) wxyz orientation of the sensor in the tip frame, beside the one that the bag was read with.
     """
 
-    def __init__(self, robot: Robot, samples: TipSamples, mount: Floats | None = None) -> None:
+    def __init__(
+        self, robot: Robot, samples: TipSamples, mount: Floats | None = None, nodes: int = NODES
+    ) -> None:
         self.robot, self.samples = robot, samples
         self.mount = np.array([1.0, 0.0, 0.0, 0.0]) if mount is None else mount
-        self._solver = StaticTips(robot, samples)
+        self._solver = StaticTips(robot, samples, nodes)
 
     def plant(self, point: Mapping[Key, float]) -> Plant:
         """The robot at ``point``."""

@@ -27,6 +27,8 @@ COMMANDS = {
     "replay": "Run a recorded bag through the estimator, without a ROS graph.",
     "diagnose": "Find what the simulation gets wrong about the recorded robot.",
     "simulate": "Write a bag of a simulated scenario.",
+    "align": "Find clock offset, latency, registration and mount between tracker and joints.",
+    "calibrate": "Fit a robot file to measured tips, judged on held-out ones.",
     "evaluate": "Compare a replay's outputs with the truth of a simulated robot.",
     "statics": "Solve the static model for a table of actuator positions.",
     "snap": "Snap-through by the finite-difference solver.",

@@ -23,14 +23,17 @@ from ctr_dynamics.model.statics import Statics
 Floats = NDArray[np.float64]
 
 FORCE = ("Fx", "Fy", "Fz")
+TIP, QUATERNION = ("tip_x", "tip_y", "tip_z"), ("qw", "qx", "qy", "qz")
 MAX_ANGLE = 20 * math.pi  # rad; ten turns, more are degrees
 MAX_FORCE = 100.0  # N
+QUATERNION_LIMIT = 0.05  # more is another order of columns, or no quaternion
 
 
 @dataclass(frozen=True)
 class Pose:
     """One row: ``problem`` says why it cannot be used, else beta (N,) m, alpha (N,) rad, force (3,) N and end
-    angles (N,) rad or None.
+    angles (N,) rad or None. ``tip_position`` (3,) m and ``tip_quaternion`` (4,) wxyz are measured; None where
+    the table has none.
     """
 
     line: int
@@ -39,6 +42,8 @@ class Pose:
     force: Floats
     end_angles: Floats | None
     problem: str = ""
+    tip_position: Floats | None = None
+    tip_quaternion: Floats | None = None
 
 
 @dataclass(frozen=True)
@@ -67,11 +72,14 @@ def _columns(n: int, name: str) -> list[str]:
     return [f"{name}{i + 1}" for i in range(n)]
 
 
-def _check_header(header: Sequence[str], n: int, where: str) -> list[str]:
+def _check_header(header: Sequence[str], n: int, where: str, measured: bool) -> list[str]:
     """Names of columns that are not read. Raises InputError for missing, doubled and misspelt ones."""
     needed = _columns(n, "beta") + _columns(n, "alpha")
-    groups = (list(FORCE), _columns(n, "psiL"))
-    known = [*needed, *groups[0], *groups[1]]
+    groups = [list(FORCE), _columns(n, "psiL")]
+    if measured:
+        needed += TIP
+        groups.append(list(QUATERNION))
+    known = [*needed, *(name for group in groups for name in group)]
     doubled = sorted({name for name in header if header.count(name) > 1})
     if doubled:
         raise InputError(f"column '{doubled[0]}' is there twice", do="keep one of them", where=where)
@@ -99,9 +107,9 @@ def _check_header(header: Sequence[str], n: int, where: str) -> list[str]:
     return spare
 
 
-def read_poses(path: Path, model: Model) -> tuple[list[Pose], list[str]]:
+def read_poses(path: Path, model: Model, measured: bool = False) -> tuple[list[Pose], list[str]]:
     """Poses of a CSV file with the columns beta1.., alpha1.. and optionally Fx, Fy, Fz and psiL1..; SI units
-    and radians.
+    and radians. ``measured``: tips are needed too, tip_x, tip_y, tip_z and optionally qw, qx, qy, qz.
 
     Returns:
         The rows, those that cannot be used with their ``problem``, and the names of columns that were not
@@ -129,16 +137,17 @@ def read_poses(path: Path, model: Model) -> tuple[list[Pose], list[str]]:
             "the file is empty", do="its first line names the columns beta1,..,alpha1,..", where=where
         )
     header = [cell.strip() for cell in lines[0][1]]
-    spare = _check_header(header, model.n, where)
+    spare = _check_header(header, model.n, where, measured)
     if len(lines) == 1:
         raise InputError("there is no row below the header", do="give one row for each pose", where=where)
-    return [_pose(model, header, line, cells) for line, cells in lines[1:]], spare
+    return [_pose(model, header, line, cells, measured) for line, cells in lines[1:]], spare
 
 
-def _pose(model: Model, header: list[str], line: int, cells: list[str]) -> Pose:
+def _pose(model: Model, header: list[str], line: int, cells: list[str], measured: bool) -> Pose:
     n = model.n
     names = _columns(n, "beta") + _columns(n, "alpha")
-    names += [name for name in (*FORCE, *_columns(n, "psiL")) if name in header]
+    tip = (*TIP, *QUATERNION) if measured else ()
+    names += [name for name in (*FORCE, *_columns(n, "psiL"), *tip) if name in header]
     values: dict[str, float] = {}
     problem = ""
     if len(cells) != len(header):
@@ -173,7 +182,14 @@ def _pose(model: Model, header: list[str], line: int, cells: list[str]) -> Pose:
         problem = (
             f"a force of {np.linalg.norm(force):g} N is beyond {MAX_FORCE:g} N; forces are in N, base frame"
         )
-    return Pose(line, beta, alpha, force, end_angles, problem)
+    position = group(TIP) if measured else None
+    quaternion = group(QUATERNION) if measured and QUATERNION[0] in values else None
+    if quaternion is not None:
+        size = float(np.linalg.norm(quaternion))
+        if not problem and abs(size - 1.0) > QUATERNION_LIMIT:
+            problem = f"the quaternion has norm {size:g}, 1 +- {QUATERNION_LIMIT:g} is needed"
+        quaternion = quaternion / max(size, 1e-12)
+    return Pose(line, beta, alpha, force, end_angles, problem, position, quaternion)
 
 
 def solve_poses(model: Model, poses: Sequence[Pose], tolerance: float = 1e-10) -> Iterator[StaticRow]:

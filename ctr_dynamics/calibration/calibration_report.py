@@ -1,0 +1,44 @@
+"""A calibration in words, and as a robot file with a head that says what it is worth."""
+
+from __future__ import annotations
+
+from ctr_dynamics.calibration.robot_calibration import Calibration
+from ctr_dynamics.robot_files import robot_to_yaml
+
+
+def lines(found: Calibration) -> list[str]:
+    """What was found: every value with its deviation before and after, and the errors on held-out tips."""
+    fit = found.fit
+    out = [f"{'':38}{'before':>11}{'+-':>9}{'after':>11}{'+-':>9}"]
+    for c, value, sigma in zip(fit.coordinates, fit.values, fit.sigma, strict=True):
+        name = " ".join(c.key)
+        out.append(f"{name:38}{c.off:11.5f}{c.prior:9.5f}{value:11.5f}{sigma:9.5f}")
+    out += [
+        f"fitted tips {found.fitted.count:5d}   after   {found.fitted.text()}",
+        f"held out    {found.before.count:5d}   before  {found.before.text()}",
+        f"held out    {found.after.count:5d}   after   {found.after.text()}",
+    ]
+    return [*out, *(f"{line}" for line in mount_lines(found))]
+
+
+def mount_lines(found: Calibration) -> list[str]:
+    """The option that goes with the new robot file where the mount was fitted."""
+    if found.mount is None:
+        return []
+    vector = ",".join(f"{v:.6f}" for v in found.mount)
+    return [f"use with    --set tracker.mount_rotation_rad={vector}"]
+
+
+def robot_text(found: Calibration, with_parameters: bool) -> str:
+    """Text of the new robot file. ``with_parameters``: whether parameters of the tracker have become part of it."""
+    head = [
+        "SI units and radians; tolerances are the standard deviations of the fit.",
+        f"Held-out tips before: {found.before.text()}",
+        f"Held-out tips after: {found.after.text()}",
+        *(line.replace("use with   ", "Use with") for line in mount_lines(found)),
+    ]
+    if with_parameters:
+        head.append(
+            "The given tracker.delay_s, lever_arm_m and registration parameters are part of this file: do not give them with it."
+        )
+    return "".join(f"# {line}\n" for line in head) + robot_to_yaml(found.robot)

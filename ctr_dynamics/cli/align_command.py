@@ -1,0 +1,74 @@
+"""`ctr-dynamics align`: the time between tracker and joints, registration and mount, as a parameter file."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from ctr_dynamics.cli.recording_options import (
+    BAG_HELP,
+    RecordingChoice,
+    settings_from,
+    with_recording_options,
+)
+from ctr_dynamics.io.atomic_files import atomic_file, check_targets
+from ctr_dynamics.io.inputs.input_mapping import parse_remap
+from ctr_dynamics.robot_files import load_robot
+
+
+@with_recording_options
+def align(
+    bag: Annotated[Path, typer.Argument(metavar="BAG", help=BAG_HELP)],
+    robot: Annotated[
+        str, typer.Option("--robot", metavar="NAME_OR_FILE", help="A shipped robot or a robot file.")
+    ],
+    output: Annotated[
+        Path, typer.Option("--output", metavar="FILE.yaml", help="Parameter file to write, for --params.")
+    ],
+    unknown_registration: Annotated[
+        bool,
+        typer.Option(
+            "--unknown-registration", help="The robot file says nothing of where the tracker stands."
+        ),
+    ] = False,
+    most_lag: Annotated[
+        float, typer.Option("--most-lag", min=0.1, max=60.0, metavar="S", help="Largest lag to look for.")
+    ] = 1.0,
+    *,
+    choice: RecordingChoice,
+) -> int:
+    """Find clock offset and latency between tracker and joints, registration and mount of the sensor.
+
+    The bag must show every actuator in slow motion. Deviations count what the robot file leaves open and what
+    the static model cannot say. The file holds the given parameters too, so it takes their place.
+    """
+    from ctr_dynamics.calibration import alignment
+    from ctr_dynamics.calibration.alignment_report import file_text, lines
+    from ctr_dynamics.calibration.reading import mount_of, read_tips
+    from ctr_dynamics.sensing.tracker_parameters import with_tracker_parameters
+
+    loaded = load_robot(robot)
+    check_targets({"output": output}, {"bag": bag, "robot file": robot})
+    settings = settings_from(choice.params, choice.assignments)
+    measured = read_tips(bag, loaded, settings, parse_remap(choice.remap))
+    for note in measured.notes:
+        print(f"ctr-dynamics: note: {note}", file=sys.stderr)
+    found = alignment.align(
+        with_tracker_parameters(loaded, settings),
+        measured.samples,
+        file=loaded,
+        mount=mount_of(settings),
+        unknown_registration=unknown_registration,
+        most_lag=most_lag,
+    )
+    print("\n".join(lines(found)))
+    text, warning = file_text(found, settings, f"ctr-dynamics align {bag.name} --robot {robot}")
+    with atomic_file(output) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+    if warning:
+        print(f"ctr-dynamics: warning: {warning}", file=sys.stderr)
+    print(f"output  {output}")
+    return 0
