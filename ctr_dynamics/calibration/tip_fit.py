@@ -275,7 +275,7 @@ class _Search:
         return TipFit(
             self.coordinates,
             self.values,
-            covariance * np.outer(self.prior, self.prior),
+            np.asarray(covariance * np.outer(self.prior, self.prior), dtype=float),
             self.residual,
             self.deviation,
             self.lasting,
@@ -294,4 +294,4 @@ def _lasting(residual: Floats) -> float:
         if rho <= 0.0:
             break
         total += 2.0 * rho
-    return min(total, max(count / 4.0, 1.0))
+    return min(total, max(count / 4.0, 1.0))  # an estimate from fewer than four independent parts is none
