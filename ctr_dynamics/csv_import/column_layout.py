@@ -20,6 +20,7 @@ MATRIX = ("m00", "m01", "m02", "m10", "m11", "m12", "m20", "m21", "m22")
 EULER = ("roll", "pitch", "yaw")
 FORCE, TORQUE = ("fx", "fy", "fz"), ("mx", "my", "mz")
 _JOINT = re.compile(r"tube[1-9]_(rotation|translation)")
+_FRAME = ("frame", "framenumber", "frame_number", "frame number")
 _TIME = ("t", "time", "stamp", "timestamp")
 _ALIASES = {"tx": "x", "ty": "y", "tz": "z", "px": "x", "py": "y", "pz": "z", "q0": "qw"}
 _BRACKETS = re.compile(r"(.+?)\s*[\[(]\s*(.+?)\s*[\])]")
@@ -44,14 +45,16 @@ class Column(Block):
 class TimeColumn(Block):
     """The column of time; `start_s` is added to it, in s.
 
-    `rate_hz`: instead of a unit, where the column counts frames. Cells such as 2023-11-14T22:13:20.012 or 22:13:20.012 need neither: the first
-    are taken for UTC unless they name an offset, the second go on over midnight.
+    `rate_hz`: instead of a unit, where the column counts frames. `frames`: another column with frame numbers, about which the times scatter.
+    Cells such as 2023-11-14T22:13:20.012 or 22:13:20.012 need neither unit nor rate: the first are taken for UTC unless they name an offset, the
+    second go on over midnight.
     """
 
     column: str
     unit: str = ""
     rate_hz: Annotated[FiniteFloat, Field(gt=0)] | None = None
     start_s: FiniteFloat | None = None
+    frames: str = ""
 
 
 class Status(Block):
@@ -158,10 +161,18 @@ def layout_of_header(kind: Kind, header: list[str], where: str) -> Source:
                 factor(unit or "none", si_unit(name), f"{where}: column '{cell}'")
             values.setdefault(name, Column(column=cell, unit=unit))
     if time is None:
-        raise InputError(
-            f"no column of time among {_some(header)}", do="name it 'time [s]', or give --layout", where=where
-        )
+        raise InputError(f"no column of time among {_some(header)}", do=_time_cure(header), where=where)
     return Source(time=time, values=values)
+
+
+def _time_cure(header: list[str]) -> str:
+    """What to do about a header without a column of time."""
+    frames = [cell for cell in header if _split(cell)[0] in _FRAME]
+    if frames:
+        return (
+            f"if '{frames[0]}' counts frames, give --layout with time: {{column: {frames[0]}, rate_hz: RATE}}"
+        )
+    return "name it 'time [s]', or give --layout; header_line in it says which line has the names"
 
 
 def check_complete(kind: Kind, source: Source, header: list[str], where: str) -> None:
@@ -170,7 +181,9 @@ def check_complete(kind: Kind, source: Source, header: list[str], where: str) ->
     Raises:
         InputError: the first that is not.
     """
-    extra = () if source.status is None else (source.status.column,)
+    extra = [] if source.status is None else [source.status.column]
+    if source.time.frames:
+        extra.append(source.time.frames)
     for column in (source.time.column, *extra, *(column.column for column in source.values.values())):
         if column not in header:
             near = get_close_matches(column, header, 1)

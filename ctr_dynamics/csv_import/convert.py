@@ -26,6 +26,7 @@ from ctr_dynamics.csv_import.column_layout import (
     layout_of_header,
     si_unit,
 )
+from ctr_dynamics.csv_import.frame_clock import times_of_frames
 from ctr_dynamics.csv_import.orientations import with_quaternions
 from ctr_dynamics.csv_import.table import CsvTable, Faults
 from ctr_dynamics.csv_import.time_cells import TimeCells
@@ -111,15 +112,21 @@ def read_log(kind: Kind, path: Path, layout: Layout, frame: str) -> Log:
     lines: list[int] = []
     last = Decimal("-Infinity")
     wanted = [source.time.column, *(source.values[name].column for name in names)]
+    if source.time.frames:
+        wanted.append(source.time.frames)
     if source.status is not None:
         wanted.append(source.status.column)
+    frames: list[float] = []
     clock = TimeCells(source.time, where)
     for number, cells in table.rows(wanted, faults):
         if source.status is not None and (status := cells.pop()) not in source.status.good:
             faults.add(number, f"{source.status.column} is '{status[:20]}'")
             continue
         try:
+            # the host may stamp several frames alike, and late ones: the device knows their order
+            number_of_frame = float(cells.pop()) if source.time.frames else None
             time = clock.read(cells[0])
+            order = time if number_of_frame is None else Decimal(number_of_frame)
             row = [
                 scale * float(cell) + offset for cell, (scale, offset) in zip(cells[1:], scales, strict=True)
             ]
@@ -129,17 +136,20 @@ def read_log(kind: Kind, path: Path, layout: Layout, frame: str) -> Log:
             bad = next((cell for cell in cells[1:] if not _finite(cell)), cells[0])
             faults.add(number, f"'{bad[:20]}' is not a number")
             continue
-        if not time.is_finite() or not all(map(math.isfinite, row)):
+        if not (time.is_finite() and order.is_finite()) or not all(map(math.isfinite, row)):
             faults.add(number, "holds a NaN or an infinity")
         elif abs(time) > MAX_STAMP_S * 10**9:
             faults.add(number, f"time {cells[0][:30]} is too large")
-        elif time <= last:
-            faults.add(number, f"time {cells[0][:30]} is not later than the row before")
+        elif order <= last:
+            what = f"time {cells[0][:30]}" if number_of_frame is None else f"frame {number_of_frame:g}"
+            faults.add(number, f"{what} is not later than the row before")
         else:
             times.append(time)
             rows.append(row)
             lines.append(number)
-            last = time
+            last = order
+            if number_of_frame is not None:
+                frames.append(number_of_frame)
     if not rows:
         raise InputError(
             f"no usable row ({faults.count} left out; {'; '.join(faults.examples) or 'no rows at all'})",
@@ -147,6 +157,9 @@ def read_log(kind: Kind, path: Path, layout: Layout, frame: str) -> Log:
             where=where,
         )
     log = Log(kind, names, [], np.array(rows), faults)
+    if source.time.frames:
+        times, note = times_of_frames(times, frames, float(clock.seconds_per_unit), where)
+        log.notes.append(note)
     log.stamp_ns = _stamps(times, source, log, where, clock)
     if kind == "tracker":
         _orientation(log, lines, where)

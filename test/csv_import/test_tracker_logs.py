@@ -90,6 +90,59 @@ def test_status_and_frame_numbers(tmp_path):
     np.testing.assert_allclose(steps(log), 0.025 * np.diff(kept), atol=2e-9)
 
 
+def scattered(late, frames=None):
+    """Rows whose host stamps come ``late`` by seconds, with frame numbers behind."""
+    frames = range(41, 41 + COUNT) if frames is None else frames
+    rows = table(1700000000.0 + TIMES + late)
+    return [HEAD + ",Frame", *(",".join([*row, str(f)]) for row, f in zip(rows, frames, strict=True))]
+
+
+BY_FRAMES = {"time": {"column": "t", "unit": "s", "frames": "Frame"}, "values": METRES | QUATERNIONS}
+
+
+def test_stamps_that_scatter_about_frame_numbers(tmp_path):
+    """Frames are even; what the host adds on average stays, two frames that it stamps alike are both there."""
+    late = np.abs(7e-3 * np.random.default_rng(8).normal(size=COUNT))
+    late[11] = late[10] - 0.025
+    log = read(tmp_path, scattered(late), BY_FRAMES)
+    same(log)
+    assert np.ptp(steps(log)) < 1e-6
+    assert steps(log).mean() == pytest.approx(0.025, abs=0.001)
+    assert np.mean(log.stamp_ns) * 1e-9 == pytest.approx(1700000000.0 + np.mean(TIMES + late), abs=1e-6)
+    assert any("scatter by" in note for note in log.notes)
+
+
+def test_lost_frames_stay_gaps(tmp_path):
+    kept = [i for i in range(COUNT) if not 8 <= i < 14]
+    lines = scattered(np.zeros(COUNT))
+    log = read(tmp_path, [lines[0], *(lines[1 + i] for i in kept)], BY_FRAMES)
+    np.testing.assert_allclose(steps(log), 0.025 * np.diff(kept), atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("frames", "says"),
+    [
+        ([*range(COUNT // 2), *range(COUNT // 2)], "is not later"),
+        ([3 * i + 60 * (i > 5) for i in range(COUNT)], "scatter"),
+    ],
+)
+def test_frame_numbers_that_count_no_frames(tmp_path, frames, says):
+    if says == "scatter":
+        with pytest.raises(InputError, match="scatter by"):
+            read(tmp_path, scattered(np.zeros(COUNT), frames), BY_FRAMES)
+    else:
+        log = read(tmp_path, scattered(np.zeros(COUNT), frames), BY_FRAMES)
+        assert log.faults.count == COUNT // 2
+        assert says in log.faults.examples[0]
+
+
+def test_a_log_with_frame_numbers_alone_names_the_cure(tmp_path):
+    path = tmp_path / "log.csv"
+    path.write_text("frame,x [m],y [m],z [m]\n1,0,0,0\n")
+    with pytest.raises(InputError, match="column: frame, rate_hz"):
+        read_log("tracker", path, Layout(), "ctr_base")
+
+
 @pytest.mark.parametrize("form", ["date", "offset", "clock"])
 def test_dates_and_times_of_day_over_midnight(tmp_path, form):
     begin = datetime(2023, 11, 14, 23, 59, 59, 700000, tzinfo=timezone.utc)
