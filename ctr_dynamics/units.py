@@ -22,7 +22,7 @@ FACTORS: dict[tuple[str, str], float] = {
 _MORE: dict[tuple[str, str], float] = {
     ("ns", "s"): 1e-9, ("N mm", "N m"): 1e-3, ("mN m", "N m"): 1e-3, ("mN", "N"): 1e-3, ("g/cm3", "kg/m^3"): 1e3,
     ("kg/m3", "kg/m^3"): 1.0, ("in", "m"): 0.0254, ("degrees", "rad"): FACTORS["deg", "rad"], ("°", "rad"): FACTORS["deg", "rad"],
-    ("sec", "s"): 1.0, ("g mm2", "kg m^2"): 1e-9,
+    ("sec", "s"): 1.0, ("N mm^2", "N m^2"): 1e-6, ("N mm2", "N m^2"): 1e-6, ("N m2", "N m^2"): 1.0, ("g mm2", "kg m^2"): 1e-9,
 }  # fmt: skip
 _TEXT = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(.*?)\s*")
 

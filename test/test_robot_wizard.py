@@ -6,6 +6,7 @@ import io
 import math
 
 import pytest
+import yaml
 
 from ctr_dynamics.cli import main as cli
 from ctr_dynamics.errors import InputError
@@ -101,6 +102,7 @@ def test_no_answer_is_one_line(tmp_path, monkeypatch, capsys):
         ([INNER, OUTER.replace("id=1.6mm", "id=1.2mm")], "does not fit around"),
         ([INNER.replace("E=52GPa", "E=52kPa")], "is outside"),
         ([INNER.replace("E=52GPa+-0.4%", "E=52GPa+--1%")], "is not 0 or more"),
+        ([INNER + ", EI=0.003N m^2"], "both EI and E are given"),
     ],
 )
 def test_sheets_that_cannot_be_are_rejected(tmp_path, capsys, tubes, message):
@@ -110,6 +112,23 @@ def test_sheets_that_cannot_be_are_rejected(tmp_path, capsys, tubes, message):
     assert message in err
     assert err.count("\n") == 1
     assert not path.exists()
+
+
+def test_stiffnesses_and_curvature_as_they_are_published(tmp_path):
+    """The same robot in EI, GJ and curvature; their deviations are their own, whatever the diameters'."""
+    path = tmp_path / "r.yaml"
+    text = (
+        "name=a, od=1.2mm+-0.02mm, id=0.9mm, straight=250mm, curved=60mm, curvature=0.0125 1/mm+-2%, "
+        "EI=4000N mm^2+-5%, GJ=0.003N m^2, density=6.45g/cm^3"
+    )
+    assert new(path, "--tube", text) == 0
+    tube = load_robot(path).tubes[0]
+    assert tube.bending_stiffness == pytest.approx(4e-3)
+    assert tube.torsion_stiffness == pytest.approx(3e-3)
+    assert tube.youngs_modulus.relative == pytest.approx(0.05)
+    assert tube.shear.relative == 0.0
+    assert tube.precurvature[1].curvature.value == pytest.approx((12.5, 0.0, 0.0))
+    assert tube.precurvature[1].relative_tolerance == pytest.approx(0.02)
 
 
 def test_an_existing_file_is_kept(tmp_path, capsys):
@@ -129,6 +148,19 @@ def test_doubtful_numbers_are_said(tmp_path, capsys):
     err = capsys.readouterr().err
     assert "clearance between tube 1 and 2 is 0.0005 mm" in err
     assert "tube 1 is strained by 12.4 %" in err
+
+
+def test_moduli_and_angles_in_other_units_are_said(tmp_path, capsys):
+    path = tmp_path / "r.yaml"
+    assert new(path, "--tube", INNER.replace("E=52GPa", "E=686GPa"), "--tube", OUTER, *REST) == 0
+    data = yaml.safe_load(path.read_text())
+    data["rest"]["alpha"]["value"] = [90.0, 0.0]
+    path.write_text(yaml.safe_dump(data))
+    capsys.readouterr()
+    assert cli.main(["robot", "check", str(path), "--no-rest"]) == 0
+    err = capsys.readouterr().err
+    assert "Young's modulus of tube 1 is 686 GPa" in err
+    assert "write 1.5708" in err
 
 
 def test_shipped_robots_pass_the_check(capsys):

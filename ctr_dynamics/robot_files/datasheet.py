@@ -38,6 +38,12 @@ TUBE_KEYS: dict[str, tuple[str, bool, str]] = {
     "G": ("Pa", False, "shear modulus; E / 2.6 without it"),
     "damping": ("N m^2 s", False, "bending damping; 0 without it"),
 }
+# Keys that may stand for one of these, as robots are published: SI unit, the key, and what it is.
+INSTEAD: dict[str, tuple[str, str, str]] = {
+    "EI": ("N m^2", "E", "bending stiffness"),
+    "GJ": ("N m^2", "G", "torsional stiffness"),
+    "curvature": ("1/m", "radius", "curvature of the precurved part"),
+}
 
 
 @dataclass(frozen=True)
@@ -134,11 +140,21 @@ def tube_from_text(text: str, number: int) -> tuple[str, dict[str, Measured]]:
             )
         if key == "name":
             name = value
-        elif key in TUBE_KEYS:
-            found[key] = measured(value, TUBE_KEYS[key][0], f"{where}: {key}")
+        elif key in TUBE_KEYS or key in INSTEAD:
+            unit = TUBE_KEYS[key][0] if key in TUBE_KEYS else INSTEAD[key][0]
+            found[key] = measured(value, unit, f"{where}: {key}")
         else:
-            raise InputError(f"unknown key '{key}'", do=f"known: name, {', '.join(TUBE_KEYS)}", where=where)
-    missing = [key for key, (_, needed, _) in TUBE_KEYS.items() if needed and key not in found]
+            known = ", ".join([*TUBE_KEYS, *INSTEAD])
+            raise InputError(f"unknown key '{key}'", do=f"known: name, {known}", where=where)
+    for key, (_, other, _) in INSTEAD.items():
+        if key in found and other in found:
+            raise InputError(f"both {key} and {other} are given", do="leave one of them out", where=where)
+    stood_for = {INSTEAD[key][1] for key in found if key in INSTEAD}
+    missing = [
+        key
+        for key, (_, needed, _) in TUBE_KEYS.items()
+        if needed and key not in found and key not in stood_for
+    ]
     if missing:
         raise InputError(
             f"{', '.join(missing)} is missing" if len(missing) == 1 else f"{', '.join(missing)} are missing",
@@ -221,7 +237,8 @@ def _tube(name: str, data: Mapping[str, Measured], number: int) -> dict[str, Any
         )
     bending = 4 * math.hypot(ro**3 * so, ri**3 * si) / (ro**4 - ri**4)
     area = 2 * math.hypot(ro * so, ri * si) / (ro**2 - ri**2)
-    modulus = Measured(data["E"].value, data["E"].value * math.hypot(data["E"].relative, bending))
+    second_moment = math.pi / 4 * (ro**4 - ri**4)
+    modulus = _modulus(data, "E", "EI", second_moment, bending)
     density = Measured(
         data["density"].value, data["density"].value * math.hypot(data["density"].relative, area)
     )
@@ -235,12 +252,10 @@ def _tube(name: str, data: Mapping[str, Measured], number: int) -> dict[str, Any
         )
     curved = data.get("curved", Measured(0.0))
     if curved.value:
-        if "radius" not in data or not data["radius"].value:
-            raise InputError("curved is given and radius is not", do="give the bend radius", where=where)
-        radius = data["radius"]
-        curvature = {"value": [_short(1 / radius.value), 0.0, 0.0], "unit": "1/m"}
-        if radius.relative:
-            curvature["tolerance"] = [_short(radius.relative / radius.value), 0.0, 0.0]
+        size = _curvature(data, where)
+        curvature = {"value": [_short(size.value), 0.0, 0.0], "unit": "1/m"}
+        if size.sigma:
+            curvature["tolerance"] = [_short(size.sigma), 0.0, 0.0]
         segments.append({"length": curved.quantity("m"), "curvature": curvature})
     damping = data.get("damping", Measured(0.0)).quantity("N m^2 s")
     tube: dict[str, Any] = {
@@ -253,12 +268,29 @@ def _tube(name: str, data: Mapping[str, Measured], number: int) -> dict[str, Any
         "torsion_damping": damping,
         "precurvature": segments,
     }
-    if "G" in data:
-        shear = data["G"]
-        tube["shear_modulus"] = Measured(
-            shear.value, shear.value * math.hypot(shear.relative, bending)
-        ).quantity("Pa")
+    if "G" in data or "GJ" in data:
+        tube["shear_modulus"] = _modulus(data, "G", "GJ", 2 * second_moment, bending).quantity("Pa")
     return tube
+
+
+def _modulus(
+    data: Mapping[str, Measured], key: str, stiffness: str, second_moment: float, bending: float
+) -> Measured:
+    """Young's or shear modulus in Pa: as given, with what the diameters add to the stiffness, or from a ``stiffness`` that was measured itself."""
+    if stiffness in data:
+        given = data[stiffness]
+        return Measured(given.value / second_moment, given.sigma / second_moment)
+    return Measured(data[key].value, data[key].value * math.hypot(data[key].relative, bending))
+
+
+def _curvature(data: Mapping[str, Measured], where: str) -> Measured:
+    """Curvature of the precurved part in 1/m, from itself or from the bend radius."""
+    if "curvature" in data:
+        return data["curvature"]
+    radius = data.get("radius", Measured(0.0))
+    if not radius.value:
+        raise InputError("curved is given and radius is not", do="give the bend radius", where=where)
+    return Measured(1 / radius.value, abs(radius.relative / radius.value))
 
 
 def robot_file_text(robot: Robot, said: Sequence[str]) -> str:

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from ctr_dynamics.robot.schema import Robot
 
 CLEARANCE_M = (5e-6, 0.3e-3)  # radial; outside, a diameter is probably wrong or play matters
 MAX_STRAIN = 0.08  # Nitinol recovers up to about this
+MODULUS_PA = (0.5e9, 450e9)  # soft polymers to tungsten
+MAX_ALPHA = 4 * math.pi  # two turns; more at rest are degrees
 
 
 def tube_rows(robot: Robot) -> list[tuple[str, ...]]:
@@ -46,12 +50,23 @@ def doubts(robot: Robot) -> list[str]:
                 f"{1e3 * high:.1f} mm; check the diameters"
             )
     for i, tube in enumerate(robot.tubes, 1):
+        low, high = MODULUS_PA
+        if not low <= tube.youngs_modulus.value <= high:
+            found.append(
+                f"Young's modulus of tube {i} is {1e-9 * tube.youngs_modulus.value:.4g} GPa, that of solids is {1e-9 * low:g} to {1e-9 * high:g} GPa "
+                "(Nitinol 30 to 85): check unit and diameters"
+            )
         strain = max(segment.peak_curvature for segment in tube.precurvature) * tube.outer_radius.value
         if strain > MAX_STRAIN:
             found.append(
                 f"tube {i} is strained by {100 * strain:.1f} % when straight, Nitinol recovers up to about {100 * MAX_STRAIN:.0f} %; "
                 "check bend radius and diameter"
             )
+    turned = max(robot.rest.alpha.value, key=abs)
+    if abs(turned) > MAX_ALPHA:
+        found.append(
+            f"an angle at rest is {turned:g} rad, more than two turns: if that is in degrees, write {math.radians(turned):.6g}"
+        )
     exact = [name for name, value in _deviations(robot) if value == 0.0]
     if exact:
         found.append(

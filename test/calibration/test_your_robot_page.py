@@ -140,5 +140,6 @@ def test_the_page_leads_from_two_logs_to_fused_poses_and_findings(lab, capsys):
     found = json.loads(capsys.readouterr().out)
     assert found["position_m"]["rms"] < 2.5e-4
     assert (lab / "report.html").exists()
-    verdict = json.loads((lab / "findings" / "findings.json").read_text())
-    assert verdict["notes"] is not None
+    findings = json.loads((lab / "findings" / "findings.json").read_text())
+    assert findings["inputs"][0]["name"] == "bag.mcap"
+    assert findings["verdict"]
