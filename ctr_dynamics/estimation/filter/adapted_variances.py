@@ -7,8 +7,9 @@ that noise explains does not raise the force.
 With the gains that the filter has used, its covariance is affine in the three variances: Pi = F + c D_force + d D_shift + n D_noise. F comes from
 the prior and the other noise, each D from the randomness of one of the three. The D go through the filter beside Pi. So the covariance of an
 innovation is known for all other variances, and with it their likelihood. Each variance is taken from a grid and changes now and then to one
-drawn from its prior: a filter for a hidden Markov chain (Rabiner 1989). The filter has their mean values, and Pi is at once what it would be had
-they been those all along.
+drawn from its prior: a filter for a hidden Markov chain (Rabiner 1989). The filter has their mean values. Where one grows, Pi is at once what it
+would be had it been that all along. Where the force's becomes less, its past randomness stays in Pi until measurements have removed it: a force
+that has ended did move the robot.
 """
 
 from __future__ import annotations
@@ -228,20 +229,24 @@ class AdaptedVariances:
         weights *= np.exp(self._likelihood - best)
         self.weights = weights = weights / weights.sum()
         # 3. The filter goes over to the mean variances.
-        means = [
-            float(weights.sum(axis=tuple(a for a in range(3) if a != axis)) @ ratio)
-            for axis, ratio in enumerate(ratios)
-        ]
+        means = np.array(
+            [
+                weights.sum(axis=tuple(a for a in range(3) if a != axis)) @ ratio
+                for axis, ratio in enumerate(ratios)
+            ]
+        )
         means[0] = min(max(means[0], 1.0 / options.largest_change), options.largest_change)
-        larger = S + np.einsum("i,ijk->jk", np.array(means) - 1.0, parts)
+        # a force that has become less has left its trace in Pi
+        change = np.array([max(means[0], 1.0), means[1], means[2]]) - 1.0
+        larger = S + np.einsum("i,ijk->jk", change, parts)
         self.fraction = float(
             np.clip(means[0] * largest_variance_fraction(parts[FORCE_PART], larger), 0.0, 1.0)
         )
-        more = np.einsum("i,ijk->jk", np.array(means) - 1.0, self.parts)
-        self.parts *= np.array(means)[:, None, None]
+        more = np.einsum("i,ijk->jk", change, self.parts)
+        self.parts *= means[:, None, None]
         self.sigma *= math.sqrt(means[0])
         self.shift *= math.sqrt(means[1])
-        self.noise *= means[2]
+        self.noise *= float(means[2])
         return more
 
     @property
