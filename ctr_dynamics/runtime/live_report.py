@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import zipfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctr_dynamics.effects import make_plant
-from ctr_dynamics.errors import InputError
 from ctr_dynamics.io.bag_reader import open_bag
 from ctr_dynamics.io.messages.cdr import PoseIn, decode_point_cloud, decode_pose_stamped
+from ctr_dynamics.io.truth_files import read_truth
 from ctr_dynamics.robot import Robot
 from ctr_dynamics.sensing import TrackerModel
 
@@ -100,17 +99,9 @@ def truth_of(file: Path) -> list[Trace]:
     Raises:
         InputError: not such a file.
     """
-    try:
-        with np.load(file) as data:
-            t = np.asarray(data["t"], dtype=float)
-            traces = [
-                Trace(t, np.asarray(data[name], dtype=float)) for name in ("p", "p_trk") if name in data
-            ]
-    except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
-        raise InputError(f"cannot be read as a truth file ({error})", where=str(file)) from None
-    if not traces or any(trace.p.shape != (*t.shape, 3) for trace in traces):
-        raise InputError("holds no tip 'p' or 'p_trk' (n, 3) over 't' (n,)", where=str(file))
-    return traces
+    truth = read_truth(file)
+    found = (truth.position, truth.tracker_position)
+    return [Trace(truth.t, positions) for positions in found if positions is not None]
 
 
 def compare(
