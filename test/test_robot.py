@@ -7,8 +7,10 @@ from importlib import resources
 import numpy as np
 import pytest
 import yaml
+from scipy.spatial.transform import Rotation
 
 from ctr_dynamics.errors import InputError
+from ctr_dynamics.parameters import Settings
 from ctr_dynamics.robot_files import (
     load_robot,
     robot_from_dict,
@@ -18,6 +20,9 @@ from ctr_dynamics.robot_files import (
     robot_to_yaml,
     robot_with,
 )
+from ctr_dynamics.sensing.checks.actuator_motion import ActuatorMotion
+from ctr_dynamics.sensing.checks.check_limits import CheckLimits
+from ctr_dynamics.sensing.tracker_parameters import with_robot_file
 
 DEG = math.pi / 180
 
@@ -383,3 +388,75 @@ def test_extensions_of_the_catalogue_are_taken_and_checked(tissue):
         message = refusal(tissue)
         for word in words:
             assert word in message
+
+
+# --- tracker and actuators of a lab ---------------------------------------------------------------------------
+
+
+def matrix_of(vector, translation):
+    motion = np.eye(4)
+    motion[:3, :3], motion[:3, 3] = Rotation.from_rotvec(vector).as_matrix(), translation
+    return motion.tolist()
+
+
+def test_a_registration_may_be_a_matrix(tissue):
+    vector, translation = [0.1, -0.7, 2.0], [0.08, -0.12, 0.25]
+    tracker = tissue["tracker"]
+    for part in ("rotation", "translation"):
+        del tracker[f"registration_{part}"]
+    matrix = matrix_of(vector, translation)
+    tracker["registration"] = {"value": matrix, "unit": "m", "tolerance": 5e-4, "rotation_tolerance": 0.01}
+    found = robot_from_dict(tissue).tracker
+    np.testing.assert_allclose(found.registration_rotation.value, vector, atol=1e-12)
+    np.testing.assert_allclose(found.registration_translation.value, translation)
+    assert found.registration_rotation.tolerance == (0.01,) * 3
+    assert found.registration_translation.tolerance == (5e-4,) * 3
+    again = robot_from_dict(yaml.safe_load(robot_to_yaml(robot_from_dict(tissue))))
+    assert again.tracker == found
+
+
+@pytest.mark.parametrize(
+    ("spoil", "words"),
+    [
+        (lambda m: m.pop(), "four rows of four numbers"),
+        (lambda m: m[0].append(0.0), "four rows of four numbers"),
+        (lambda m: m[1].__setitem__(1, 2.0), "no rigid motion"),
+        (lambda m: m[0].__setitem__(slice(0, 3), [-v for v in m[0][:3]]), "no rigid motion"),  # a reflection
+        (lambda m: m[3].__setitem__(0, 1.0), "no rigid motion"),
+        (lambda m: m[2].__setitem__(3, "far"), "is not a number"),
+    ],
+)
+def test_a_matrix_that_is_no_registration_is_refused(tissue, spoil, words):
+    matrix = matrix_of([0.1, 0.2, 0.3], [0.0, 0.0, 0.1])
+    spoil(matrix)
+    tracker = tissue["tracker"]
+    for part in ("rotation", "translation"):
+        del tracker[f"registration_{part}"]
+    tracker["registration"] = {"value": matrix, "unit": "m"}
+    assert words in refusal(tissue)
+
+
+def test_a_registration_is_given_once_and_in_metres(tissue):
+    tissue["tracker"]["registration"] = {"value": np.eye(4).tolist(), "unit": "m"}
+    assert "both registration and registration_rotation are given" in refusal(tissue)
+    for part in ("rotation", "translation"):
+        del tissue["tracker"][f"registration_{part}"]
+    tissue["tracker"]["registration"]["unit"] = "mm"
+    assert "unit 'mm' must be 'm'" in refusal(tissue)
+
+
+def test_axes_mount_and_speeds(tissue):
+    tissue["tracker"]["axes"] = "xyzrp"
+    tissue["tracker"]["mount_rotation"] = {"value": [0.0, 1.5, 0.0], "unit": "rad"}
+    tissue["actuators"] = {"rotation_speed": {"value": 6.0, "unit": "rad/s"}}
+    robot = robot_from_dict(tissue)
+    assert robot_from_dict(yaml.safe_load(robot_to_yaml(robot))) == robot
+    settings = with_robot_file(Settings(), robot)
+    assert settings["tracker.axes"] == "xyzrp"
+    assert settings["tracker.mount_rotation_rad"] == (0.0, 1.5, 0.0)
+    assert with_robot_file(settings, robot) == settings
+    assert with_robot_file(Settings({"tracker.axes": "xyz"}), robot)["tracker.axes"] == "xyz"
+    motion = ActuatorMotion(2, CheckLimits(), robot)
+    assert motion.speeds == (6.0, 6.0, CheckLimits().translation_speed, CheckLimits().translation_speed)
+    tissue["tracker"]["axes"] = "zyx"
+    assert "'zyx' is not a subset of 'xyzrpy'" in refusal(tissue)

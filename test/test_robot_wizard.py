@@ -176,3 +176,27 @@ def test_measured_values():
     with pytest.raises(InputError):
         measured("1 mm +- x", "m", "x")
     assert tube_from_text(INNER, 1)[0] == "inner"
+
+
+def test_tracker_options(tmp_path):
+    path = tmp_path / "r.yaml"
+    options = [
+        "--registration",
+        "0 -1 0 0.1; 1 0 0 0.2; 0 0 1 0.3; 0 0 0 1",
+        "--mount",
+        "0deg, 90deg, 0deg",
+        "--axes",
+        "xyzrp",
+    ]
+    assert new(path, "--tube", INNER, "--tube", OUTER, *REST, *options) == 0
+    tracker = load_robot(path).tracker
+    assert tracker.axes == "xyzrp"
+    assert tracker.mount_rotation.value == pytest.approx((0.0, math.pi / 2, 0.0))
+    assert tracker.registration_rotation.value == pytest.approx((0.0, 0.0, math.pi / 2), abs=1e-12)
+    assert tracker.registration_translation.value == (0.1, 0.2, 0.3)
+    assert tracker.registration_rotation.tolerance[0] == pytest.approx(math.radians(0.3))
+
+
+def test_a_registration_of_other_than_16_numbers_is_refused(tmp_path, capsys):
+    assert new(tmp_path / "r.yaml", "--tube", INNER, "--registration", "1 0 0 0") == 2
+    assert "4 numbers, expected 16" in capsys.readouterr().err

@@ -13,20 +13,15 @@ def lines(found: Calibration) -> list[str]:
     for c, value, sigma in zip(fit.coordinates, fit.values, fit.sigma, strict=True):
         name = " ".join(c.key)
         out.append(f"{name:38}{c.off:11.5f}{c.prior:9.5f}{value:11.5f}{sigma:9.5f}")
+    mount = found.robot.tracker.mount_rotation
+    if mount is not None:
+        out.append(f"mount of the sensor  {', '.join(f'{v:.4f}' for v in mount.value)} rad")
     out += [
         f"fitted tips {found.fitted.count:5d}   after   {found.fitted.text()}",
         f"held out    {found.before.count:5d}   before  {found.before.text()}",
         f"held out    {found.after.count:5d}   after   {found.after.text()}",
     ]
-    return [*out, *(f"{line}" for line in mount_lines(found))]
-
-
-def mount_lines(found: Calibration) -> list[str]:
-    """The option that goes with the new robot file where the mount was fitted."""
-    if found.mount is None:
-        return []
-    vector = ",".join(f"{v:.6f}" for v in found.mount)
-    return [f"use with    --set tracker.mount_rotation_rad={vector}"]
+    return out
 
 
 def robot_text(found: Calibration, with_parameters: bool) -> str:
@@ -35,10 +30,9 @@ def robot_text(found: Calibration, with_parameters: bool) -> str:
         "SI units and radians; tolerances are the standard deviations of the fit.",
         f"Held-out tips before: {found.before.text()}",
         f"Held-out tips after: {found.after.text()}",
-        *(line.replace("use with   ", "Use with") for line in mount_lines(found)),
     ]
     if with_parameters:
         head.append(
-            "The given tracker.delay_s, lever_arm_m and registration parameters are part of this file: do not give them with it."
+            "The given tracker.delay_s, lever_arm_m, mount and registration parameters are part of this file: do not give them with it."
         )
     return "".join(f"# {line}\n" for line in head) + robot_to_yaml(found.robot)

@@ -50,13 +50,11 @@ class Calibration:
 
     Attributes:
         robot: with fitted values and posterior deviations. fit: what was found.
-        mount: (3,) rotation vector of the sensor in the tip frame, rad; None where it was not free.
         before, after: errors on the held-out tips with the robot as given and as fitted; fitted: errors on those of the fit.
     """
 
     robot: Robot
     fit: TipFit
-    mount: Floats | None
     before: TipErrors
     after: TipErrors
     fitted: TipErrors
@@ -131,10 +129,13 @@ def calibrate(
         for m, p in ((nominal, {}), (judge, fit.point), (seen_again, fit.point))
     ]
     text = f"calibrated{f' {note}' if note else ''}: {1e3 * errors[1].rms:.2f} mm rms on held-out tips"
+    calibrated = calibrated_robot(robot, fit, text)
+    if free:
+        vector = to_vector(multiply(total, mount) if mount is not None else total)
+        calibrated = calibrated.with_mount(tuple(vector.tolist()))
     return Calibration(
-        robot=calibrated_robot(robot, fit, text),
+        robot=calibrated,
         fit=fit,
-        mount=to_vector(multiply(total, mount) if mount is not None else total) if free else None,
         before=errors[0],
         after=errors[1],
         fitted=errors[2],

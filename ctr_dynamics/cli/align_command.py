@@ -48,11 +48,11 @@ def align(
     from ctr_dynamics.calibration import alignment
     from ctr_dynamics.calibration.alignment_report import file_text, lines
     from ctr_dynamics.calibration.reading import mount_of, read_tips
-    from ctr_dynamics.sensing.tracker_parameters import with_tracker_parameters
+    from ctr_dynamics.sensing.tracker_parameters import with_robot_file, with_tracker_parameters
 
     loaded = load_robot(robot)
     check_targets({"output": output}, {"bag": bag, "robot file": robot})
-    settings = settings_from(choice.params, choice.assignments)
+    settings = with_robot_file(settings_from(choice.params, choice.assignments), loaded)
     measured = read_tips(bag, loaded, settings, parse_remap(choice.remap))
     for note in measured.notes:
         print(f"ctr-dynamics: note: {note}", file=sys.stderr)

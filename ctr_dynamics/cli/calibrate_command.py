@@ -50,11 +50,11 @@ def calibrate(
     from ctr_dynamics.calibration.calibration_report import lines, robot_text
     from ctr_dynamics.calibration.reading import mount_of, read_tips
     from ctr_dynamics.calibration.robot_calibration import calibrate as calibrate_robot
-    from ctr_dynamics.sensing.tracker_parameters import with_tracker_parameters
+    from ctr_dynamics.sensing.tracker_parameters import with_robot_file, with_tracker_parameters
 
     loaded = load_robot(robot)
     check_targets({"output": output}, {"tips": tips, "robot file": robot})
-    settings = settings_from(choice.params, choice.assignments)
+    settings = with_robot_file(settings_from(choice.params, choice.assignments), loaded)
     measured = read_tips(tips, loaded, settings, parse_remap(choice.remap))
     for note in measured.notes:
         print(f"ctr-dynamics: note: {note}", file=sys.stderr)

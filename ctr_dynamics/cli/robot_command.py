@@ -81,6 +81,23 @@ class NewOptions:
         str,
         typer.Option("--lever-arm", metavar="LIST", help="Sensor in the tip frame: '0mm, 2mm+-0.5mm, -5mm'."),
     ] = ""
+    registration: Annotated[
+        str,
+        typer.Option(
+            "--registration",
+            metavar="MATRIX",
+            help="ctr_base in the tracker's frame: 16 numbers, the rows of [R t; 0 0 0 1], t in m.",
+        ),
+    ] = ""
+    mount: Annotated[
+        str,
+        typer.Option(
+            "--mount", metavar="LIST", help="Rotation vector of the sensor in the tip: '0deg, 90deg, 0deg'."
+        ),
+    ] = ""
+    axes: Annotated[
+        str, typer.Option("--axes", metavar="AXES", help="What the tracker measures, as xyzrp; default: all.")
+    ] = ""
     force: Annotated[bool, typer.Option("--force", help="Write over an existing file.")] = False
 
 
@@ -109,8 +126,12 @@ def new(options: NewOptions) -> int:
             unit, several, _, _ = _ASKED[key]
             read = sheets.measures if several else sheets.measured
             values[key] = read(text, unit, f"--{key.replace('_', '-')}")
+    if options.mount:
+        values["mount"] = sheets.measures(options.mount, "rad", "--mount")
+    if options.registration:
+        values["registration"] = sheets.matrix_from_text(options.registration, "--registration")
     sheet = dataclasses.replace(
-        sheets.Sheet(options.name or file.stem, tuple(tubes), options.gravity), **values
+        sheets.Sheet(options.name or file.stem, tuple(tubes), options.gravity, axes=options.axes), **values
     )
     robot = sheets.robot_from_sheet(sheet)
     with atomic_file(file) as temporary:

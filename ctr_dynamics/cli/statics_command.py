@@ -95,10 +95,10 @@ def _compared(poses: Path, robot: str, output: Path, nodes: int, choice: Recordi
     """Expected beside measured tips; 1 where the model has no solution."""
     from ctr_dynamics.calibration.comparison import HEADER, compare, table
     from ctr_dynamics.calibration.reading import read_tips
-    from ctr_dynamics.sensing.tracker_parameters import with_tracker_parameters
+    from ctr_dynamics.sensing.tracker_parameters import with_robot_file, with_tracker_parameters
 
     loaded = load_robot(robot)
-    settings = settings_from(choice.params, choice.assignments)
+    settings = with_robot_file(settings_from(choice.params, choice.assignments), loaded)
     tips = read_tips(poses, loaded, settings, parse_remap(choice.remap))
     for note in tips.notes:
         print(f"ctr-dynamics: note: {note}", file=sys.stderr)

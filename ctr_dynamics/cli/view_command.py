@@ -15,11 +15,12 @@ from ctr_dynamics.cli.replay_command import settings_for_replay
 from ctr_dynamics.errors import InputError
 from ctr_dynamics.estimation.monitoring.statuses import all_statuses, snap_ahead
 from ctr_dynamics.io.bag_reader import Bag
-from ctr_dynamics.parameters import Settings
+from ctr_dynamics.parameters import Settings, input_mapping
 from ctr_dynamics.robot import Robot
 from ctr_dynamics.robot_files import load_robot
 from ctr_dynamics.runtime.joint_rate import with_joint_rate
 from ctr_dynamics.runtime.step_encoder import StepEncoder
+from ctr_dynamics.sensing.tracker_parameters import with_robot_file
 from ctr_dynamics.view.server import Pace, ViewServer
 
 LAYOUT = "ctr_dynamics/config/view/foxglove.json"
@@ -85,7 +86,8 @@ def _replay(server: ViewServer, opened: Bag, robot: Robot, settings: Settings, s
     from ctr_dynamics.estimation.estimator import Estimator
     from ctr_dynamics.runtime.replay import Player, no_step
 
-    opened.tubes = robot.n_tubes
+    settings = with_robot_file(settings, robot)
+    opened.read_for(robot.n_tubes, input_mapping(settings).mount_xyzw)
     settings, _ = with_joint_rate(opened, settings)
     estimator = Estimator(robot, settings)
     encoder = StepEncoder(settings["output.frame_id"], robot.name, settings["output.backbone_every"])

@@ -21,6 +21,7 @@ from ctr_dynamics.parameters import Settings, axes_mask, input_mapping, pose_fra
 from ctr_dynamics.robot import Robot
 from ctr_dynamics.sensing.checks import CheckOptions, JointChecks, Kind
 from ctr_dynamics.sensing.interpolation import finite, joint_order
+from ctr_dynamics.sensing.tracker_parameters import with_robot_file
 
 Floats = NDArray[np.float64]
 Samples = list[tuple[int, list[float]]]
@@ -85,7 +86,7 @@ def read_recording(
         InputError: not a bag, no complete joint state of this robot, no tracker, or joints and tracker together shorter or longer than
             the options say.
     """
-    o, settings = options or RecordingOptions(), settings or Settings()
+    o, settings = options or RecordingOptions(), with_robot_file(settings or Settings(), robot)
     bag = open_bag(path, input_mapping(settings, remap))
     bag.tubes = robot.n_tubes
     bag.check_inputs((JOINT_STATES, TRACKER_TIP))

@@ -36,6 +36,7 @@ from ctr_dynamics.model.simulator import StepResult
 from ctr_dynamics.model.stability import StabilityWatch
 from ctr_dynamics.parameters import Settings
 from ctr_dynamics.robot import Robot
+from ctr_dynamics.sensing.tracker_parameters import with_robot_file
 
 Floats = NDArray[np.float64]
 
@@ -94,7 +95,8 @@ class Estimator:
     """
 
     def __init__(self, robot: Robot, settings: Settings) -> None:
-        self.robot, self.settings = robot, settings
+        self.robot, self.settings = robot, with_robot_file(settings, robot)
+        settings = self.settings
         self.options = EstimatorOptions()
         self.discretisation = discretise(
             robot, int(settings["model.nodes"]), float(settings["model.accuracy_m"])

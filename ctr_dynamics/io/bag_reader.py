@@ -84,6 +84,11 @@ class Bag:
             notes.append(f"{topic}: {count} messages cannot be decoded ({self._first_fault[topic]})")
         return [*notes, *self._input_notes]
 
+    def read_for(self, tubes: int, mount_xyzw: tuple[float, float, float, float]) -> None:
+        """Read the inputs for a robot with so many tubes, whose sensor has the orientation ``mount_xyzw`` in the tip frame."""
+        self.tubes = tubes
+        self.mapping = replace(self.mapping, mount_xyzw=mount_xyzw)
+
     @property
     def stored_topics(self) -> list[StoredTopic]:
         """Topics as they are in the files."""

@@ -6,9 +6,21 @@ import math
 from typing import Annotated, Any
 
 import numpy as np
-from pydantic import Field, PrivateAttr, model_validator
+from pydantic import Field, PrivateAttr, field_validator, model_validator
 
-from ctr_dynamics.robot.quantity import Block, Floats, Number, Quantity, VectorQuantity, problem, rule
+from ctr_dynamics.errors import InputError
+from ctr_dynamics.parameters import axes_mask
+from ctr_dynamics.robot.quantity import (
+    Block,
+    Floats,
+    Number,
+    Quantity,
+    VectorQuantity,
+    check_unit,
+    number,
+    problem,
+    rule,
+)
 from ctr_dynamics.robot.tube import MAX_LENGTH, MILLIMETRES, Tube
 
 MAX_TUBES = 8
@@ -25,6 +37,8 @@ Duration = Annotated[Quantity, rule("s", 0.0, 3600.0, above=True)]
 RotationVector = Annotated[VectorQuantity, rule("rad", -2 * math.pi, 2 * math.pi, hint=_DEGREES)]
 Translation = Annotated[VectorQuantity, rule("m", -100.0, 100.0, hint=MILLIMETRES)]
 LeverArm = Annotated[VectorQuantity, rule("m", -1.0, 1.0, hint=MILLIMETRES)]
+RotationSpeed = Annotated[Quantity, rule("rad/s", 0.0, 1e3, above=True, hint=_DEGREES)]
+TranslationSpeed = Annotated[Quantity, rule("m/s", 0.0, 10.0, above=True, hint=MILLIMETRES)]
 
 
 class Gravity(VectorQuantity):
@@ -92,7 +106,9 @@ class TrackerNoise(Block):
 
 
 class Tracker(Block):
-    """Tip tracker: it reports R_reg (p_tip + R_tip lever) + t_reg, and R_reg R_tip, `delay` seconds late.
+    """Tip tracker: it reports R_reg (p_tip + R_tip lever) + t_reg, and R_reg R_tip R_mount, `delay` seconds late.
+
+    A file may give both parts of the registration as ``registration: {value: [4 rows of 4], unit: m, tolerance: .., rotation_tolerance: ..}``.
 
     Attributes:
         registration_rotation: (3,) rotation vector of R_reg, rad.
@@ -100,6 +116,8 @@ class Tracker(Block):
         lever_arm: (3,) sensor position in the tip frame, m.
         delay: how much older than its stamp a pose is, s.
         noise: of the reported pose.
+        mount_rotation: (3,) rotation vector of R_mount, the sensor in the tip frame, rad; None where its axes are those of the tip.
+        axes: measured axes, a subset of "xyzrpy" (rotations about the tip's axes); None: all.
     """
 
     registration_rotation: RotationVector
@@ -107,6 +125,81 @@ class Tracker(Block):
     lever_arm: LeverArm
     delay: Delay
     noise: TrackerNoise
+    mount_rotation: RotationVector | None = None
+    axes: str | None = None
+
+    @model_validator(mode="before")
+    @classmethod
+    def _registration_from_matrix(cls, data: Any) -> Any:
+        if not isinstance(data, dict) or "registration" not in data:
+            return data
+        for key in ("registration_rotation", "registration_translation"):
+            if key in data:
+                raise problem(f"both registration and {key} are given; keep one of them")
+        others = {key: value for key, value in data.items() if key != "registration"}
+        return {**others, **_registration(data["registration"])}
+
+    @field_validator("axes")
+    @classmethod
+    def _axes_known(cls, axes: str | None) -> str | None:
+        if axes is not None:
+            try:
+                axes_mask(axes)
+            except InputError:
+                raise problem(
+                    f"'{axes}' is not a subset of 'xyzrpy' in that order; write for example xyz or xyzrp"
+                ) from None
+        return axes
+
+
+def _registration(data: Any) -> dict[str, Any]:
+    """Rotation and translation of a rigid motion that a file gives as a matrix of four by four."""
+    check_unit(data, "m")
+    known = {"value", "unit", "tolerance", "rotation_tolerance"}
+    if set(data) - known:
+        raise problem(
+            f"registration: unknown key '{min(set(data) - known)}'; known keys are {', '.join(sorted(known))}"
+        )
+    rows = data.get("value")
+    if (
+        not isinstance(rows, (list, tuple))
+        or [len(r) if isinstance(r, (list, tuple)) else 0 for r in rows] != [4] * 4
+    ):
+        raise problem("registration: value is no matrix; write four rows of four numbers")
+    motion = np.array([[number(x) for x in row] for row in rows])
+    turn = motion[:3, :3]
+    error = float(np.abs(turn @ turn.T - np.eye(3)).max())
+    if error > 1e-3 or np.linalg.det(turn) < 0.0 or np.abs(motion[3] - [0.0, 0.0, 0.0, 1.0]).max() > 1e-9:
+        raise problem(
+            f"registration: no rigid motion (rows of the rotation miss orthonormality by {error:.2g}, limit 0.001, "
+            f"determinant {np.linalg.det(turn):.3g}); write [R t; 0 0 0 1] with t in m"
+        )
+    from scipy.spatial.transform import Rotation  # takes long to import, and few files need it
+
+    vector = Rotation.from_matrix(turn).as_rotvec()
+    return {
+        "registration_rotation": {
+            "value": vector.tolist(),
+            "unit": "rad",
+            "tolerance": data.get("rotation_tolerance", 0.0),
+        },
+        "registration_translation": {
+            "value": motion[:3, 3].tolist(),
+            "unit": "m",
+            "tolerance": data.get("tolerance", 0.0),
+        },
+    }
+
+
+class Actuators(Block):
+    """What the actuators can do; a reading that jumps faster is a fault.
+
+    Attributes:
+        rotation_speed: rad/s. translation_speed: m/s. None: what actuators of this size reach.
+    """
+
+    rotation_speed: RotationSpeed | None = None
+    translation_speed: TranslationSpeed | None = None
 
 
 class ActuatorVector(Block):
@@ -139,6 +232,7 @@ class Rest(Block):
 class Robot(Block):
     """A concentric tube robot; tubes innermost first, everything in SI units and radians.
 
+    ``actuators`` holds the speeds that they reach at most; None where nothing is known of them.
     ``extensions`` holds values of effects by name and parameter. Which effects there are is not known here; who reads a robot file checks them.
     """
 
@@ -150,6 +244,7 @@ class Robot(Block):
     encoders: Encoders
     tracker: Tracker
     rest: Rest
+    actuators: Actuators | None = None
     extensions: dict[str, dict[str, Any]] = Field(default_factory=dict)
 
     _source: str = PrivateAttr("")
@@ -196,6 +291,11 @@ class Robot(Block):
     def exposed_length(self) -> float:
         """Length of tube 1 in front of the base plate, m, at rest; no tube reaches farther."""
         return float(self.lengths[0] + self.rest.beta.value[0])
+
+    def with_mount(self, rotation: tuple[float, ...]) -> Robot:
+        """The robot with its tracker's sensor turned by the rotation vector (3,) rad in the tip frame."""
+        mount = VectorQuantity.model_validate({"value": rotation, "unit": "rad"})
+        return self.model_copy(update={"tracker": self.tracker.model_copy(update={"mount_rotation": mount})})
 
     @property
     def source(self) -> str:

@@ -7,6 +7,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
+
 from ctr_dynamics.errors import InputError
 from ctr_dynamics.robot.schema import Robot
 from ctr_dynamics.robot_files.loader import robot_from_dict, robot_to_yaml
@@ -106,6 +108,8 @@ class Sheet:
         position_noise, rotation_noise: tracker, one sigma per axis, m and rad.
         delay: of the tracker, s. lever_arm: (3,) sensor in the tip frame, m.
         registration_sigma: of the tracker's frame, m and rad per axis.
+        registration: rows of [R t; 0 0 0 1] of `ctr_base` in the tracker's frame, t in m; empty: the two are one.
+        mount: rotation vector of the sensor in the tip frame, rad; empty: its axes are those of the tip. axes: measured ones; empty: all.
         encoder_sigma: offset of a rotary encoder, rad.
     """
 
@@ -121,6 +125,9 @@ class Sheet:
     delay: Measured = Measured(0.0, 0.002)
     lever_arm: tuple[Measured, ...] = field(default_factory=lambda: (Measured(0.0, 0.0005),) * 3)
     registration_sigma: tuple[float, float] = (0.0005, math.radians(0.3))
+    registration: tuple[tuple[float, ...], ...] = tuple(tuple(row) for row in np.eye(4).tolist())
+    mount: tuple[Measured, ...] = ()
+    axes: str = ""
     encoder_sigma: Measured = Measured(math.radians(0.1))
 
 
@@ -204,8 +211,12 @@ def robot_from_sheet(sheet: Sheet) -> Robot:
             "noise": {"value": _short(math.radians(0.012)), "unit": "rad"},
         },
         "tracker": {
-            "registration_rotation": {"value": [0.0] * 3, "unit": "rad", "tolerance": _short(rotation)},
-            "registration_translation": {"value": [0.0] * 3, "unit": "m", "tolerance": _short(position)},
+            "registration": {
+                "value": sheet.registration,
+                "unit": "m",
+                "tolerance": _short(position),
+                "rotation_tolerance": _short(rotation),
+            },
             "lever_arm": {
                 "value": [_short(part.value) for part in sheet.lever_arm],
                 "unit": "m",
@@ -222,7 +233,30 @@ def robot_from_sheet(sheet: Sheet) -> Robot:
         "rest": {"beta": {"value": beta, "unit": "m"}, "alpha": {"value": alpha, "unit": "rad"}},
         "extensions": {},
     }
+    tracker: dict[str, Any] = data["tracker"]  # type: ignore[assignment]
+    if sheet.mount:
+        tracker["mount_rotation"] = {"value": [_short(part.value) for part in sheet.mount], "unit": "rad"}
+    if sheet.axes:
+        tracker["axes"] = sheet.axes
     return robot_from_dict(data, f"robot '{sheet.name}'")
+
+
+def matrix_from_text(text: str, where: str) -> tuple[tuple[float, ...], ...]:
+    """Four rows of the 16 numbers in ``text``, which blanks, commas or semicolons separate.
+
+    Raises:
+        InputError: not so many numbers.
+    """
+    words = text.replace(",", " ").replace(";", " ").split()
+    try:
+        numbers = [float(word) for word in words]
+    except ValueError as error:
+        raise InputError(f"{error}", do="write 16 numbers, row by row", where=where) from None
+    if len(numbers) != 16:
+        raise InputError(
+            f"{len(numbers)} numbers, expected 16", do="write [R t; 0 0 0 1] row by row", where=where
+        )
+    return tuple(tuple(numbers[i : i + 4]) for i in range(0, 16, 4))
 
 
 def _tube(name: str, data: Mapping[str, Measured], number: int) -> dict[str, Any]:

@@ -50,6 +50,7 @@ from ctr_dynamics.runtime.step_encoder import StepEncoder
 from ctr_dynamics.runtime.step_loop import Clock, StepLoop
 from ctr_dynamics.runtime.timing import StepTiming
 from ctr_dynamics.runtime.warm_up import warm_up
+from ctr_dynamics.sensing.tracker_parameters import with_robot_file
 
 DIAGNOSTICS_NS = 500_000_000
 DIAGNOSTICS_WAIT_NS = 100_000_000  # how long they wait for time between steps
@@ -77,7 +78,7 @@ class EstimatorNode(Node):
             self.destroy_node()  # so that others hear of the end
             raise
         self._gate = InputGate(self._estimator)
-        self._decoder = InputDecoder(input_mapping(self.settings), self._robot.n_tubes)
+        self._decoder = self._new_decoder(self.settings)
         self._prepared: tuple[Settings, set[str], Estimator | None] | None = None
         self._use_sim_time = bool(self.get_parameter("use_sim_time").value)
 
@@ -352,11 +353,12 @@ class EstimatorNode(Node):
             json.dump(content, file)  # piece by piece: dumps() would hold up the stepping thread
         return path
 
+    def _new_decoder(self, settings: Settings) -> InputDecoder:
+        return InputDecoder(input_mapping(with_robot_file(settings, self._robot)), self._robot.n_tubes)
+
     def _prepare(self, settings: Settings, changes: set[str]) -> None:
         """Reject parameters that cannot be used; where a new estimator is needed, make it here."""
-        InputDecoder(
-            input_mapping(settings), self._robot.n_tubes
-        )  # names and numbers of joints for so many tubes
+        self._new_decoder(settings)  # names and numbers of joints for so many tubes
         fresh = Estimator(self._robot, settings) if changes - {"filter.enabled"} else None
         self._prepared = (settings, changes, fresh)
 
@@ -376,7 +378,7 @@ class EstimatorNode(Node):
         estimator.carry_load(self._estimator)
         self._estimator = estimator
         self._gate = InputGate(estimator)
-        self._decoder = InputDecoder(input_mapping(settings), self._robot.n_tubes)
+        self._decoder = self._new_decoder(settings)
         self.timing.policy = settings["output.policy"]
         self.loop.max_age_ns = round(settings["output.max_age_s"] * 1e9)
         self.timing.input_timeout_ns = round(settings["input_timeout_s"] * 1e9)

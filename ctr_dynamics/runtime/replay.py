@@ -35,6 +35,7 @@ from ctr_dynamics.runtime.input_gate import InputGate
 from ctr_dynamics.runtime.joint_rate import with_joint_rate
 from ctr_dynamics.runtime.replay_notes import AFTER_NS, no_step, replay_notes, shortfall
 from ctr_dynamics.runtime.step_encoder import StepEncoder
+from ctr_dynamics.sensing.tracker_parameters import with_robot_file
 
 if TYPE_CHECKING:
     from ctr_dynamics.estimation.estimator import Estimator, StepOutput
@@ -248,11 +249,12 @@ def replay(
     """
     if not isinstance(settings, Settings):
         settings = Settings({"output.policy": "wait", **(settings or {})})
-    opened = bag if isinstance(bag, Bag) else open_bag(bag, input_mapping(settings))
-    opened.check_inputs()
     if not isinstance(robot, Robot):
         robot = load_robot(robot)
-    opened.tubes = robot.n_tubes
+    settings = with_robot_file(settings, robot)
+    opened = bag if isinstance(bag, Bag) else open_bag(bag, input_mapping(settings))
+    opened.read_for(robot.n_tubes, input_mapping(settings).mount_xyzw)
+    opened.check_inputs()
     settings, rate_note = with_joint_rate(opened, settings)
     settings = settings.replace({"robot": robot.source or robot.name})
     read = {"bag" if i == 0 else f"bag's part {i + 1}": file.path for i, file in enumerate(opened.files)}

@@ -1,11 +1,13 @@
-"""The tracker of a robot as the parameters say it is, for what knows robots but no parameters."""
+"""What robot file and parameters say of the tracker, brought together."""
 
 from __future__ import annotations
+
+from typing import Any
 
 import numpy as np
 
 from ctr_dynamics.kernels.rotations import from_vector, matrix, multiply, to_vector
-from ctr_dynamics.parameters import Settings
+from ctr_dynamics.parameters import Settings, parameter
 from ctr_dynamics.robot import Robot
 
 
@@ -30,3 +32,14 @@ def with_tracker_parameters(robot: Robot, settings: Settings) -> Robot:
     }
     changed = {name: getattr(tracker, name).model_copy(update={"value": v}) for name, v in values.items()}
     return robot.model_copy(update={"tracker": tracker.model_copy(update=changed)})
+
+
+def with_robot_file(settings: Settings, robot: Robot) -> Settings:
+    """``settings`` with what the robot file says of the tracker's axes and mount, where a parameter is at its default."""
+    tracker = robot.tracker
+    stated: dict[str, Any] = {}
+    if tracker.axes is not None:
+        stated["tracker.axes"] = tracker.axes
+    if tracker.mount_rotation is not None:
+        stated["tracker.mount_rotation_rad"] = list(tracker.mount_rotation.value)
+    return settings.replace({k: v for k, v in stated.items() if settings[k] == parameter(k).default})

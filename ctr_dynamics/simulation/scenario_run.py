@@ -294,13 +294,15 @@ def messages(scenario: Scenario, robot: Robot, recording: Recording) -> list[tup
     tracker = make_plant(robot).tracker.corrected(delay=scenario.tracker.delay_s)
     stamps = _stamps(scenario.rates.tracker_hz, end)
     positions, quaternions = tracker.forward(np.array(stamps) * 1e-9, _tip_at(recording))
+    stated = robot.tracker.mount_rotation
+    mount = from_vector(stated.array if stated is not None else np.zeros(3))
     keep = math.exp(-1.0 / (scenario.rates.tracker_hz * drift_time))
     wander = drift * tracker_noise.standard_normal(3)
     for ns, p, h in zip(stamps, positions, quaternions, strict=True):
         wander = keep * wander + drift * math.sqrt(1.0 - keep * keep) * tracker_noise.standard_normal(3)
         reported = p + wander + position * tracker_noise.standard_normal(3)
         turned = multiply(h, from_vector(rotation * tracker_noise.standard_normal(3)))
-        turned /= np.linalg.norm(turned)
+        turned = multiply(turned / np.linalg.norm(turned), mount)
         stamp = origin + ns
         message = encode_pose_stamped(stamp, FRAME, reported.tolist(), turned[[1, 2, 3, 0]].tolist())
         found.append((stamp + round(scenario.tracker.arrival_s * 1e9), topics.TRACKER_TIP, message))

@@ -39,7 +39,14 @@ class ActuatorMotion:
         turning = max(limits.rotation_step, limits.noise_factor * noise)
         self.names = tuple(f"tube{i + 1}_{kind}" for kind in ("rotation", "translation") for i in range(n))
         self.scale = (turning,) * n + (limits.translation_step,) * n
-        self.speeds = (limits.rotation_speed,) * n + (limits.translation_speed,) * n
+        stated = robot.actuators if robot is not None else None
+        turn = stated.rotation_speed.value if stated and stated.rotation_speed else limits.rotation_speed
+        slide = (
+            stated.translation_speed.value
+            if stated and stated.translation_speed
+            else limits.translation_speed
+        )
+        self.speeds = (turn,) * n + (slide,) * n
         self.acceleration = max(
             limits.rotation_acceleration / turning,
             limits.translation_acceleration / limits.translation_step,
