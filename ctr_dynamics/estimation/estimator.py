@@ -381,6 +381,7 @@ class Estimator:
                 f"the tracker has led the estimate astray: deviation of the tip {deviation:.2g} m, limit "
                 f"{self.robot.tubes[0].length:g} m; the filter is reinitialised from the open-loop run",
             )
+        fused.inflate_covariance(tip, self.runs.open_loop)
         self._inflate(tip.covariance, tip.position, stamp)
         deviation = position_deviation(tip.covariance)
         since = fused.measured_ns if fused.measured_ns is not None else self.t0_ns
@@ -429,7 +430,8 @@ class Estimator:
         largest = largest or self.options.deviation_fraction * self.robot.tubes[0].length
         if deviation > largest:
             return f"the tip is known to no better than the limit of {1e3 * largest:.1f} mm (output.largest_deviation_m)"
-        apart = self.health.apart_m if self.health.fusing and self.health.tracker_alive else 0.0
+        compared = self.health.fusing and self.health.tracker_alive and not self.runs.fused.late
+        apart = self.health.apart_m if compared else 0.0
         if apart > largest:
             return (
                 f"tracker and model lie {1e3 * apart:.1f} mm apart, limit {1e3 * largest:.1f} mm: check the tracker's frame and sensor, the joints' "

@@ -9,20 +9,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctr_dynamics.estimation.filter.ekf import RodEkf
-from ctr_dynamics.estimation.filter.filter_records import FilterState, Update
+from ctr_dynamics.estimation.filter.filter_records import FilterState, TipEstimate, Update
 from ctr_dynamics.estimation.inputs.input_buffer import InputBuffer
 from ctr_dynamics.estimation.inputs.measurement_queue import DueMeasurement
 from ctr_dynamics.estimation.inputs.run_inputs import InterpolatedInputs, RunInputs
-from ctr_dynamics.estimation.monitoring.delay_search import DelaySearch
+from ctr_dynamics.estimation.monitoring.delay_search import DelaySearch, allowance
 from ctr_dynamics.estimation.monitoring.health import Health
 from ctr_dynamics.estimation.monitoring.innovation_log import InnovationLog
 from ctr_dynamics.estimation.open_loop import OpenLoopRun
-from ctr_dynamics.estimation.step_output import Innovation, MotionPoint
+from ctr_dynamics.estimation.step_output import FUSION_OFF, UNKNOWN_DELAY, Innovation, MotionPoint
 from ctr_dynamics.estimation.timeline import DT, seconds
+from ctr_dynamics.kernels import rotations
 from ctr_dynamics.kernels.layout import parameters_of_inputs
 from ctr_dynamics.model.simulator import State
 
 Floats = NDArray[np.float64]
+NEGLIGIBLE = 1e-4  # probability of another delay, below which it is no matter of the covariance
 
 
 class FusedState(NamedTuple):
@@ -45,6 +47,7 @@ class FusedRun:
     Attributes:
         state: after the last step; None before the start and after what cannot be gone on from.
         measured_ns: stamp of the newest measurement that reached the gate.
+        late: whether the tracker is late by a time that is not known yet. Measurements are then compared and not fused.
     """
 
     def __init__(
@@ -56,15 +59,17 @@ class FusedRun:
         model = ekf.model
         rows = parameters_of_inputs(model.n)[: model.input_count]
         self._by_theta = ekf.uncertainty.effect[rows]  # encoder offsets and tip force
-        self.delay_search = DelaySearch(model.robot.tracker.noise.position.value)
+        self.delay_search = DelaySearch(model.robot.tracker.noise.position.value, ekf.options.force_change)
         self.state: State | None = None
         self.measured_ns: int | None = None
+        self.late = False
+        self._apart = np.zeros(3)  # m, the last measurement from the open-loop run
 
     def clear(self) -> None:
         """Have no state, and the parameters of the robot file."""
         self.ekf.forget_parameters()
         self.delay_search.clear()
-        self.state, self.measured_ns = None, None
+        self.state, self.measured_ns, self.late = None, None, False
 
     def start(self, state: State, t: float) -> None:
         """Begin at the static equilibrium ``state`` at the time ``t`` (s)."""
@@ -82,18 +87,20 @@ class FusedRun:
         for measurement, time_s, position, quaternion in due:
             measurement.fused_k = k
             motion, residual = self.residuals(time_s, position, quaternion, open_loop)
-            if motion is not None:
-                tips, own_s = open_loop.tips, time_s - self.ekf.tracker.age
-                self.delay_search.add(
-                    measurement.stamp_ns, own_s, motion.position + motion.residual, *tips.positions()
-                )
             if self._inputs.missing_at(time_s - self.ekf.tracker.age):
                 update = Update.impossible("no joint states at its time")
-            elif self._health.fusing:
+            elif self._health.fusing and not self.late:
                 update = self.ekf.update(self.state, time_s, position, quaternion)
-                self.delay_search.explained(self.ekf.adapted.sound and "outside" not in update.reason)
             else:
                 update = self.ekf.compare(time_s, position, quaternion)
+                if self.late:
+                    update = update._replace(reason=update.reason.replace(FUSION_OFF, UNKNOWN_DELAY))
+            if motion is not None and update.foretold is not None:
+                self._apart = motion.residual
+                own_s, seen = time_s - self.ekf.tracker.age, motion.position + motion.residual
+                self.delay_search.add(
+                    measurement.stamp_ns, own_s, seen, *open_loop.tips.positions(), update.foretold
+                )
             if update.dof:
                 self.measured_ns = max(self.measured_ns or 0, measurement.stamp_ns)
             else:
@@ -116,7 +123,7 @@ class FusedRun:
     ) -> tuple[MotionPoint | None, Floats | None]:
         """How far a measurement lies from both runs, before its update: the open-loop run there, and the residual (3,) m of the fused tip."""
         tracker, inputs, n = self.ekf.tracker, self._inputs, self.ekf.model.n
-        own_s = time_s - tracker.delay
+        own_s = time_s - tracker.delay - self.ekf.expected_delay
         fused = tracker.observed_tip(lambda s: self.ekf.tips.at(s, DT, columns=False), own_s)
         found = open_loop.observed(tracker, own_s)
         if fused is None or found is None:
@@ -125,7 +132,7 @@ class FusedRun:
         position, _ = tracker.to_base(position, quaternion, fused.quaternion)
         estimate = tracker.registered(self.ekf.bias, fused)[:3]
         assert inputs.t0_ns is not None
-        joints, rates = inputs.joints.at(inputs.t0_ns + (time_s - tracker.age) * 1e9)
+        joints, rates = inputs.joints.at(inputs.t0_ns + (own_s - 0.5 * tracker.averaging) * 1e9)
         motion = MotionPoint(
             position - tip.position, tip.position, tip.quaternion, tip.velocity, acceleration,
             joints[:n], rates[:n], rates[n:],
@@ -139,17 +146,43 @@ class FusedRun:
         self._health.restarts += 1
 
     def follow_delay(self, open_loop: OpenLoopRun, k: int) -> bool:
-        """Go on from the open-loop run at step ``k`` with another delay of the tracker, if measurements fit far better with it."""
+        """Go on from the open-loop run at step ``k`` with another delay of the tracker, if measurements follow it far better with that.
+
+        Where they do with many delays, as before a late tracker shows the first motion, they are not fused until one is found.
+        """
         if not self._health.fusing:
             return False
-        delay = self.delay_search.found(self.ekf.delay)
-        if delay is None:
+        search, present = self.delay_search, self.ekf.delay
+        found, was_late = search.found(present), self.late
+        self.late = found is None and search.undecided(present)
+        if found is None and (was_late or not self.late):
             return False
-        text = f"poses are {1e3 * (self.ekf.tracker.delay + delay):.0f} ms older than their stamps"
-        self._health.note("tracker", "latency", f"{text}; check the tracker's clock, or set tracker.delay_s")
-        self.ekf.expect_delay(delay, self.delay_search.options.spacing_s)
+        note = "poses are older than their stamps, by a time that is not known yet"
+        if found is not None:
+            delay, deviation = found
+            note = f"poses are {1e3 * (self.ekf.tracker.delay + delay):.0f} ms older than their stamps"
+            self.ekf.expect_delay(delay, deviation)
+            search.begin_again(delay)
+            self._health.distances.clear()
+        self._health.note("tracker", "latency", f"{note}; check the tracker's clock, or set tracker.delay_s")
         self.reinitialise(open_loop, k)
         return True
+
+    def inflate_covariance(self, tip: TipEstimate, open_loop: OpenLoopRun) -> None:
+        """Have the covariance of ``tip`` hold what else may be right: the open-loop run where the tracker may be late, the tracker where it
+        is thought to be."""
+        belief = self.delay_search.belief(self.ekf.delay)
+        if not self._health.fusing or belief.late < NEGLIGIBLE:
+            return
+        if self.late:
+            tip.covariance[:3, :3] += allowance(1.0 - belief.late) * np.multiply.outer(
+                self._apart, self._apart
+            )
+            return
+        other = open_loop.tips.last.mean
+        turn = rotations.to_vector(rotations.multiply(tip.quaternion, rotations.conjugate(other[3:7])))
+        apart = np.concatenate([tip.position - other[:3], turn, tip.twist - other[7:13]])
+        tip.covariance[:] += allowance(belief.late) * np.multiply.outer(apart, apart)
 
     def checkpoint(self) -> FusedState:
         """What :meth:`restore` returns to."""

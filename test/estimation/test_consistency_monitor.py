@@ -235,11 +235,14 @@ def test_a_late_tracker_is_noticed_and_named(replayed):
     assert monitor.causes()[0].effect in ("tracker_latency", "actuator_latency")
 
 
-def test_an_unknown_delay_of_the_tracker_is_noticed_and_ends_once_it_is_set(replayed):
-    status = replayed("latency_sweep").estimator.health.consistency.status()
-    assert status.level == WARN
-    assert "tracker_latency" in status.message
-    assert replayed("latency_sweep", tracker__delay_s=0.018).estimator.health.consistency.alarms == 0
+def test_an_unknown_delay_of_the_tracker_is_found_and_is_no_misfit_then(replayed):
+    estimator = replayed("latency_sweep").estimator
+    assert estimator.runs.fused.ekf.delay == pytest.approx(0.02, abs=0.001)
+    assert "older than their stamps" in estimator.health.tracker["latency"].last
+    assert estimator.health.consistency.alarms == 0
+    told = replayed("latency_sweep", tracker__delay_s=0.018).estimator
+    assert told.health.consistency.alarms == 0
+    assert "latency" not in told.health.tracker
 
 
 def test_a_heavier_payload_is_noticed_and_listed(replayed):

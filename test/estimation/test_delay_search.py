@@ -4,21 +4,21 @@ import numpy as np
 import pytest
 from estimation_cases import bag_messages, play, truth_error
 
-from ctr_dynamics.estimation.monitoring.delay_search import DelaySearch
+from ctr_dynamics.estimation.monitoring.delay_search import DelaySearch, allowance
 
 NOISE = 2.5e-4
 
 
-def search(path, delay, beside=(0.0, 0.0, 0.0), sound=False, seen=None):
-    """One second at 40 Hz of a tip on ``path``, measured ``delay`` late by a tracker that sees ``seen``, or the same."""
-    rng, found = np.random.default_rng(3), DelaySearch(NOISE)
-    times = np.arange(0.0, 2.0, 0.003)
-    for k in range(40):
+def search(path, delay, beside=(0.0, 0.0, 0.0), foretold=(-20.0, -2.0), seen=None, seconds=1.0):
+    """Positions at 40 Hz of a tip on ``path``, measured ``delay`` late by a tracker that sees ``seen``, or the same, beside a filter that has
+    ``foretold`` every one like that: as if a force had changed."""
+    rng, found = np.random.default_rng(3), DelaySearch(NOISE, 20.0)
+    times = np.arange(0.0, 0.9 + seconds + 0.1, 0.003)
+    for k in range(round(40 * seconds)):
         t = 0.9 + 0.025 * k
         z = (seen or path)(np.array([t - delay]))[0] + np.array(beside) + NOISE * rng.standard_normal(3)
         known = times <= t
-        found.add(round(t * 1e9), t, z, times[known], path(times[known]))
-        found.explained(sound)
+        found.add(round(t * 1e9), t, z, times[known], path(times[known]), foretold)
     return found
 
 
@@ -32,20 +32,65 @@ def vibrating(hertz):
     )
 
 
-@pytest.mark.parametrize("delay", [0.04, 0.083, 0.25])
+WELL = (-2.0, -2.0)  # as a filter foretells whose model is right
+
+
+@pytest.mark.parametrize("delay", [0.02, 0.04, 0.083, 0.25])
 def test_a_delay_is_found_beside_a_wrong_registration(delay):
-    assert search(moving, delay, (0.01, 0.0, -0.02)).found(0.0) == pytest.approx(delay, abs=0.003)
+    found = search(moving, delay, (0.01, 0.0, -0.02)).found(0.0)
+    assert found is not None
+    assert found[0] == pytest.approx(delay, abs=3.0 * found[1] + 1e-4)
+    assert found[1] < 0.002
 
 
 def test_nothing_is_found_where_nothing_is_wrong():
     assert search(moving, 0.0).found(0.0) is None
     assert search(moving, 0.08).found(0.08) is None
-    assert search(moving, 0.08, sound=True).found(0.0) is None, "the filter has explained it"
-    assert search(lambda t: np.zeros((len(t), 3)), 0.08).found(0.0) is None, "a robot at rest tells nothing"
+    assert search(moving, 0.08, foretold=WELL).belief(0.0).late < 1e-2, "the filter has foretold it"
+    still = search(lambda t: np.zeros((len(t), 3)), 0.08, foretold=WELL)
+    assert still.belief(0.0).late < 0.05, "a robot at rest tells nothing"
 
 
 def test_a_free_vibration_whose_phase_is_wrong_is_no_delay():
     assert search(vibrating(5.6), 0.0, seen=lambda t: vibrating(5.6)(t - 0.05)).found(0.0) is None
+
+
+def test_a_vibration_that_gets_out_of_phase_is_no_delay():
+    slower = search(vibrating(5.6), 0.0, seen=vibrating(5.3), foretold=(-2.5, -2.5), seconds=3.0)
+    assert slower.belief(0.0).late < 1e-3
+
+
+def test_before_a_late_tracker_shows_the_first_motion_its_delay_is_unknown():
+    def starts(t):
+        return 0.02 * np.maximum(t - 1.5, 0.0)[:, None] * np.array([1.0, 2.0, 0.5])
+
+    before = search(starts, 0.2, seconds=0.75)
+    assert before.undecided(0.0)
+    assert before.found(0.0) is None
+    after = search(starts, 0.2, seconds=1.2)
+    found = after.found(0.0)
+    assert found is not None
+    assert found[0] == pytest.approx(0.2, abs=0.01)
+    assert not after.undecided(0.0)
+
+
+def test_steps_that_are_taken_again_count_once():
+    once, twice = search(moving, 0.08), search(moving, 0.08)
+    times = np.arange(0.0, 2.0, 0.003)
+    rng = np.random.default_rng(3)
+    noise = NOISE * rng.standard_normal((40, 3))
+    for k in range(35, 40):
+        t = 0.9 + 0.025 * k
+        z = moving(np.array([t - 0.08]))[0] + noise[k]
+        known = times <= t
+        twice.add(round(t * 1e9), t, z, times[known], moving(times[known]), (-20.0, -2.0))
+    assert twice.belief(0.0) == pytest.approx(once.belief(0.0))
+
+
+def test_another_estimate_lies_within_what_its_probability_allows():
+    assert allowance(0.9) == 1.0
+    assert allowance(0.0027) == pytest.approx(1.0 / 14.2, rel=0.01)  # three deviations in three dimensions
+    assert allowance(1e-4) < allowance(1e-2) < allowance(0.4)
 
 
 @pytest.mark.parametrize("late", [0.04, 0.12])

@@ -23,6 +23,7 @@ from ctr_dynamics.estimation.filter.filter_records import (
     TipEstimate,
     Update,
 )
+from ctr_dynamics.estimation.filter.foretold_position import log_density
 from ctr_dynamics.estimation.filter.gating import Gate
 from ctr_dynamics.estimation.filter.parameter_priors import force_range, model_uncertainty
 from ctr_dynamics.estimation.filter.process_noise import ProcessNoise
@@ -121,6 +122,11 @@ class RodEkf:
     def delay(self) -> float:
         """Estimated delay of the tracker beyond the nominal one, s."""
         return float(self.bias[DELAY])
+
+    @property
+    def expected_delay(self) -> float:
+        """Delay of the tracker beyond the nominal one that the filter has begun with, s."""
+        return self._delay
 
     def expect_delay(self, delay: float, sigma: float) -> None:
         """Start with another ``delay`` of the tracker beyond the nominal one, and its deviation ``sigma``, both s; :meth:`start` is next."""
@@ -244,6 +250,11 @@ class RodEkf:
         if not self.adapted.noisy:
             S = S + (self.adapted.noise - 1.0) * R
         self.pi += self.adapted.adapt(stamp, nu, H, S, R)
+        places = self.tracker.axes < 3
+        if places.sum() == 3:
+            changed = H @ self.pi @ H.T + self.adapted.noise * R
+            foretold = log_density(nu, S, R, places), log_density(nu, changed, R, places)
+            record = record._replace(foretold=foretold)
         # 3. Gate: a single measurement outside is rejected, and so are all that the tracker's state explains.
         outside = self.gate.outside(record.nis, dof)
         self.gate.count(outside and self.adapted.sound)
@@ -301,8 +312,12 @@ class RodEkf:
         compared = self._comparison(stamp, position, quaternion)
         if isinstance(compared, Update):
             return compared
-        record = compared.record
+        nu, _, S, record = compared
         outside = self.gate.outside(record.nis, record.dof)
+        places = self.tracker.axes < 3
+        if places.sum() == 3:
+            foretold = log_density(nu, S, self.tracker.noise, places)
+            record = record._replace(foretold=(foretold, foretold))
         return record._replace(reason="outside the gate" if outside else FUSION_OFF)
 
     def _tip_at(self, time: float) -> Tip | None:

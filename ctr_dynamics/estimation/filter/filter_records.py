@@ -44,6 +44,8 @@ class Update(NamedTuple):
         variance: (6,) its predicted variance. nis, dof: normalised innovation squared and its degrees of freedom.
         accepted: whether it was fused. reason: why not, or how.
         white: (6,) residual by the inverse root of its covariance. NaN on axes that are not measured, here and in the others.
+        foretold: logarithm of the density of the measured position by what was known before it, and by the variances that it led to; 0 is that of
+            the stated noise at its middle. None where it was not compared.
     """
 
     residual: Floats
@@ -53,6 +55,7 @@ class Update(NamedTuple):
     accepted: bool
     reason: str
     white: Floats
+    foretold: tuple[float, float] | None = None
 
     @classmethod
     def impossible(cls, reason: str) -> Update:

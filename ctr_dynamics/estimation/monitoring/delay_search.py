@@ -1,19 +1,24 @@
-"""A tracker whose poses are far older than the robot file says: the delay with which measurements fit the open-loop run best.
+"""A tracker whose poses are far older than the robot file says: the delay with which measurements follow the open-loop run.
 
-A delay shows while the robot moves, and looks like a force or like noise to the filter, whose prior for it is narrow. The open-loop run does not
-depend on the tracker, so every measurement is compared with its tips of the last 0.3 s. A registration that is wrong moves all residuals alike,
-so their scatter over a short time counts.
+A delay shows while the robot moves, and looks like a force to the filter, whose prior for it is narrow. The open-loop run does not depend on the
+tracker, so every measurement is compared with its tips of the last 0.3 s. Delays and filter compete by how well each foretells the next position
+(prequential evidence, Dawid 1984).
 """
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ctr_dynamics import chi_square
+
 Floats = NDArray[np.float64]
+FINER = np.arange(-4.5, 5.0) / 10.0  # places between two delays
 
 
 @dataclass(frozen=True)
@@ -22,97 +27,183 @@ class DelaySearchOptions:
 
     Attributes:
         longest_s: largest delay beyond the nominal one. spacing_s: of those that are tried.
-        fewest: measurements that are compared. window_s: s, over which they lie at most.
-        better: times. The scatter with the delay of the filter is larger than the least by that, or the delay stays. Residuals are correlated
-            over a period of a slow vibration, so that they count as few.
-        unique: times. So much larger is the scatter at every other minimum: a free vibration fits with its period more, too. A window holds
-            some 12 independent values, for which 2.5 means odds of 2.5^6, 200 to 1.
-        fits: deviations of the noise, at most, of the scatter with the best delay. A model that does not fit with any delay tells nothing.
         least_s: a smaller difference is left to the filter's own estimate.
+        prior: probability that a tracker is late beyond that. One in a hundred has a clock or a driver of that kind.
+        believed: probability from which on the estimate begins again with the delay.
+        drift_s: time in which the open-loop run goes astray by about the tracker's noise, beside a registration that is wrong for good.
+        memory_s: s, for which evidence counts. Latency is the same for long. A vibration that gets out of phase was in phase before.
+        remembered: measurements that may be taken again.
     """
 
     longest_s: float = 0.3
-    spacing_s: float = 0.005
-    fewest: int = 8
-    window_s: float = 0.6
-    better: float = 4.0
-    unique: float = 2.5
-    fits: float = 3.0
-    least_s: float = 0.01
+    spacing_s: float = 0.0025
+    least_s: float = 0.005
+    prior: float = 0.01
+    believed: float = 0.99
+    drift_s: float = 1.0
+    memory_s: float = 10.0
+    remembered: int = 200
+
+
+class Evidence(NamedTuple):
+    """What the measurements up to ``stamp_ns`` say.
+
+    Attributes:
+        level: (d, 3) m, how far measurements lie from the open-loop run for every delay, as known from the past. variance: m^2, of it.
+        delays: (d,) logarithm of the evidence of every delay; filter: of what the filter foretold.
+    """
+
+    stamp_ns: int
+    level: Floats
+    variance: float
+    delays: Floats
+    filter: float
+
+
+class Belief(NamedTuple):
+    """Probability that the tracker is ``late``; the most likely ``delay`` and its deviation ``spread``, s; probability of being ``near`` it."""
+
+    late: float
+    delay: float
+    spread: float
+    near: float
 
 
 class DelaySearch:
-    """Scatter of the open-loop residuals for many delays.
+    """Evidence for every delay of the tracker against that of the filter.
 
     Args:
         noise: m per axis, deviation of a measured position.
+        change_s: mean time between two changes of the unknown force. The filter may have met one with every measurement.
         options: when a delay is believed.
     """
 
-    def __init__(self, noise: float, options: DelaySearchOptions | None = None) -> None:
+    def __init__(self, noise: float, change_s: float, options: DelaySearchOptions | None = None) -> None:
         self.options = options = options or DelaySearchOptions()
-        self._fits = 3.0 * (options.fits * noise) ** 2
+        self._noise, self._change_s = noise, change_s
         self.delays = np.arange(0.0, options.longest_s + 0.5 * options.spacing_s, options.spacing_s)
         self.clear()
 
     def clear(self) -> None:
         """Forget all measurements."""
-        self._compared: deque[tuple[int, Floats, bool]] = deque()
+        self._evidence: deque[Evidence] = deque(maxlen=self.options.remembered)
+        self._belief: tuple[float, Belief] | None = None
 
-    def add(self, stamp_ns: int, time_s: float, position: Floats, stamps: Floats, tips: Floats) -> None:
-        """Take in a measured tip; one of a stamp that is known takes its place.
+    def add(
+        self,
+        stamp_ns: int,
+        time_s: float,
+        position: Floats,
+        stamps: Floats,
+        tips: Floats,
+        foretold: tuple[float, float],
+    ) -> None:
+        """Take in a measured tip that the filter has met; one of a stamp that is known takes its place.
 
         Args:
             stamp_ns: of its header. time_s: its own time with the nominal delay, s from the first step.
             position: (3,) m, base axes.
             stamps, tips: (k,) s and (k, 3) m of the open-loop run.
+            foretold: what the filter foretold; see :class:`~ctr_dynamics.estimation.filter.filter_records.Update`.
         """
-        while self._compared and self._compared[-1][0] >= stamp_ns:
-            self._compared.pop()  # its step is taken again
-        while self._compared and stamp_ns - self._compared[0][0] > self.options.window_s * 1e9:
-            self._compared.popleft()
+        while self._evidence and self._evidence[-1].stamp_ns >= stamp_ns:
+            self._evidence.pop()  # its step is taken again
         times = time_s - self.delays
         if len(stamps) < 2 or times[-1] < stamps[0]:
             return
-        seen = np.stack([np.interp(times, stamps, tips[:, axis]) for axis in range(3)], axis=1)
-        self._compared.append((stamp_ns, position - seen, True))
+        self._belief = None
+        residual = position - np.stack([np.interp(times, stamps, tips[:, axis]) for axis in range(3)], axis=1)
+        noise = self._noise**2
+        if not self._evidence:
+            self._evidence.append(Evidence(stamp_ns, residual, noise, np.zeros(len(times)), 0.0))
+            return
+        # 1. The registration and the drift of the open-loop run: a random walk.
+        last, options = self._evidence[-1], self.options
+        elapsed = (stamp_ns - last.stamp_ns) * 1e-9
+        before = last.variance + noise * elapsed / options.drift_s
+        change = residual - last.level
+        total = before + noise
+        # 2. Density of the position, by that of the stated noise at zero.
+        density = -0.5 * ((change**2).sum(axis=1) / total + 3.0 * math.log(total / noise))
+        known, changed = foretold
+        likely = -math.expm1(-elapsed / self._change_s)
+        own = float(np.logaddexp(known + math.log1p(-likely), changed + math.log(likely)))
+        # 3. What is known of the past counts less and less.
+        decay = math.exp(-elapsed / options.memory_s)
+        gain = before / total
+        self._evidence.append(
+            Evidence(
+                stamp_ns,
+                last.level + gain * change,
+                before * (1.0 - gain),
+                decay * last.delays + density,
+                decay * last.filter + own,
+            )
+        )
 
-    def explained(self, sound: bool) -> None:
-        """Whether the filter has explained the last measurement by a ``sound`` tracker."""
-        if self._compared:
-            stamp_ns, residual, _ = self._compared[-1]
-            self._compared[-1] = stamp_ns, residual, sound
+    def belief(self, present_s: float) -> Belief:
+        """How likely another delay than ``present_s`` (s, beyond the nominal one) is.
 
-    def found(self, present_s: float) -> float | None:
-        """The delay (s, beyond the nominal one) that is far more likely than ``present_s``; None where there is none.
-
-        None too while the filter explains the measurements: a model whose frequencies are a little wrong vibrates late or early, which is no
-        delay of the tracker.
+        The filter may be right; so may the open-loop run with the delay that the filter has, and so may it with any other.
         """
-        options = self.options
-        recent = [sound for _, _, sound in self._compared][-options.fewest :]
-        if len(recent) < options.fewest or 2 * sum(recent) > len(recent):
-            return None
-        residuals = np.array([residual for _, residual, _ in self._compared])
-        scatter = residuals.var(axis=0).sum(axis=1) * len(residuals) / (len(residuals) - 1)
-        best = int(np.argmin(scatter))
-        now = float(np.interp(present_s, self.delays, scatter))
-        if scatter[best] > self._fits or now < options.better * max(
-            scatter[best], self._fits / options.fits**2
-        ):
-            return None
-        apart = np.abs(self.delays - self.delays[best]) > 2.0 * options.least_s
-        lowest = np.r_[True, scatter[1:] < scatter[:-1]] & np.r_[scatter[:-1] < scatter[1:], True]
-        if np.any(scatter[lowest & apart] < options.unique * scatter[best]):
-            return None
-        delay = self._vertex(scatter, best)
-        return delay if abs(delay - present_s) > options.least_s else None
+        if self._belief is None or self._belief[0] != present_s:
+            self._belief = present_s, self._compare(present_s)
+        return self._belief[1]
 
-    def _vertex(self, scatter: Floats, best: int) -> float:
-        """The lowest point of the parabola through the least scatter and its neighbours."""
-        if not 0 < best < len(scatter) - 1:
-            return float(self.delays[best])
-        before, at, after = scatter[best - 1 : best + 2]
-        second = before - 2.0 * at + after
-        shift = 0.5 * (before - after) / second if second > 0.0 else 0.0
-        return float(self.delays[best] + shift * self.options.spacing_s)
+    def _compare(self, present_s: float) -> Belief:
+        if not self._evidence:
+            return Belief(0.0, present_s, 0.0, 0.0)
+        last, options = self._evidence[-1], self.options
+        delays, evidence = self._between(last.delays)
+        other = np.abs(delays - present_s) > options.least_s
+        as_now = max([last.filter, *evidence[~other]])
+        likely = evidence[other] + math.log(options.prior / len(delays))
+        most = max(as_now, float(likely.max()))
+        weights = np.exp(likely - most)
+        weights /= weights.sum() + math.exp(as_now - most)
+        delays = delays[other]
+        near = np.abs(delays - delays[weights.argmax()]) <= 2.0 * options.least_s
+        around = float(weights[near].sum())
+        if not around:
+            return Belief(float(weights.sum()), present_s, 0.0, 0.0)
+        delay = float(weights[near] @ delays[near]) / around
+        spread = math.sqrt(float(weights[near] @ (delays[near] - delay) ** 2) / around)
+        return Belief(float(weights.sum()), delay, spread, around)
+
+    def _between(self, evidence: Floats) -> tuple[Floats, Floats]:
+        """Delays and evidence ten times as dense: parabolas through neighbours. A fast robot moves by more than the noise between two delays."""
+        at = np.clip(np.arange(len(evidence)), 1, len(evidence) - 2)
+        before, middle, after = evidence[at - 1], evidence[at], evidence[at + 1]
+        offset = np.arange(len(evidence))[:, None] - at[:, None] + FINER
+        slope, curvature = 0.5 * (after - before)[:, None], 0.5 * (before - 2.0 * middle + after)[:, None]
+        delays = self.delays[at][:, None] + self.options.spacing_s * offset
+        dense = middle[:, None] + offset * (slope + offset * curvature)
+        inside = (delays >= 0.0) & (delays <= self.options.longest_s)
+        return delays[inside], dense[inside]
+
+    def found(self, present_s: float) -> tuple[float, float] | None:
+        """The delay that is believed instead of ``present_s``, beyond the nominal one, and its deviation, s; None where there is none."""
+        belief = self.belief(present_s)
+        return (belief.delay, belief.spread) if belief.near > self.options.believed else None
+
+    def undecided(self, present_s: float) -> bool:
+        """Whether the tracker is late, by a time that is not known yet."""
+        believed = self.options.believed
+        belief = self.belief(present_s)
+        return belief.late > believed >= belief.near
+
+    def begin_again(self, present_s: float) -> None:
+        """The filter goes on from the open-loop run with the delay ``present_s``, and foretells as well as that has done."""
+        self._belief = None
+        if self._evidence:
+            last = self._evidence.pop()
+            same = np.abs(self.delays - present_s) <= self.options.least_s
+            self._evidence.append(last._replace(filter=max([last.filter, *last.delays[same]])))
+
+
+def allowance(probability: float) -> float:
+    """By how much the variance grows for each squared deviation of another estimate that is right with that ``probability``.
+
+    The other estimate must not lie farther out than a normal error of that probability, in three dimensions.
+    """
+    return 1.0 / chi_square.quantile(1.0 - max(probability, 1e-9), 3) if probability < 0.5 else 1.0
