@@ -1,51 +1,133 @@
-"""Likelihood of an innovation for every combination of three variances on which its covariance depends linearly."""
+"""A grid of three variances: the likelihood of an innovation whose covariance depends on them linearly, and their joint probabilities.
 
-import math
+The grid's axes are shift, noise and force here, the longest last: its points are computed a SIMD batch at a time.
+"""
 
 import numpy as np
 
 from ctr_dynamics.kernels.compiler import njit
+from ctr_dynamics.kernels.kinds import ONE_BATCH, SIMD_WIDTH
+from ctr_dynamics.kernels.simd import fma, view, where_above
 
 compiled = njit(cache=True, nogil=True, error_model="numpy")
 
 
 @compiled
-def log_likelihood(nu, S, parts, first, second, third, result):
-    """Logarithm of the normal density of ``nu`` (k,), but for a constant, into ``result`` (a, b, c).
+def normal_density(nu, S, parts, first, second, third, work, determinant, square):
+    """What makes up the normal density of ``nu`` (k,), exp(-square / 2) / sqrt(determinant) but for a constant.
 
-    Its covariance is S + first[i] parts[0] + second[j] parts[1] + third[l] parts[2], with ``S`` (k, k) and ``parts`` (3, k, k).
-    Minus infinity where that is not positive definite.
+    Its covariance is S + first[i] parts[0] + second[j] parts[1] + third[m] parts[2], with ``S`` (k, k) and ``parts`` (3, k, k). Written:
+    ``determinant`` and ``square`` (b, c, a), flat; a, the length of ``first``, is a multiple of 8. Where the covariance is not positive definite
+    they are 1 and infinity. ``work`` (2k (k + 1) 8,) is scratch, as views hold no array. Its Cholesky decomposition is the one without roots, L D L^T.
     """
-    k = len(nu)
-    outer, middle, root = np.empty((k, k)), np.empty((k, k)), np.empty((k, k))
-    inverse, white = np.empty(k), np.empty(k)  # of the root's diagonal; the whitened innovation
-    for i in range(len(first)):
-        for p in range(k):
-            for q in range(p + 1):
-                outer[p, q] = S[p, q] + first[i] * parts[0, p, q]
-        for j in range(len(second)):
+    k, batches = len(nu), len(first) // SIMD_WIDTH
+    rows = k * SIMD_WIDTH
+    # L D and L; D^-1 and L^-1 nu
+    scaled, lower = view(ONE_BATCH, work, 0, SIMD_WIDTH), view(ONE_BATCH, work[k * rows :], 0, SIMD_WIDTH)
+    inverse, rest = (
+        view(ONE_BATCH, work[2 * k * rows :], 0, SIMD_WIDTH),
+        view(ONE_BATCH, work[(2 * k + 1) * rows :], 0, SIMD_WIDTH),
+    )
+    changes = view(ONE_BATCH, first, 0, SIMD_WIDTH)
+    determinants, squares = (
+        view(ONE_BATCH, determinant, 0, SIMD_WIDTH),
+        view(ONE_BATCH, square, 0, SIMD_WIDTH),
+    )
+    base = np.empty((k, k))
+    at = 0
+    for j in range(len(second)):
+        for m in range(len(third)):
             for p in range(k):
                 for q in range(p + 1):
-                    middle[p, q] = outer[p, q] + second[j] * parts[1, p, q]
-            for m in range(len(third)):
-                determinant, square = 1.0, 0.0
+                    base[p, q] = S[p, q] + second[j] * parts[1, p, q] + third[m] * parts[2, p, q]
+            for batch in range(batches):
+                change = changes[batch]
+                zero = 0.0 * change
+                product, total, least = zero + 1.0, zero, zero + 1.0
                 for p in range(k):
-                    value = nu[p]
+                    value, entry = zero + nu[p], zero
                     for q in range(p + 1):
-                        entry = middle[p, q] + third[m] * parts[2, p, q]
+                        entry = fma(change, parts[0, p, q], zero + base[p, q])
                         for t in range(q):
-                            entry -= root[p, t] * root[q, t]
+                            entry = entry - scaled[p * k + t] * lower[q * k + t]
                         if q < p:
-                            root[p, q] = entry * inverse[q]
-                            value -= root[p, q] * white[q]
-                    if not entry > 0.0:
-                        determinant = 0.0
-                        break
-                    determinant *= entry
-                    inverse[p] = 1.0 / math.sqrt(entry)
-                    white[p] = value * inverse[p]
-                    square += white[p] * white[p]
-                if determinant > 0.0:
-                    result[i, j, m] = -0.5 * (math.log(determinant) + square)
-                else:
-                    result[i, j, m] = -math.inf
+                            ratio = entry * inverse[q]
+                            scaled[p * k + q] = entry
+                            lower[p * k + q] = ratio
+                            value = value - ratio * rest[q]
+                    least = where_above(entry, 0.0, least, zero)
+                    product = product * entry
+                    inverted = 1.0 / entry
+                    inverse[p] = inverted
+                    rest[p] = value
+                    total = fma(value * value, inverted, total)
+                determinants[at] = where_above(least, 0.0, product, zero + 1.0)
+                squares[at] = where_above(least, 0.0, total, zero + np.inf)
+                at += 1
+
+
+def log_likelihood(nu, S, parts, first, second, third):
+    """(a, b, c) logarithms of the normal density of ``nu`` but for a constant; arguments as of :func:`normal_density`, of any length.
+
+    Minus infinity where the covariance is not positive definite.
+    """
+    padded = np.empty(SIMD_WIDTH * -(-len(first) // SIMD_WIDTH))
+    padded[: len(first)], padded[len(first) :] = first, first[-1]
+    determinant, square = np.empty((2, len(second), len(third), len(padded)))
+    work = np.empty(2 * len(nu) * (len(nu) + 1) * SIMD_WIDTH)
+    normal_density(nu, S, parts, padded, second, third, work, determinant.reshape(-1), square.reshape(-1))
+    result = -0.5 * (np.log(determinant) + square)
+    return result[:, :, : len(first)].transpose(2, 0, 1)
+
+
+@compiled
+def update_probabilities(weights, likelihood, changes, marginals):
+    """A step of a hidden Markov chain: each variance may have changed independently, then Bayes' rule. In place.
+
+    ``weights`` (b, c, a): joint probabilities; ``likelihood`` (b, c, a): by a constant. ``changes``, of shift, noise and force: each (2, length),
+    the probability that a value is left, and that it is the one that is taken then. ``marginals``: written, of shift, noise and force.
+    """
+    (shift, noise, force), (B, C, A) = changes, weights.shape
+    left = np.empty(A)
+    for m in range(C):
+        left[:] = 0.0
+        for j in range(B):
+            for i in range(A):
+                left[i] += shift[0, j] * weights[j, m, i]
+        for j in range(B):
+            for i in range(A):
+                weights[j, m, i] += shift[1, j] * left[i] - shift[0, j] * weights[j, m, i]
+    for j in range(B):
+        left[:] = 0.0
+        for m in range(C):
+            for i in range(A):
+                left[i] += noise[0, m] * weights[j, m, i]
+        for m in range(C):
+            for i in range(A):
+                weights[j, m, i] += noise[1, m] * left[i] - noise[0, m] * weights[j, m, i]
+    by_shift, by_noise, by_force = marginals
+    by_shift[:], by_noise[:], by_force[:] = 0.0, 0.0, 0.0
+    whole = 0.0
+    for j in range(B):
+        for m in range(C):
+            leaving, total = 0.0, 0.0
+            for i in range(A):
+                leaving += force[0, i] * weights[j, m, i]
+            for i in range(A):
+                value = weights[j, m, i] * (1.0 - force[0, i]) + force[1, i] * leaving
+                value *= likelihood[j, m, i]
+                weights[j, m, i] = value
+                by_force[i] += value
+                total += value
+            by_shift[j] += total
+            by_noise[m] += total
+            whole += total
+    for j in range(B):
+        by_shift[j] /= whole
+        for m in range(C):
+            for i in range(A):
+                weights[j, m, i] /= whole
+    for m in range(C):
+        by_noise[m] /= whole
+    for i in range(A):
+        by_force[i] /= whole

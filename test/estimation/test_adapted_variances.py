@@ -127,7 +127,7 @@ def test_the_weights_are_those_of_the_likelihoods():
         elapsed = t or AdaptationOptions().shortest_interval
         before = weights
         for axis, prior in enumerate(sizes.priors):
-            leaves = -np.expm1(-elapsed / np.broadcast_to(sizes._every[axis], prior.shape))
+            leaves = -np.expm1(-elapsed * sizes._rates[axis])
             change = np.diag(1.0 - leaves) + np.outer(leaves, prior)  # from row to column
             before = np.moveaxis(np.tensordot(before, change, axes=(axis, 0)), -1, axis)
         for index in np.ndindex(weights.shape):
@@ -156,8 +156,8 @@ def test_the_likelihood_kernel_equals_its_numpy_twin():
     S, parts, nu = S + np.eye(6), np.array(parts), rng.normal(size=6)
     grids = [rng.uniform(0.0, 5.0, size) for size in (3, 2, 4)]
     grids[0][0] = -1e3  # no covariance
-    result = np.empty((3, 2, 4))
-    log_likelihood(nu, S, parts, *grids, result)
+    result = log_likelihood(nu, S, parts, *grids)
+    assert result.shape == (3, 2, 4)
     for i, j, m in np.ndindex(result.shape):
         trial = S + grids[0][i] * parts[0] + grids[1][j] * parts[1] + grids[2][m] * parts[2]
         if i == 0:

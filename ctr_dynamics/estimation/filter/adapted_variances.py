@@ -15,13 +15,15 @@ that has ended did move the robot.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg.lapack import dsygv
 
-from ctr_dynamics.kernels.variance_likelihood import log_likelihood
+from ctr_dynamics.kernels.variance_likelihood import log_likelihood, update_probabilities
 from ctr_dynamics.sensing.tracker import SHIFT, STATES
 
 Floats = NDArray[np.float64]
@@ -66,6 +68,8 @@ class AdaptedState(NamedTuple):
 
     parts: Floats
     weights: Floats
+    steady: float
+    quiet: float
     sigma: float
     shift: float
     noise: float
@@ -96,7 +100,7 @@ class AdaptedVariances:
         parts: (3, n, n) D: what of the filter's covariance is in proportion to the variances of force, shift and noise.
         fraction: largest part of an innovation's variance that the force had at the last measurement, 0 to 1, along any direction.
         reach: m. grids: of each variance, as it is: N^2, m^2, and by the stated one. priors: probabilities of their values.
-        weights: (a, b, c) their joint probabilities.
+        weights: (a, b, c) their joint probabilities. steady, quiet: probabilities that the tracker does not shift, and has the stated noise.
     """
 
     def __init__(
@@ -114,13 +118,14 @@ class AdaptedVariances:
         noise = np.r_[1.0, self._faults(options.least_noise, largest / position_noise**2)]
         self.grids = (np.exp(grid), shift, noise)
         self.priors = (likely / likely.sum(), self._prior(len(shift)), self._prior(len(noise)))
-        # s, mean time after which each value is left
-        self._every = (
-            np.array([force.change_s]),
-            *(np.r_[options.sound_s, np.full(len(g) - 1, options.fault_s)] for g in (shift, noise)),
+        # 1/s, rate at which each value is left
+        self._rates = (
+            np.full(len(grid), 1.0 / force.change_s),
+            *(1.0 / np.r_[options.sound_s, np.full(len(g) - 1, options.fault_s)] for g in (shift, noise)),
         )
+        # rows: probabilities that a value is left before the next measurement, and that it is the one that is taken
+        self._changes = tuple(np.stack([rate, prior]) for rate, prior in zip(self._rates, self.priors, strict=True))
         self.parts = np.zeros((3, 0, 0))
-        self._likelihood = np.empty(tuple(len(g) for g in self.grids))
         self._clear()
 
     def _faults(self, least: float, most: float) -> Floats:
@@ -136,19 +141,21 @@ class AdaptedVariances:
     def _clear(self) -> None:
         force, shift, noise = self.grids
         self.sigma, self.shift, self.noise = math.sqrt(force[0]), math.sqrt(shift[0]), float(noise[0])
-        self.weights = np.zeros(self._likelihood.shape)
+        weights = np.zeros((len(shift), len(noise), len(force)))  # in the order of the kernels
+        self.weights = weights.transpose(2, 0, 1)
         self.weights[:, 0, 0] = self.priors[0]
+        self.steady = self.quiet = 1.0
         self.fraction, self._stamp = 0.0, -math.inf
 
     @property
     def noisy(self) -> bool:
         """Whether it is established that the tracker has more noise than stated; the gate goes by it then."""
-        return bool(self.weights[:, :, 0].sum() < 1.0 - self.options.established)
+        return self.quiet < 1.0 - self.options.established
 
     @property
     def sound(self) -> bool:
         """Whether the tracker is more likely than not to be steady, and not established to be noisy."""
-        return not self.noisy and bool(self.weights[:, 0, :].sum() > 0.5)
+        return not self.noisy and self.steady > 0.5
 
     def start(self, pi: Floats, force: slice) -> None:
         """Begin with the least force, which the coefficients ``force`` of the covariance ``pi`` (n, n) hold, and a sound tracker."""
@@ -190,8 +197,8 @@ class AdaptedVariances:
         """The shift may have jumped since the last measurement, before one of the time ``stamp`` (s); ``pi`` (n, n) changes in place."""
         # what the filter has fused while the tracker was sound is no error of a fault that begins now
         remains = math.exp(-self._elapsed(stamp) / self.options.memory_s)
-        self.parts[SHIFT_PART] *= remains * (1.0 - self.weights[:, 0, :].sum())
-        self.parts[NOISE_PART] *= remains * (1.0 - self.weights[:, :, 0].sum())
+        self.parts[SHIFT_PART] *= remains * (1.0 - self.steady)
+        self.parts[NOISE_PART] *= remains * (1.0 - self.quiet)
         first = len(pi) - STATES
         for i in range(first + SHIFT.start, first + SHIFT.stop):
             pi[i, i] += self.shift**2
@@ -214,39 +221,38 @@ class AdaptedVariances:
         parts[NOISE_PART] += self.noise * R
         present = (self.sigma**2, self.shift**2, self.noise)
         ratios = [grid / value for grid, value in zip(self.grids, present, strict=True)]
-        log_likelihood(nu, S, parts, *(ratio - 1.0 for ratio in ratios), self._likelihood)
-        best = self._likelihood.max()
+        likelihood = log_likelihood(nu, S, parts, *(ratio - 1.0 for ratio in ratios))
+        best = likelihood.max()
         if not math.isfinite(best):
             return np.zeros_like(self.parts[0])
         # 2. Hidden Markov chain: each may have changed since the last innovation, then Bayes' rule.
         elapsed = self._elapsed(stamp)
         self._stamp = max(stamp, self._stamp)
-        weights = self.weights
-        for axis, (prior, every) in enumerate(zip(self.priors, self._every, strict=True)):
-            weights = np.moveaxis(weights, axis, -1)
-            leaves = weights * -np.expm1(-elapsed / every)
-            weights = np.moveaxis(weights - leaves + leaves.sum(axis=-1, keepdims=True) * prior, -1, axis)
-        weights *= np.exp(self._likelihood - best)
-        self.weights = weights = weights / weights.sum()
+        for left, rate in zip(self._changes, self._rates, strict=True):
+            left[0] = -np.expm1(-elapsed * rate)
+        marginals = [np.empty_like(grid) for grid in self.grids]
+        weights = self.weights.transpose(1, 2, 0).copy()  # in the order of the kernels
+        update_probabilities(
+            weights, np.exp(likelihood - best).transpose(1, 2, 0), _rolled(self._changes), _rolled(marginals)
+        )
+        self.weights = weights.transpose(2, 0, 1)
+        self.steady, self.quiet = float(marginals[1][0]), float(marginals[2][0])
         # 3. The filter goes over to the mean variances.
-        means = np.array(
-            [
-                weights.sum(axis=tuple(a for a in range(3) if a != axis)) @ ratio
-                for axis, ratio in enumerate(ratios)
-            ]
+        force, shift, noise = (
+            float(marginal @ ratio) for marginal, ratio in zip(marginals, ratios, strict=True)
         )
-        means[0] = min(max(means[0], 1.0 / options.largest_change), options.largest_change)
+        force = min(max(force, 1.0 / options.largest_change), options.largest_change)
         # a force that has become less has left its trace in Pi
-        change = np.array([max(means[0], 1.0), means[1], means[2]]) - 1.0
-        larger = S + np.einsum("i,ijk->jk", change, parts)
-        self.fraction = float(
-            np.clip(means[0] * largest_variance_fraction(parts[FORCE_PART], larger), 0.0, 1.0)
-        )
-        more = np.einsum("i,ijk->jk", change, self.parts)
-        self.parts *= means[:, None, None]
-        self.sigma *= math.sqrt(means[0])
-        self.shift *= math.sqrt(means[1])
-        self.noise *= float(means[2])
+        change = np.array([max(force, 1.0), shift, noise]) - 1.0
+        larger = S + (change @ parts.reshape(3, -1)).reshape(S.shape)
+        fraction = force * largest_variance_fraction(parts[FORCE_PART], larger)
+        self.fraction = min(max(fraction, 0.0), 1.0)
+        n = self.parts.shape[1]
+        more = (change @ self.parts.reshape(3, -1)).reshape(n, n)
+        self.parts *= np.array([force, shift, noise])[:, None, None]
+        self.sigma *= math.sqrt(force)
+        self.shift *= math.sqrt(shift)
+        self.noise *= noise
         return more
 
     @property
@@ -263,18 +269,19 @@ class AdaptedVariances:
     def correct(self, K: Floats, H: Floats, R: Floats) -> None:
         """A measurement of noise ``R`` (k, k) by the robot file has been fused with gain ``K`` (n, k) and derivative ``H`` (k, n).
 
-        (I - K H) D (I - K H)^T is multiplied as it stands and made symmetric. Written out, rounding errors grow until Pi is no covariance.
+        Each (I - K H) D (I - K H)^T is made symmetric, as rounding errors would grow.
         """
-        left = np.eye(len(K)) - K @ H
-        parts = left @ self.parts @ left.T
-        parts[NOISE_PART] += self.noise * (K @ R @ K.T)
-        self.parts = 0.5 * (parts + parts.transpose(0, 2, 1))
+        noise = np.zeros((3, *R.shape))
+        noise[NOISE_PART] = self.noise * R
+        self.parts = joseph(self.parts, K, H, noise)
 
     def checkpoint(self) -> AdaptedState:
         """What :meth:`restore` returns to."""
         return AdaptedState(
             self.parts.copy(),
             self.weights,
+            self.steady,
+            self.quiet,
             self.sigma,
             self.shift,
             self.noise,
@@ -284,14 +291,30 @@ class AdaptedVariances:
 
     def restore(self, state: AdaptedState) -> None:
         """Return to a checkpoint."""
-        parts, self.weights, self.sigma, self.shift, self.noise, self.fraction, self._stamp = state
+        (
+            parts, self.weights, self.steady, self.quiet, self.sigma, self.shift, self.noise, self.fraction, self._stamp,
+        ) = state  # fmt: skip
         self.parts = parts.copy()
 
 
+def joseph(P: Floats, K: Floats, H: Floats, R: Floats) -> Floats:
+    """(I - K H) P (I - K H)^T + K R K^T of one or several ``P`` (.., n, n) with ``R`` (.., k, k), for a gain ``K`` (n, k) and ``H`` (k, n).
+
+    Multiplied from the left, then from the right, with products of few rows only.
+    """
+    left = P - K @ (H @ P)
+    left -= (left @ H.T - K @ R) @ K.T
+    symmetric: Floats = 0.5 * (left + left.swapaxes(-1, -2))
+    return symmetric
+
+
+def _rolled(values: Sequence[Floats]) -> tuple[Floats, Floats, Floats]:
+    """Of force, shift and noise, in the order of the kernels."""
+    force, shift, noise = values
+    return shift, noise, force
+
+
 def largest_variance_fraction(part: Floats, whole: Floats) -> float:
-    """Largest fraction of the variance by ``whole`` (k, k) that ``part`` (k, k) has, along any direction."""
-    try:
-        root = np.linalg.inv(np.linalg.cholesky(whole))
-    except np.linalg.LinAlgError:
-        return 1.0
-    return float(np.linalg.eigvalsh(root @ part @ root.T)[-1])
+    """Largest fraction of the variance by ``whole`` (k, k) that ``part`` (k, k) has, along any direction: the largest x of part v = x whole v."""
+    values, _, failed = dsygv(part, whole, jobz="N")
+    return 1.0 if failed else float(values[-1])

@@ -12,7 +12,7 @@ import numpy as np
 from filterpy.kalman import ExtendedKalmanFilter
 from numpy.typing import NDArray
 
-from ctr_dynamics.estimation.filter.adapted_variances import AdaptedVariances, ForceRange
+from ctr_dynamics.estimation.filter.adapted_variances import AdaptedVariances, ForceRange, joseph
 from ctr_dynamics.estimation.filter.covariance_factor import CovarianceFactor
 from ctr_dynamics.estimation.filter.factor_reduction import reduced
 from ctr_dynamics.estimation.filter.factor_schedule import FactorSchedule
@@ -269,14 +269,16 @@ class RodEkf:
             record = record._replace(
                 reason=f"outside the gate {self.gate.rejections} times in a row: fused with an inflated covariance"
             )
-        # 5. Gain, covariance and correction; then what is left of a shift that is over.
-        self._fuse(state, nu, H, R)
+        # 5. Gain and covariance, then what is left of a shift that is over; correction by both.
+        x = self._fuse(nu, H, R)
+        x = x + self._end_shift(x)
+        self._correct(state, x)
         self.schedule.since_correction = 0
-        self._end_shift(state)
         return record._replace(accepted=True)
 
-    def _fuse(self, state: State, nu: Floats, H: Floats, R: Floats) -> None:
-        """Correct everything by an innovation ``nu`` (k,) of derivative ``H`` (k, r + 16) and stated noise ``R`` (k, k): Joseph form."""
+    def _fuse(self, nu: Floats, H: Floats, R: Floats) -> Floats:
+        """The correction (r + 16,) by an innovation ``nu`` (k,) of derivative ``H`` (k, r + 16) and stated noise ``R`` (k, k), and the covariance
+        after it: Joseph form."""
         size, dof = len(self.pi), len(nu)
         if (size, dof) not in self._filters:
             self._filters[size, dof] = ExtendedKalmanFilter(dim_x=size, dim_z=dof)
@@ -285,27 +287,33 @@ class RodEkf:
         ekf.update(nu[:, None], HJacobian=lambda x: H, Hx=lambda x: np.zeros((dof, 1)))
         self.pi = 0.5 * (ekf.P + ekf.P.T)
         self.adapted.correct(ekf.K, H, R)
-        self._correct(state, ekf.x[:, 0])
+        correction: Floats = ekf.x[:, 0]
+        return correction
 
-    def _end_shift(self, state: State) -> None:
-        """Bring the tracker's shift back to zero where the tracker is sound and nothing speaks against it.
+    def _end_shift(self, x: Floats) -> Floats:
+        """What is to be added to the correction ``x`` (r + 16,), and the covariance after it: the tracker's shift is brought back to zero where the
+        tracker is sound and nothing speaks against it.
 
         That is a measurement of the shift, zero within the noise of a position. Odds are by Bayes' rule: a shift could be anything up to the
         robot's length, which is improbable beside none unless it is many of its deviations from zero.
         """
         r = self.factor.theta.shape[1]
         rows = slice(r + SHIFT.start, r + SHIFT.stop)
-        variance, shift = self.pi[rows, rows], self.bias[SHIFT]
-        noise = self.tracker.variance[0]
+        variance, noise = self.pi[rows, rows], self.tracker.variance[0]
         if not self.adapted.sound or variance.trace() < 0.01 * noise:
-            return
+            return np.zeros_like(x)
+        shift = self.bias[SHIFT] + x[rows]
         against = shift @ np.linalg.solve(variance, shift)
         _, size = np.linalg.slogdet(variance / self.adapted.reach**2)
         if against > -size:
-            return
-        H = np.zeros((3, len(self.pi)))
+            return np.zeros_like(x)
+        R, H = noise * np.eye(3), np.zeros((3, len(x)))
         H[:, rows] = np.eye(3)
-        self._fuse(state, -shift, H, noise * np.eye(3))
+        K = np.linalg.solve(variance + self.adapted.noise * R, self.pi[rows]).T
+        self.pi = joseph(self.pi, K, H, self.adapted.noise * R)
+        self.adapted.correct(K, H, R)
+        back: Floats = K @ -shift
+        return back
 
     def compare(self, stamp: float, position: Floats, quaternion: Floats) -> Update:
         """The innovation of a measurement that is not fused; arguments as of :meth:`update`."""
