@@ -98,6 +98,10 @@ class Estimator:
         self.robot, self.settings = robot, with_robot_file(settings, robot)
         settings = self.settings
         self.options = EstimatorOptions()
+        self._length = robot.tubes[0].length
+        self._largest_deviation = (
+            float(settings["output.largest_deviation_m"]) or self.options.deviation_fraction * self._length
+        )
         self.discretisation = discretise(
             robot, int(settings["model.nodes"]), float(settings["model.accuracy_m"])
         )
@@ -371,7 +375,7 @@ class Estimator:
         stamp = self.timeline.stamp(k)
         deviation = position_deviation(tip.covariance)
         if (
-            deviation > self.robot.tubes[0].length
+            deviation > self._length
         ):  # a tip that is known no better than that is not estimated any more
             fused.reinitialise(self.runs.open_loop, k)
             self.late.history.record(k)
@@ -379,7 +383,7 @@ class Estimator:
             return self._invalid(
                 k,
                 f"the tracker has led the estimate astray: deviation of the tip {deviation:.2g} m, limit "
-                f"{self.robot.tubes[0].length:g} m; the filter is reinitialised from the open-loop run",
+                f"{self._length:g} m; the filter is reinitialised from the open-loop run",
             )
         fused.inflate_covariance(tip, self.runs.open_loop)
         self._inflate(tip.covariance, tip.position, stamp)
@@ -406,11 +410,13 @@ class Estimator:
         A rotation moves the tip at its distance from the axis, or half the robot's length where tubes turn against each other; a translation
         moves it by as much.
         """
+        if stamp <= self.inputs.joints.stamps[-1]:
+            return
         error = self.inputs.extrapolation_error(stamp)
         if not error.any():
             return
         n = self.model.n
-        half = 0.5 * (self.robot.tubes[0].length + float(self.inputs.joints.values[-1][n]))
+        half = 0.5 * (self._length + float(self.inputs.joints.values[-1][n]))
         arm = max(half, math.hypot(position[0], position[1]))
         age = (stamp - self.inputs.joints.stamps[-1]) * 1e-9
         turned = float(error[:n] @ error[:n])
@@ -426,8 +432,7 @@ class Estimator:
         limit = self.inputs.timeout_ns * 1e-9
         if age > limit:
             return f"joint states are missing: the last is {age:.3f} s old, limit {limit:g} s"
-        largest = float(self.settings["output.largest_deviation_m"])
-        largest = largest or self.options.deviation_fraction * self.robot.tubes[0].length
+        largest = self._largest_deviation
         if deviation > largest:
             return f"the tip is known to no better than the limit of {1e3 * largest:.1f} mm (output.largest_deviation_m)"
         compared = self.health.fusing and self.health.tracker_alive and not self.runs.fused.late

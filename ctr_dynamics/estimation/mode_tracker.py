@@ -63,7 +63,7 @@ class ModeTracker:
     def clear(self) -> None:
         """Forget the modes, but for what continues them in order and sign."""
         self._basis: ModalBasis | None = None
-        self._load: tuple[int, Floats] | None = None  # step and load (6,) of the last measurement
+        self._load: tuple[int, tuple[float, ...]] | None = None  # step and load (6,) of the last measurement
         self._age = self.every
         self._pending: Iterator[ModalBasis | None] | None = None
         self._own: Equilibrium | None = None
@@ -85,11 +85,12 @@ class ModeTracker:
             self.clear()
         if self._basis is None:
             return Modes.none()
-        load = np.concatenate([state.inputs.force, state.inputs.torque])
+        force, torque = state.inputs.force, state.inputs.torque
+        load = (*force.tolist(), *torque.tolist())
         before, self._load = self._load, (k, load)
         rate = None
-        if before is not None and before[0] < k and (load != before[1]).any():
-            rate = (load - before[1]) / seconds(k - before[0])
+        if before is not None and before[0] < k and load != before[1]:
+            rate = (np.array(load) - np.array(before[1])) / seconds(k - before[0])
         return self._basis.measure(state.fields, state.inputs, rate)
 
     def refresh(self, state: State, parameters: Floats) -> None:

@@ -32,6 +32,7 @@ SHIFT_STEP = 0.02  # s: the shift 50 / s lies among the slow bending modes
 BLOCK = 8  # columns that are swept together: as many lanes as one vector has
 ROUNDS = 4  # blocks of the Krylov space: the four slowest modes then hold to a percent
 MAX_DAMPING = 0.7  # damping ratio; more is no vibration
+STILL = np.zeros(6)  # rates of a load that does not change
 SMALLEST = 1e-9  # of a block's largest direction; smaller ones are rounding
 
 
@@ -70,17 +71,14 @@ class ModalBasis:
         Args:
             load_rate: (6,) rates of force (N/s) and torque (N m/s); None where they stand still.
         """
-        by_fields, by_inputs, at_rest = self._rows
-        m, n = len(self.damping), len(now.alpha)
-        values = modal_coordinates(
-            by_fields, fields, by_inputs, now.alpha, now.beta, now.force, now.torque, at_rest
-        )
-        moving = (
-            self.by_input_rates[:, :n] @ now.alpha_rate + self.by_input_rates[:, n : 2 * n] @ now.beta_rate
-        )
-        if load_rate is not None:
-            moving += self.by_input_rates[:, 2 * n :] @ load_rate
-        return Modes(self.frequency_hz, self.damping, values[:m], values[m:] - moving, self.direction)
+        by_fields, by_inputs, at_rest, by_rates = self._rows
+        m, still = len(self.damping), STILL if load_rate is None else load_rate
+        values = np.empty(2 * m)
+        modal_coordinates(
+            by_fields, fields, at_rest, by_inputs, (now.alpha, now.beta, now.force, now.torque),
+            by_rates, (now.alpha_rate, now.beta_rate, still[:3], still[3:]), values,
+        )  # fmt: skip
+        return Modes(self.frequency_hz, self.damping, values[:m], values[m:], self.direction)
 
     @property
     def _coordinates(self) -> NDArray[np.complex128]:
@@ -123,14 +121,16 @@ class ModalBasis:
         )
 
     @cached_property
-    def _rows(self) -> tuple[Floats, Floats, Floats]:
-        """Amplitudes and rates (2m,) by fields (2m, fields), by inputs (2m, 2N + 6), and in the fields and inputs of the equilibrium (2m,)."""
+    def _rows(self) -> tuple[Floats, Floats, Floats, Floats]:
+        """Amplitudes and rates (2m,) by fields (2m, fields), by inputs (2m, 2N + 6), in the fields and inputs of the equilibrium (2m,), and by the
+        inputs' rates (2m, 2N + 6)."""
         m = len(self.damping)
         turn = 2.0 * np.block(
             [[np.eye(m), np.zeros((m, m))], [np.diag(self.exponent.real), np.diag(-self.exponent.imag)]]
         )
         by_fields, by_inputs = turn @ self.readout, turn @ self.by_inputs
-        return by_fields, by_inputs, by_fields @ self.rest - by_inputs @ self.inputs
+        by_rates = np.vstack([np.zeros_like(self.by_input_rates), self.by_input_rates])
+        return by_fields, by_inputs, by_fields @ self.rest - by_inputs @ self.inputs, by_rates
 
 
 def lanes_of(model: Model) -> Lanes:

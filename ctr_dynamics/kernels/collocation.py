@@ -30,6 +30,9 @@ RISE = 5.0  # by that much
 JACOBIANS = 4  # of one solve
 # what a run does with the next sweep
 NEWTON, DAMPED, RETURN, DONE = 0, 1, 2, 3
+# columns of a run's account of a solve: whether its Jacobian is not usable; then its outcome, its sweeps and its new Jacobians
+FRESH, OUTCOME, SWEPT, RENEWED = 0, 1, 2, 3
+ACCOUNT = 4
 
 
 @njit(nogil=True)
@@ -168,12 +171,12 @@ def learn(F_step, steps, lengths, count):
 
 
 @njit(nogil=True, error_model="numpy")
-def solve_stages(kind, damping, lanes, mesh, scheme, solver, x, factors, fresh, outcome):
+def solve_stages(kind, damping, lanes, mesh, scheme, solver, x, factors, account):
     """Find the unknowns ``x`` (runs, stages, mt) of all stages, in place; the fields and nodes of the solution stay in the solver's buffers.
 
-    ``factors``: of every run, in units; ``fresh`` (runs,): those that are not usable. ``outcome`` (runs,) is set. Returns (sweeps,
-    Jacobians).
+    ``factors``: of every run, in units. ``account`` (runs, 4): what is in :data:`FRESH` is read, the rest is written. Returns (sweeps, Jacobians).
     """
+    fresh, outcome, renewed = account[:, FRESH] != 0, account[:, OUTCOME], account[:, RENEWED]
     b, units, scale = solver.stages, solver.point.units, solver.point.residual_units
     runs, stages, mt = x.shape
     L = lanes.count
@@ -182,7 +185,8 @@ def solve_stages(kind, damping, lanes, mesh, scheme, solver, x, factors, fresh, 
     steps, lengths = np.empty((runs, UPDATES, stages, mt)), np.empty((runs, UPDATES))
     work = np.empty((2, 2, mt))
     norm, least, factor = np.full(runs, math.inf), np.full(runs, math.inf), np.ones(runs)
-    count, rising, renewed = np.zeros(runs, np.int64), np.zeros(runs, np.int64), np.zeros(runs, np.int64)
+    count, rising = np.zeros(runs, np.int64), np.zeros(runs, np.int64)
+    renewed[:] = 0
     # the first sweep is at the start itself, as after a return
     phase, newest = np.full(runs, RETURN), np.zeros(runs, np.bool_)
     sweeps = 0
@@ -198,6 +202,7 @@ def solve_stages(kind, damping, lanes, mesh, scheme, solver, x, factors, fresh, 
         for g in range(runs):
             if phase[g] == DONE:
                 continue
+            account[g, SWEPT] = sweeps
             found = take_residual(b.residual, L, g * STAGES, scale, F[g])
             if phase[g] == RETURN:
                 if math.isinf(found):
@@ -318,39 +323,42 @@ def finish_stages(lanes, scheme, solver, g, bank, nodes):
 
 
 @njit(nogil=True, error_model="numpy")
-def advance_stages(kind, damping, mesh, scheme, solver, run, inputs, x, fresh):
-    """A step of one run (:class:`~ctr_dynamics.kernels.structures.CollocationRun`) with ``inputs`` (stages, inputs), from the unknowns ``x`` (1,
-    stages, mt) to those of its stages, in place.
+def advance_stages(kind, damping, mesh, scheme, solver, run, known, inputs, times, account):
+    """A step of one run (:class:`~ctr_dynamics.kernels.structures.CollocationRun`) with ``inputs`` (stages, inputs) at the stages' ``times``
+    (stages,) s.
 
     ``damping``: :data:`~ctr_dynamics.kernels.coupling.DAMPED` where a tube has damping; ``scheme``:
     :class:`~ctr_dynamics.kernels.structures.CollocationCoefficients`; ``solver``:
-    :class:`~ctr_dynamics.kernels.structures.CollocationSolver`. Returns (outcome, sweeps, Jacobians); on failure the run is as it was, but for its
-    Jacobian.
+    :class:`~ctr_dynamics.kernels.structures.CollocationSolver`. ``known``: of the run's last stages, those that tell what comes next. ``account`` (1,
+    4): as for :func:`solve_stages`. Returns (sweeps, Jacobians); on failure the run is as it was, but for its Jacobian.
     """
-    outcome, renewing = np.zeros(1, np.int64), np.full(1, fresh)
+    x = np.empty((1, STAGES, run.unknowns.shape[1]))
+    predict(run.times, run.unknowns, known, solver.point.units, times, x[0])
     prepare_stages(kind, ONE_RUN, mesh, scheme, solver, 0, run.parameters, inputs, run.bank)
     sweeps, jacobians = solve_stages(
-        kind, damping, ONE_RUN, mesh, scheme, solver, x, (run.factors,), renewing, outcome
+        kind, damping, ONE_RUN, mesh, scheme, solver, x, (run.factors,), account
     )
-    if outcome[0] == CONVERGED:
+    if account[0, OUTCOME] == CONVERGED:
         finish_stages(ONE_RUN, scheme, solver, 0, run.bank, run.nodes)
-    return outcome[0], sweeps, jacobians
+        remember_stages(run.times, run.unknowns, times, x[0])
+    return sweeps, jacobians
 
 
 @njit(nogil=True, error_model="numpy")
-def advance_two(kind, damping, mesh, scheme, solver, runs, inputs, x, fresh, outcome):
-    """A step of two ``runs`` in the same sweeps, as :func:`advance_stages` of one; ``inputs`` (2, stages, inputs), ``x`` (2, stages, mt).
+def advance_two(kind, damping, mesh, scheme, solver, runs, known, inputs, times, account):
+    """A step of two ``runs`` in the same sweeps, as :func:`advance_stages` of one; ``known`` and ``inputs`` are pairs, ``account`` is (2, 4).
 
-    ``outcome`` (2,) is set; unless both converge, both runs are as they were but for their Jacobians. Returns (sweeps, Jacobians).
+    Unless both converge, both runs are as they were but for their Jacobians. Returns (sweeps, Jacobians).
     """
     both = (runs.first, runs.second)
+    x = np.empty((2, STAGES, runs.first.unknowns.shape[1]))
     for g in range(2):
+        predict(both[g].times, both[g].unknowns, known[g], solver.point.units, times, x[g])
         prepare_stages(kind, TWO_RUNS, mesh, scheme, solver, g, both[g].parameters, inputs[g], both[g].bank)
     factors = (runs.first.factors, runs.second.factors)
-    sweeps, jacobians = solve_stages(
-        kind, damping, TWO_RUNS, mesh, scheme, solver, x, factors, fresh, outcome
-    )
-    if outcome[0] == CONVERGED and outcome[1] == CONVERGED:
+    sweeps, jacobians = solve_stages(kind, damping, TWO_RUNS, mesh, scheme, solver, x, factors, account)
+    if account[0, OUTCOME] == CONVERGED and account[1, OUTCOME] == CONVERGED:
         for g in range(2):
             finish_stages(TWO_RUNS, scheme, solver, g, both[g].bank, both[g].nodes)
+            remember_stages(both[g].times, both[g].unknowns, times, x[g])
     return sweeps, jacobians

@@ -15,20 +15,19 @@ compiled_sums = njit(cache=True, nogil=True, error_model="numpy", fastmath={"rea
 
 
 @compiled_sums
-def modal_coordinates(by_fields, fields, by_inputs, alpha, beta, force, torque, at_rest):
-    """(2m,) amplitudes and rates of modes: ``by_fields`` (2m, fields) times the ``fields``, less what the equilibrium at the inputs has."""
-    values = np.empty(len(at_rest))
+def modal_coordinates(by_fields, fields, at_rest, by_inputs, inputs, by_rates, rates, values):
+    """Amplitudes and rates of modes into ``values`` (2m,): ``by_fields`` (2m, fields) times the ``fields``, less what the equilibrium has at the
+    inputs and by their rates. ``inputs``, ``rates``: of alpha, beta, force and torque."""
     for i in range(len(values)):
         total = -at_rest[i]
         for k in range(len(fields)):
             total += by_fields[i, k] * fields[k]
         column = 0
-        for part in (alpha, beta, force, torque):
+        for part, rate in zip(inputs, rates):
             for k in range(len(part)):
-                total -= by_inputs[i, column] * part[k]
+                total -= by_inputs[i, column] * part[k] + by_rates[i, column] * rate[k]
                 column += 1
         values[i] = total
-    return values
 
 
 @compiled

@@ -46,13 +46,12 @@ def stage_rows(times, t0_ns, joints, load, rows, beta_rate):
 
 
 @compiled
-def corrected_rows(bare, load, effect, theta):
-    """(stages, inputs) rows ``bare`` with the ``load`` (inputs,) and what the parameters ``theta`` (p,) add by their ``effect`` (inputs, p)."""
-    rows = np.empty_like(bare)
+def corrected_rows(bare, load, effect, theta, rows):
+    """Into ``rows`` (stages, inputs): ``bare`` with the ``load`` (inputs,) and what the parameters ``theta`` (p,) add by their ``effect`` (inputs,
+    p)."""
     for i in range(bare.shape[1]):
         shift = load[i]
         for k in range(len(theta)):
             shift += effect[i, k] * theta[k]
         for stage in range(len(bare)):
             rows[stage, i] = bare[stage, i] + shift
-    return rows

@@ -206,13 +206,15 @@ class CollocationSolver(NamedTuple):
 
 @structure
 class CollocationRun(NamedTuple):
-    """What a run carries from step to step: parameters (NP,), fields and rates ``bank`` (3, fields), ``factors`` of its Jacobians, and states at the
-    ``nodes`` (rows,)."""
+    """What a run carries from step to step: parameters (NP,), fields and rates ``bank`` (3, fields), ``factors`` of its Jacobians, states at the
+    ``nodes`` (rows,), and ``unknowns`` (K, mt) of the last stages at their ``times`` (K,), the newest last."""
 
     parameters: np.ndarray
     bank: np.ndarray
     factors: SystemFactors
     nodes: np.ndarray
+    unknowns: np.ndarray
+    times: np.ndarray
 
 
 @structure

@@ -42,10 +42,11 @@ def registered_pose(mean, rotation, lever, bias, pose):
 
 
 @compiled
-def fused_tip(mean, columns, rotation, lever, bias, pi, force_rows, pose, covariance):
+def fused_tip(mean, columns, rotation, lever, bias, pi, force_rows, pose, covariance, sigma):
     """Pose (7,) of :func:`registered_pose` and the covariance (12, 12) of pose and twist (base axes) under ``pi`` (r + 16, r + 16).
 
-    ``columns`` (12, r): of the tip; ``force_rows`` (3, r): of the tip force. Returns that force's deviations (3,), and whether all is finite.
+    ``columns`` (12, r): of the tip; ``force_rows`` (3, r): of the tip force. ``sigma`` (3,): written, that force's deviations. Returns whether all
+    is finite.
     """
     r = columns.shape[1]
     size = r + 9  # delay, drift and shift are left out
@@ -75,7 +76,7 @@ def fused_tip(mean, columns, rotation, lever, bias, pi, force_rows, pose, covari
     whole = np.empty((15, 15))
     covariance_of(J, pi, whole)
     covariance[:] = whole[:12, :12]
-    sigma, total = np.empty(3), 0.0
+    total = 0.0
     for i in range(3):
         sigma[i] = math.sqrt(max(whole[12 + i, 12 + i], 0.0))
     for i in range(15):
@@ -83,7 +84,7 @@ def fused_tip(mean, columns, rotation, lever, bias, pi, force_rows, pose, covari
             total += whole[i, n]
     for i in range(7):
         total += pose[i]
-    return sigma, np.isfinite(total)
+    return math.isfinite(total)
 
 
 @compiled

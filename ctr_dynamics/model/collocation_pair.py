@@ -9,12 +9,12 @@ from itertools import pairwise
 import numpy as np
 
 from ctr_dynamics.errors import InputError
-from ctr_dynamics.kernels.collocation import TWO_RUNS, advance_two, predict
+from ctr_dynamics.kernels.collocation import ACCOUNT, FRESH, OUTCOME, TWO_RUNS, advance_two
 from ctr_dynamics.kernels.coupling import DAMPED, STAGES, UNDAMPED
 from ctr_dynamics.kernels.shooting import CONVERGED
 from ctr_dynamics.kernels.structures import CollocationRun, RunPair
 from ctr_dynamics.model.collocation_buffers import Workspaces
-from ctr_dynamics.model.collocation_steps import CollocationSteps, accept, recorded
+from ctr_dynamics.model.collocation_steps import CollocationSteps, accept, keeps_jacobian, recorded
 from ctr_dynamics.model.simulator import Simulator
 from ctr_dynamics.model.state import InputsAt, Record, State, StepResult, divided, stage_inputs
 from ctr_dynamics.model.time_scheme import Collocation
@@ -98,29 +98,28 @@ class CollocationPair:
             if key != a.key or last_a.beta.tobytes() != last_b.beta.tobytes():
                 return None
         work = self._workspaces.of(key, mesh, last_a.beta, scheme)
-        x = np.empty((2, STAGES, a.unknowns.shape[1]))
-        fresh, outcome = np.empty(2, np.bool_), np.zeros(2, np.int64)
-        for g, state in enumerate((a, b)):
-            predict(state.times, state.unknowns, state.known, work.solver.point.units, times, x[g])
-            fresh[g] = not state.usable
         one, other = self._steps
+        account = np.zeros((2, ACCOUNT), np.int64)
+        account[0, FRESH], account[1, FRESH] = not a.usable, not b.usable
         damping = DAMPED if one.damping is DAMPED or other.damping is DAMPED else UNDAMPED
         runs = self._together(
             a.run(one.parameters, work.factors_in), b.run(other.parameters, work.factors_in)
         )
         sweeps, jacobians = advance_two(
-            model.kind, damping, work.segments.mesh, scheme.coefficients, work.solver, runs, np.stack((rows_a, rows_b)), x, fresh, outcome
+            model.kind, damping, work.segments.mesh, scheme.coefficients, work.solver, runs, (a.known, b.known), (rows_a, rows_b), times, account
         )  # fmt: skip
-        a.usable, b.usable = (bool(found == CONVERGED) for found in outcome)
-        if not (a.usable and b.usable):
+        a_outcome, b_outcome = account[:, OUTCOME].tolist()
+        if a_outcome != CONVERGED or b_outcome != CONVERGED:
+            a.usable, b.usable = a_outcome == CONVERGED, b_outcome == CONVERGED
             return None
-        a.mesh = b.mesh = mesh
-        accept(a, times, x[0], last_a)
-        accept(b, times, x[1], last_b)
+        for state, last, (_, _, swept, renewed) in zip((a, b), (last_a, last_b), account.tolist(), strict=True):
+            state.mesh = mesh
+            accept(state, last)
+            state.usable = keeps_jacobian(state, swept, renewed > 0)
         records: tuple[Record, ...] = ()
         if record:
             own = np.asarray if scheme is self.scheme else np.copy  # parts of a step share one bank
-            records = (recorded(model, a, scheme, rows_a, x[0], times, own),)
+            records = (recorded(model, a, scheme, rows_a, a.unknowns[-STAGES:], times, own),)
         return (
             StepResult(True, "ok", sweeps - 1, sweeps, jacobians, 1, records),
             StepResult(True, "ok", sweeps - 1, sweeps, jacobians),

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctr_dynamics.errors import InputError
-from ctr_dynamics.kernels.collocation import advance_stages, predict, remember_stages
+from ctr_dynamics.kernels.collocation import ACCOUNT, FRESH, OUTCOME, SWEPT, advance_stages, remember_stages
 from ctr_dynamics.kernels.coupling import DAMPED, STAGES, UNDAMPED, Damping
 from ctr_dynamics.kernels.layout import RATE_NOW, RATES, Y_BEFORE, Y_NOW, state_rows
 from ctr_dynamics.kernels.segmented_shooting import advance_segmented
@@ -40,6 +40,7 @@ Recorded = bool | Literal["end"]
 PAST = 12  # stages whose unknowns are kept: a step's, and those before it through which a polynomial of degree 6 goes
 RESCUE = "sdirk3"  # stage by stage, each with its own Jacobian: it stands stages that differ too much for a common one
 HALVINGS = 5
+JACOBIAN_COST = 20  # sweeps: twice what a new Jacobian with its factors costs, as a part of what goes beyond the fewest is chance
 
 
 class CollocationSteps:
@@ -56,7 +57,7 @@ class CollocationSteps:
         self.model, self.scheme, self.parameters = model, scheme, parameters
         self.workspaces = Workspaces(model, scheme, tolerance)
         rows = model.layout.rows
-        self._damping_rows = np.concatenate([rows("bending_damping"), rows("torsion_damping")])
+        self._damping_rows = [*rows("bending_damping").tolist(), *rows("torsion_damping").tolist()]
 
     def shift(self, state: State, change: Floats, nodes: Floats) -> None:
         """Move the unknowns of ``state`` with a correction: the first of them by ``change`` (5 + N,), those at the cuts as the ``nodes`` (P, S)."""
@@ -66,7 +67,7 @@ class CollocationSteps:
     @property
     def damping(self) -> Damping:
         """Whether a tube of the run has damping."""
-        return DAMPED if self.parameters[self._damping_rows].any() else UNDAMPED
+        return DAMPED if any(map(self.parameters.item, self._damping_rows)) else UNDAMPED
 
     def rest(self, equilibrium: Equilibrium, inputs: Inputs) -> State:
         """State at rest in the ``equilibrium`` at ``inputs``."""
@@ -141,24 +142,26 @@ class CollocationSteps:
         if isinstance(moved, StepResult):
             return moved
         work = self.workspaces.of(moved.key, moved.mesh, last.beta, scheme)
-        x = np.empty((1, STAGES, moved.unknowns.shape[1]))
-        predict(moved.times, moved.unknowns, moved.known, work.solver.point.units, times, x[0])
-        outcome, sweeps, jacobians = advance_stages(
+        account = np.zeros((1, ACCOUNT), np.int64)
+        account[0, FRESH] = fresh or not moved.usable
+        sweeps, jacobians = advance_stages(
             model.kind, self.damping, work.segments.mesh, scheme.coefficients, work.solver,
-            moved.run(self.parameters, work.factors_in), inputs, x, fresh or not moved.usable,
+            moved.run(self.parameters, work.factors_in), moved.known, inputs, times, account,
         )  # fmt: skip
         state.usable = False
+        outcome = int(account[0, OUTCOME])
         if outcome != CONVERGED:
             return StepResult(False, OUTCOMES[outcome], sweeps - 1, sweeps, jacobians)
-        accept(moved, times, x[0], last)
+        accept(moved, last)
         if moved is not state:
             state.become(moved)
-        state.usable = True
+        state.usable = keeps_jacobian(state, int(account[0, SWEPT]), jacobians > 0)
         records: tuple[Record, ...] = ()
         if record:
             # parts of a step share one bank
             own = np.asarray if record == "end" and scheme is self.scheme else np.copy
-            records = (recorded(model, state, scheme, inputs, x[0], times, own),)
+            found = state.unknowns[-STAGES:]
+            records = (recorded(model, state, scheme, inputs, found, times, own),)
         return StepResult(True, "ok", sweeps - 1, sweeps, jacobians, records=records)
 
     def at_sections(self, state: State, inputs: Floats, last: Inputs) -> State | StepResult:
@@ -228,7 +231,8 @@ class CollocationSteps:
                     break
                 trial.bank[Y_NOW], trial.bank[RATE_NOW] = bank[Y_NOW], bank[RATES + used.stages - 1]
                 trial.nodes = solver.single.nodes.reshape(-1, state_rows(model.n).size).copy()
-                accept(trial, times, found, last)
+                remember_stages(trial.times, trial.unknowns, times, found)
+                accept(trial, last, len(times))
                 if record:
                     records.append(recorded(model, trial, used, inputs, found, times, np.copy))
             if ok:
@@ -247,11 +251,21 @@ class CollocationSteps:
         return solver
 
 
-def accept(state: State, times: Floats, found: Floats, last: Inputs) -> None:
-    """The stages ``found`` at ``times`` are the newest of ``state``; ``last`` are its inputs."""
-    remember_stages(state.times, state.unknowns, times, found)
-    state.known = min(state.known + len(times), PAST)
+def accept(state: State, last: Inputs, stages: int = STAGES) -> None:
+    """The newest unknowns of ``state`` are those of ``stages`` more stages; ``last`` are its inputs."""
+    state.known = min(state.known + stages, PAST)
     state.inputs = last
+
+
+def keeps_jacobian(state: State, sweeps: int, renewed: bool) -> bool:
+    """Whether the Jacobian of ``state`` serves the next step too, after one that has taken ``sweeps`` sweeps; ``renewed``: with a new one.
+
+    The trajectory moves away from where it was taken, and steps take more and more sweeps. It is renewed when these have cost as much as new ones:
+    where they grow evenly, that is the least cost in the mean.
+    """
+    state.fewest = sweeps if renewed else min(state.fewest, sweeps)
+    state.beyond = 0 if renewed else state.beyond + sweeps - state.fewest
+    return state.beyond < JACOBIAN_COST
 
 
 def recorded(
@@ -265,7 +279,7 @@ def recorded(
 ) -> Record:
     """What the tangent of the step needs, of its last stage; ``own`` copies what the state may go on to write before that is read."""
     rates = own(state.bank[RATE_NOW : RATE_NOW + 1])
-    first = np.ascontiguousarray(found[:, : model.unknown_count])
+    first = found[:, : model.unknown_count].copy()
     return Record(
         scheme, state.key, state.mesh, state.bank[:0], own(state.bank[Y_NOW]), rates, inputs, first, times
     )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from operator import is_not
 from typing import NamedTuple
 
 import numpy as np
@@ -88,7 +89,8 @@ class State:
 
     ``bank``: stored fields, those of now first. Of schemes that solve their stages one by one, ``unknowns`` (stages, 5 + N) are of the last step and
     ``earlier`` (EARLIER, stages, 5 + N) of those before. Of collocation ``unknowns`` (K, mt) are of the last stages, the newest last, at their
-    ``times`` (K,) s, of which the last ``known`` tell what comes next; ``earlier`` is empty.
+    ``times`` (K,) s, of which the last ``known`` tell what comes next; ``earlier`` is empty. Since there is its Jacobian, ``fewest`` sweeps have been
+    wanted by a step, and ``beyond`` those by all steps.
     """
 
     key: tuple
@@ -102,6 +104,8 @@ class State:
     inputs: Inputs
     times: np.ndarray = field(default_factory=lambda: np.zeros(0))
     known: int = 0
+    fewest: int = 0
+    beyond: int = 0
     _arrays: RunArrays | None = field(default=None, repr=False, compare=False)
     _run: tuple[tuple[np.ndarray, ...], CollocationRun] | None = field(
         default=None, repr=False, compare=False
@@ -111,7 +115,7 @@ class State:
         """An independent copy; meshes are shared, they are never written."""
         return State(
             self.key, self.mesh, self.bank.copy(), self.unknowns.copy(), self.earlier.copy(), self.inverse.copy(), self.usable,
-            self.nodes.copy(), self.inputs, self.times.copy(), self.known,
+            self.nodes.copy(), self.inputs, self.times.copy(), self.known, self.fewest, self.beyond,
         )  # fmt: skip
 
     def become(self, other: State) -> None:
@@ -146,9 +150,11 @@ class State:
 
     def run(self, parameters: np.ndarray, factors: Callable[[np.ndarray], SystemFactors]) -> CollocationRun:
         """The arrays for the kernels of collocation, with ``factors`` of the flat ``inverse``; the same object while they are the same."""
-        arrays = parameters, self.bank, self.inverse, self.nodes
-        if self._run is None or any(a is not b for a, b in zip(self._run[0], arrays, strict=True)):
-            run = CollocationRun(parameters, self.bank, factors(self.inverse), self.nodes.reshape(-1))
+        arrays = parameters, self.bank, self.inverse, self.nodes, self.unknowns, self.times
+        if self._run is None or any(map(is_not, self._run[0], arrays)):
+            run = CollocationRun(
+                parameters, self.bank, factors(self.inverse), self.nodes.reshape(-1), self.unknowns, self.times
+            )
             self._run = arrays, run
         return self._run[1]
 

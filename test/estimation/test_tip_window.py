@@ -142,10 +142,9 @@ def test_registered_pose_and_covariance_equal_finite_differences():
         at = moved(tip, a)
         mean = np.concatenate([at.position, at.quaternion, at.velocity, at.rate])
         pose, covariance = np.empty(7), np.empty((12, 12))
-        _, finite = fused_tip(
-            mean, tip.columns, tracker.rotation, tracker.lever, b, pi, NO_FORCE, pose, covariance
+        assert fused_tip(
+            mean, tip.columns, tracker.rotation, tracker.lever, b, pi, NO_FORCE, pose, covariance, np.empty(3)
         )
-        assert finite
         return pose, covariance
 
     pi = np.eye(COLUMNS + STATES)
@@ -174,7 +173,7 @@ def test_registered_pose_is_what_a_perfect_tracker_with_nominal_geometry_sees():
     pose, covariance = np.empty(7), np.empty((12, 12))
     mean = np.concatenate([tip.position, tip.quaternion, tip.velocity, tip.rate])
     pi = np.eye(COLUMNS + STATES)
-    fused_tip(mean, tip.columns, tracker.rotation, tracker.lever, bias, pi, NO_FORCE, pose, covariance)
+    fused_tip(mean, tip.columns, tracker.rotation, tracker.lever, bias, pi, NO_FORCE, pose, covariance, np.empty(3))
     assert np.allclose(pose[:3], position, atol=1e-12)
     assert np.allclose(matrix(pose[3:]), matrix(quaternion), atol=1e-12)
 
@@ -187,8 +186,8 @@ def test_what_is_not_finite_is_noticed():
     pi[0, 0] = np.nan
     none = np.zeros(STATES)
     assert not fused_tip(
-        mean, tip.columns, tracker.rotation, tracker.lever, none, pi, NO_FORCE, pose, covariance
-    )[1]
+        mean, tip.columns, tracker.rotation, tracker.lever, none, pi, NO_FORCE, pose, covariance, np.empty(3)
+    )
 
 
 def test_the_published_tip_comes_with_the_deviation_of_the_force():
@@ -197,12 +196,12 @@ def test_the_published_tip_comes_with_the_deviation_of_the_force():
     rng = np.random.default_rng(5)
     root = rng.normal(size=(COLUMNS + STATES, COLUMNS + STATES))
     pi, force_rows = root @ root.T, rng.normal(size=(3, COLUMNS))
-    whole = np.empty(7), np.empty((12, 12))
+    sigma = np.empty(3)
+    whole = np.empty(7), np.empty((12, 12)), sigma
     given = (mean, tip.columns, tracker.rotation, tracker.lever, bias, pi)
-    sigma, finite = fused_tip(*given, force_rows, *whole)
-    assert finite
+    assert fused_tip(*given, force_rows, *whole)
     assert np.allclose(sigma**2, np.diag(force_rows @ pi[:COLUMNS, :COLUMNS] @ force_rows.T))
-    assert not fused_tip(*given, force_rows * np.nan, *whole)[1]
+    assert not fused_tip(*given, force_rows * np.nan, *whole)
 
 
 # -- the window --

@@ -66,6 +66,7 @@ class RodEkf:
         sigma = np.where(self.uncertainty.sigma > 0, self.uncertainty.sigma, least)
         self._parameter_weights = (options.parameter_energy / sigma)[:, None]
         self._least_force = least
+        self._length = float(self.model.robot.lengths[0])
         self.nominal = simulator.parameters.copy()
         self.theta = np.zeros(len(self.uncertainty.names))
         self.bias = np.zeros(STATES)
@@ -173,7 +174,7 @@ class RodEkf:
         # 3. Is the factor propagated now, or later over this step and the next?
         skipped, records = self.schedule.skipped, result.records
         assert self._strides is not None
-        stride = self._strides.at(exposed(self.model, state))
+        stride = self._strides.at(exposed(self._length, state))
         self.schedule.most_skipped = stride.steps - 1
         propagate = self.schedule.plan_step(
             records[0].key, records[-1].key, len(records) > 1, measured, idle, self.adapted.fraction
@@ -382,17 +383,17 @@ class RodEkf:
     def tip_estimate(self) -> TipEstimate:
         """Fused tip now."""
         tip = self.tips.last
-        pose, covariance = np.empty(7), np.empty((12, 12))
-        sigma, finite = fused_tip(
+        pose, covariance, sigma = np.empty(7), np.empty((12, 12)), np.empty(3)
+        finite = fused_tip(
             tip.mean, tip.columns, self.tracker.rotation, self.tracker.lever, self.bias, self.pi, self.factor.theta[self._force],
-            pose, covariance,
+            pose, covariance, sigma,
         )  # fmt: skip
         return TipEstimate(pose[:3], pose[3:], tip.mean[7:13].copy(), covariance, sigma, finite)
 
     def tracker_fault(self) -> tuple[float, float]:
         """By how much measured positions are shifted (m; 0 where that is within three deviations of their noise), and the tracker's noise by the
         stated deviation (1 while nothing else is established)."""
-        shift = float(np.linalg.norm(self.bias[SHIFT]))
+        shift = math.hypot(*self.bias[SHIFT].tolist())
         ratio = math.sqrt(self.adapted.noise) if self.adapted.noisy else 1.0
         return shift if shift > 3.0 * math.sqrt(self.tracker.variance[0]) else 0.0, ratio
 

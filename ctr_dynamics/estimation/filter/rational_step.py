@@ -81,9 +81,9 @@ def column_error(fraction: PartialFractions, frequency_hz: NDArray[np.float64], 
     return float((weights * np.minimum(errors, 1.0)).sum() / weights.sum())
 
 
-def exposed(model: Model, state: State) -> float:
-    """Length of tube 1 in front of the plate, m."""
-    return float(model.robot.lengths[0] + state.inputs.beta[0])
+def exposed(length: float, state: State) -> float:
+    """Length (m) in front of the plate of tube 1 of that ``length`` (m)."""
+    return length + float(state.inputs.beta[0])
 
 
 class Stride(NamedTuple):
@@ -116,7 +116,7 @@ class ColumnStrides:
         frequency = np.zeros(0) if basis is None else basis.frequency_hz
         # at the rate 1/s, of whose root the growth is a multiple
         by_root = float(growth(model, state.mesh, state.inputs.beta, 1.0).sum())
-        return cls(frequency, exposed(model, state), by_root, dt)
+        return cls(frequency, exposed(float(model.robot.lengths[0]), state), by_root, dt)
 
     def at(self, length: float) -> Stride:
         """For the exposed ``length`` (m). Frequencies go as its inverse square, as those of bending do."""

@@ -111,7 +111,8 @@ class RunInputs:
     def stages(self, times: Floats) -> tuple[Floats, Inputs]:
         """Inputs at all stages of a step; see :func:`ctr_dynamics.model.simulator.stage_inputs`."""
         rows, beta_rate = self.interpolated.rows(times)
-        corrected = corrected_rows(rows, self.load, self.effect, self.theta)
+        corrected = np.empty_like(rows)
+        corrected_rows(rows, self.load, self.effect, self.theta, corrected)
         n, last = self.interpolated.n, corrected[-1]
         return corrected, Inputs(
             last[:n],

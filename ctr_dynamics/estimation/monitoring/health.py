@@ -85,7 +85,9 @@ class Health:
         shift_m: m, by which measured positions lie beside what any force on the robot explains; 0 where they do not.
         noise_ratio: deviation of the tracker's noise by the stated one; 1 while nothing else is established.
         residuals: of the measurements that were used; unused_residuals: of those that were rejected or dropped.
-        distances: m, between measured and published positions, of the last measurements.
+        distances: m, between measured and published positions, of the last measurements. apart_m: their median, as half of them may be outliers,
+            whatever the filter made of them; 0 before there are ``FEWEST_APART``.
+        outside: how many of the recent measurements lay outside the gate.
         consistency: watches the innovations. stability: of the equilibrium that belongs to the present actuators.
     """
 
@@ -123,6 +125,8 @@ class Health:
     unused_residuals: Residuals = NOTHING_COMPARED
 
     distances: deque[float] = field(default_factory=lambda: deque(maxlen=APART))
+    apart_m: float = 0.0
+    outside: int = 0
 
     # -- counting --
 
@@ -150,8 +154,11 @@ class Health:
         )
         if innovation.dof:
             self.recent.append((innovation.nis / innovation.dof, within))
+            self.outside = sum(not other for _, other in self.recent)
         if innovation.fused_residual is not None:
             self.distances.append(float(np.linalg.norm(innovation.fused_residual)))
+            if len(self.distances) >= FEWEST_APART:
+                self.apart_m = statistics.median(self.distances)
         if again:
             return
         used = bool(innovation.dof) and (innovation.accepted or not self.fusing)
@@ -192,12 +199,14 @@ class Health:
         self.residuals, self.unused_residuals = counts.residuals, counts.unused_residuals
         self.recent.clear()
         self.recent.extend(counts.recent)
+        self.outside = sum(not within for _, within in self.recent)
 
     def reinitialise(self) -> None:
         """Wait for joints and watch afresh; counters of what was odd stay."""
         self.problem = WAITING
         self.recent.clear()
         self.distances.clear()
+        self.outside, self.apart_m = 0, 0.0
         self.consistency.clear()
 
     # -- what it comes to --
@@ -211,19 +220,6 @@ class Health:
     def inconsistent(self) -> bool:
         """Whether the consistency monitor's alarm stands and measurements still come."""
         return self.consistency.alarm and self.tracker_alive
-
-    @property
-    def apart_m(self) -> float:
-        """How far the last measured positions lie from the tip that was published for their times, m, whatever the filter made of them.
-
-        The median of the last ``APART``: half of them may be outliers. 0 before there are ``FEWEST_APART``.
-        """
-        return statistics.median(self.distances) if len(self.distances) >= FEWEST_APART else 0.0
-
-    @property
-    def outside(self) -> int:
-        """How many of the recent measurements lay outside the gate."""
-        return sum(not within for _, within in self.recent)
 
     @property
     def rejecting(self) -> bool:
