@@ -374,9 +374,7 @@ class Estimator:
             return self._invalid(k, "the estimate is not finite; the model is reinitialised at rest")
         stamp = self.timeline.stamp(k)
         deviation = position_deviation(tip.covariance)
-        if (
-            deviation > self._length
-        ):  # a tip that is known no better than that is not estimated any more
+        if deviation > self._length:  # a tip that is known no better than that is not estimated any more
             fused.reinitialise(self.runs.open_loop, k)
             self.late.history.record(k)
             health.failed("led astray")

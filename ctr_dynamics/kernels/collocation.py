@@ -335,9 +335,7 @@ def advance_stages(kind, damping, mesh, scheme, solver, run, known, inputs, time
     x = np.empty((1, STAGES, run.unknowns.shape[1]))
     predict(run.times, run.unknowns, known, solver.point.units, times, x[0])
     prepare_stages(kind, ONE_RUN, mesh, scheme, solver, 0, run.parameters, inputs, run.bank)
-    sweeps, jacobians = solve_stages(
-        kind, damping, ONE_RUN, mesh, scheme, solver, x, (run.factors,), account
-    )
+    sweeps, jacobians = solve_stages(kind, damping, ONE_RUN, mesh, scheme, solver, x, (run.factors,), account)
     if account[0, OUTCOME] == CONVERGED:
         finish_stages(ONE_RUN, scheme, solver, 0, run.bank, run.nodes)
         remember_stages(run.times, run.unknowns, times, x[0])

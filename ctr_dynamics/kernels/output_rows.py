@@ -2,8 +2,6 @@
 
 import math
 
-import numpy as np
-
 from ctr_dynamics.kernels.compiled_rotations import matrix
 from ctr_dynamics.kernels.compiler import njit
 from ctr_dynamics.kernels.layout import field_rows

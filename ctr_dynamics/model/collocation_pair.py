@@ -112,7 +112,9 @@ class CollocationPair:
         if a_outcome != CONVERGED or b_outcome != CONVERGED:
             a.usable, b.usable = a_outcome == CONVERGED, b_outcome == CONVERGED
             return None
-        for state, last, (_, _, swept, renewed) in zip((a, b), (last_a, last_b), account.tolist(), strict=True):
+        for state, last, (_, _, swept, renewed) in zip(
+            (a, b), (last_a, last_b), account.tolist(), strict=True
+        ):
             state.mesh = mesh
             accept(state, last)
             state.usable = keeps_jacobian(state, swept, renewed > 0)

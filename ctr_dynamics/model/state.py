@@ -153,7 +153,12 @@ class State:
         arrays = parameters, self.bank, self.inverse, self.nodes, self.unknowns, self.times
         if self._run is None or any(map(is_not, self._run[0], arrays)):
             run = CollocationRun(
-                parameters, self.bank, factors(self.inverse), self.nodes.reshape(-1), self.unknowns, self.times
+                parameters,
+                self.bank,
+                factors(self.inverse),
+                self.nodes.reshape(-1),
+                self.unknowns,
+                self.times,
             )
             self._run = arrays, run
         return self._run[1]

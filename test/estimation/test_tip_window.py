@@ -173,7 +173,9 @@ def test_registered_pose_is_what_a_perfect_tracker_with_nominal_geometry_sees():
     pose, covariance = np.empty(7), np.empty((12, 12))
     mean = np.concatenate([tip.position, tip.quaternion, tip.velocity, tip.rate])
     pi = np.eye(COLUMNS + STATES)
-    fused_tip(mean, tip.columns, tracker.rotation, tracker.lever, bias, pi, NO_FORCE, pose, covariance, np.empty(3))
+    fused_tip(
+        mean, tip.columns, tracker.rotation, tracker.lever, bias, pi, NO_FORCE, pose, covariance, np.empty(3)
+    )
     assert np.allclose(pose[:3], position, atol=1e-12)
     assert np.allclose(matrix(pose[3:]), matrix(quaternion), atol=1e-12)
 

@@ -124,7 +124,9 @@ class AdaptedVariances:
             *(1.0 / np.r_[options.sound_s, np.full(len(g) - 1, options.fault_s)] for g in (shift, noise)),
         )
         # rows: probabilities that a value is left before the next measurement, and that it is the one that is taken
-        self._changes = tuple(np.stack([rate, prior]) for rate, prior in zip(self._rates, self.priors, strict=True))
+        self._changes = tuple(
+            np.stack([rate, prior]) for rate, prior in zip(self._rates, self.priors, strict=True)
+        )
         self.parts = np.zeros((3, 0, 0))
         self._clear()
 
