@@ -21,7 +21,8 @@ def modal_coordinates(by_fields, fields, at_rest, by_inputs, inputs, by_rates, r
         for k in range(len(fields)):
             total += by_fields[i, k] * fields[k]
         column = 0
-        for part, rate in zip(inputs, rates):
+        for p in range(len(inputs)):
+            part, rate = inputs[p], rates[p]
             for k in range(len(part)):
                 total -= by_inputs[i, column] * part[k] + by_rates[i, column] * rate[k]
                 column += 1

@@ -18,7 +18,8 @@ def normal_density(nu, S, parts, first, second, third, work, determinant, square
 
     Its covariance is S + first[i] parts[0] + second[j] parts[1] + third[m] parts[2], with ``S`` (k, k) and ``parts`` (3, k, k). Written:
     ``determinant`` and ``square`` (b, c, a), flat; a, the length of ``first``, is a multiple of 8. Where the covariance is not positive definite
-    they are 1 and infinity. ``work`` (2k (k + 1) 8,) is scratch, as views hold no array. Its Cholesky decomposition is the one without roots, L D L^T.
+    they are 1 and infinity. ``work`` (2k (k + 1) 8,) is scratch, as views hold no array. The Cholesky decomposition is the one without roots,
+    L D L^T.
     """
     k, batches = len(nu), len(first) // SIMD_WIDTH
     rows = k * SIMD_WIDTH
