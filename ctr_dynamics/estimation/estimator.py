@@ -260,6 +260,7 @@ class Estimator:
         runs, history = self.runs, self.late.history
         if runs.fused.state is None:
             return
+        runs.fused.ekf.adapted.settle()
         if runs.fused.ekf.add_noise_and_reduce() and history.last is not None and history.last.k == self.k:
             history.record(self.k)  # who returns to that step need not do it again
         if self._stability_due:

@@ -1,7 +1,10 @@
-"""A grid of three variances: the likelihood of an innovation whose covariance depends on them linearly, and their joint probabilities.
+"""What innovations say: the likelihood of one whose covariance depends linearly on three variances, on a grid, and their joint probabilities; how
+well a position has been foretold; and whether a state has come back to zero.
 
 The grid's axes are shift, noise and force here, the longest last: its points are computed a SIMD batch at a time.
 """
+
+import math
 
 import numpy as np
 
@@ -132,3 +135,86 @@ def update_probabilities(weights, likelihood, changes, marginals):
         by_noise[m] /= whole
     for i in range(A):
         by_force[i] /= whole
+
+
+@compiled
+def position_density(nu, S, R):
+    """How well a filter foretells a measured position: logarithm of the normal density of the first three rows of an innovation ``nu`` (k,) with
+    covariance ``S`` (k, k), by that of the stated noise ``R`` (k, k), diagonal, at its middle. Minus infinity where that is no covariance."""
+    root, white = np.empty((3, 3)), np.empty(3)
+    total = 0.0
+    for p in range(3):
+        value = nu[p]
+        for q in range(p + 1):
+            entry = S[p, q]
+            for t in range(q):
+                entry -= root[p, t] * root[q, t]
+            if q < p:
+                root[p, q] = entry / root[q, q]
+                value -= root[p, q] * white[q]
+            elif entry > 0.0:
+                root[p, p] = math.sqrt(entry)
+            else:
+                return -math.inf
+        white[p] = value / root[p, p]
+        total += white[p] ** 2 + 2.0 * math.log(root[p, p]) - math.log(R[p, p])
+    return -0.5 * total
+
+
+@compiled
+def pull_to_zero(pi, first, noise, most, x, gain):
+    """The measurement that three states from ``first`` on are zero, of variance ``noise``, where it is plausible; returns whether it is.
+
+    ``pi`` (n, n): covariance, updated in place in Joseph form; ``x`` (n,): the estimate, corrected in place; ``gain`` (n, 3): written. Plausible: the
+    states' squared distance from zero, by their covariance V, is at most -log det V of V by the variance ``most``.
+    """
+    n = len(pi)
+    V, states = pi[first : first + 3, first : first + 3].copy(), x[first : first + 3].copy()
+    _, size, square = _inverse(V, states)
+    if square > 3.0 * math.log(most) - size:
+        return False
+    for i in range(3):
+        V[i, i] += noise
+    inverse, _, _ = _inverse(V, states)
+    rows = pi[first : first + 3].copy()
+    for i in range(n):
+        for a in range(3):
+            gain[i, a] = 0.0
+            for b in range(3):
+                gain[i, a] += rows[b, i] * inverse[b, a]
+    columns = np.empty(3)
+    for i in range(n):
+        for a in range(3):
+            x[i] -= gain[i, a] * states[a]
+            for j in range(n):
+                pi[i, j] -= gain[i, a] * rows[a, j]
+    for i in range(n):
+        for a in range(3):
+            columns[a] = pi[i, first + a] - gain[i, a] * noise
+        for a in range(3):
+            for j in range(n):
+                pi[i, j] -= columns[a] * gain[j, a]
+    for i in range(n):
+        for j in range(i):
+            pi[i, j] = pi[j, i] = 0.5 * (pi[i, j] + pi[j, i])
+    return True
+
+
+@compiled
+def _inverse(V, x):
+    """Inverse and logarithm of the determinant of ``V`` (3, 3), positive definite, and x^T V^-1 x; infinity for both where it is not."""
+    cofactors = np.empty((3, 3))
+    for i in range(3):
+        a, b = (i + 1) % 3, (i + 2) % 3
+        for j in range(3):
+            c, d = (j + 1) % 3, (j + 2) % 3
+            cofactors[i, j] = V[a, c] * V[b, d] - V[a, d] * V[b, c]
+    determinant = V[0, 0] * cofactors[0, 0] + V[0, 1] * cofactors[0, 1] + V[0, 2] * cofactors[0, 2]
+    if not determinant > 0.0:
+        return cofactors, math.inf, math.inf
+    inverse = cofactors.T / determinant
+    square = 0.0
+    for i in range(3):
+        for j in range(3):
+            square += x[i] * inverse[i, j] * x[j]
+    return inverse, math.log(determinant), square

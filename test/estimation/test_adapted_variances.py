@@ -11,7 +11,7 @@ from ctr_dynamics.estimation.filter.adapted_variances import (
     AdaptedVariances,
     ForceRange,
 )
-from ctr_dynamics.kernels.variance_likelihood import log_likelihood
+from ctr_dynamics.kernels.variance_likelihood import log_likelihood, position_density, pull_to_zero
 from ctr_dynamics.sensing.tracker import SHIFT, STATES
 
 NEVER = AdaptationOptions(sound_s=1e30)  # faults of the tracker are ruled out
@@ -165,6 +165,43 @@ def test_the_likelihood_kernel_equals_its_numpy_twin():
         else:
             wanted = -0.5 * (np.linalg.slogdet(trial)[1] + nu @ np.linalg.solve(trial, nu))
             assert result[i, j, m] == pytest.approx(wanted, rel=1e-10)
+
+
+def test_the_density_of_a_position_equals_its_numpy_twin():
+    rng = np.random.default_rng(4)
+    root, nu = rng.normal(size=(6, 6)), rng.normal(size=6)
+    S, R = root @ root.T, np.diag(rng.uniform(0.1, 1.0, 6))
+    wanted = -0.5 * (
+        nu[:3] @ np.linalg.solve(S[:3, :3], nu[:3])
+        + np.linalg.slogdet(S[:3, :3])[1]
+        - np.log(R.diagonal()[:3]).sum()
+    )
+    assert position_density(nu, S, R) == pytest.approx(wanted, rel=1e-12)
+    assert position_density(nu, S - 100.0 * np.eye(6), R) == -math.inf
+
+
+@pytest.mark.parametrize(("distance", "plausible"), [(0.1, True), (30.0, False)])
+def test_states_are_pulled_to_zero_where_that_is_plausible(distance, plausible):
+    rng = np.random.default_rng(6)
+    n, first, noise, most = 9, 4, 0.3, 1e4
+    root = rng.normal(size=(n, n))
+    pi, x = root @ root.T, rng.normal(size=n)
+    x[first : first + 3] *= distance
+    V, shift = pi[first : first + 3, first : first + 3], x[first : first + 3]
+    against, size = shift @ np.linalg.solve(V, shift), np.linalg.slogdet(V / most)[1]
+    assert (against < -size) == plausible
+    H = np.eye(n)[first : first + 3]
+    K = pi @ H.T @ np.linalg.inv(V + noise * np.eye(3))
+    left = np.eye(n) - K @ H
+    moved, after, gain = x.copy(), pi.copy(), np.empty((n, 3))
+    assert pull_to_zero(after, first, noise, most, moved, gain) == plausible
+    if plausible:
+        np.testing.assert_allclose(gain, K, rtol=1e-9, atol=1e-12)
+        np.testing.assert_allclose(moved, x - K @ shift, rtol=1e-9, atol=1e-12)
+        np.testing.assert_allclose(after, left @ pi @ left.T + noise * K @ K.T, rtol=1e-9, atol=1e-12)
+    else:
+        np.testing.assert_array_equal(moved, x)
+        np.testing.assert_array_equal(after, pi)
 
 
 FAULTS = {

@@ -67,6 +67,7 @@ class AdaptedState(NamedTuple):
     """What a checkpoint stores of :class:`AdaptedVariances`; nothing in it is written to later."""
 
     parts: Floats
+    waiting: tuple[tuple[Floats, Floats, Floats], ...]
     weights: Floats
     steady: float
     quiet: float
@@ -97,7 +98,6 @@ class AdaptedVariances:
     Attributes:
         sigma: deviation that the process noise of the force has now, N per axis.
         shift: deviation of the shift's jump between two measurements, m per axis. noise: the tracker's variance by the stated one.
-        parts: (3, n, n) D: what of the filter's covariance is in proportion to the variances of force, shift and noise.
         fraction: largest part of an innovation's variance that the force had at the last measurement, 0 to 1, along any direction.
         reach: m. grids: of each variance, as it is: N^2, m^2, and by the stated one. priors: probabilities of their values.
         weights: (a, b, c) their joint probabilities. steady, quiet: probabilities that the tracker does not shift, and has the stated noise.
@@ -127,7 +127,7 @@ class AdaptedVariances:
         self._changes = tuple(
             np.stack([rate, prior]) for rate, prior in zip(self._rates, self.priors, strict=True)
         )
-        self.parts = np.zeros((3, 0, 0))
+        self._parts = np.zeros((3, 0, 0))
         self._clear()
 
     def _faults(self, least: float, most: float) -> Floats:
@@ -148,6 +148,19 @@ class AdaptedVariances:
         self.weights[:, 0, 0] = self.priors[0]
         self.steady = self.quiet = 1.0
         self.fraction, self._stamp = 0.0, -math.inf
+        # corrections that the parts have not followed yet: gain, derivative, noise
+        self._waiting: list[tuple[Floats, Floats, Floats]] = []
+
+    @property
+    def parts(self) -> Floats:
+        """(3, n, n) D: what of the filter's covariance is in proportion to the variances of force, shift and noise."""
+        if self._waiting:
+            self.settle()
+        return self._parts
+
+    @parts.setter
+    def parts(self, parts: Floats) -> None:
+        self._parts = parts
 
     @property
     def noisy(self) -> bool:
@@ -161,9 +174,9 @@ class AdaptedVariances:
 
     def start(self, pi: Floats, force: slice) -> None:
         """Begin with the least force, which the coefficients ``force`` of the covariance ``pi`` (n, n) hold, and a sound tracker."""
+        self._clear()
         self.parts = np.zeros((3, *pi.shape))
         self.parts[FORCE_PART][force, force] = pi[force, force]
-        self._clear()
 
     def append(self, at: int, count: int, variance: float) -> None:
         """New randomness of the force: ``count`` coefficients of ``variance`` before the coefficient ``at``."""
@@ -271,16 +284,23 @@ class AdaptedVariances:
     def correct(self, K: Floats, H: Floats, R: Floats) -> None:
         """A measurement of noise ``R`` (k, k) by the robot file has been fused with gain ``K`` (n, k) and derivative ``H`` (k, n).
 
-        Each (I - K H) D (I - K H)^T is made symmetric, as rounding errors would grow.
+        The parts follow it when they are asked for, or in :meth:`settle` before: no output waits for them.
         """
-        noise = np.zeros((3, *R.shape))
-        noise[NOISE_PART] = self.noise * R
-        self.parts = joseph(self.parts, K, H, noise)
+        self._waiting.append((K, H, self.noise * R))
+
+    def settle(self) -> None:
+        """Have the parts follow all corrections. Each (I - K H) D (I - K H)^T is made symmetric, as rounding errors would grow."""
+        for K, H, R in self._waiting:
+            noise = np.zeros((3, *R.shape))
+            noise[NOISE_PART] = R
+            self._parts = joseph(self._parts, K, H, noise)
+        self._waiting.clear()
 
     def checkpoint(self) -> AdaptedState:
         """What :meth:`restore` returns to."""
         return AdaptedState(
-            self.parts.copy(),
+            self._parts.copy(),
+            tuple(self._waiting),
             self.weights,
             self.steady,
             self.quiet,
@@ -294,9 +314,9 @@ class AdaptedVariances:
     def restore(self, state: AdaptedState) -> None:
         """Return to a checkpoint."""
         (
-            parts, self.weights, self.steady, self.quiet, self.sigma, self.shift, self.noise, self.fraction, self._stamp,
+            parts, waiting, self.weights, self.steady, self.quiet, self.sigma, self.shift, self.noise, self.fraction, self._stamp,
         ) = state  # fmt: skip
-        self.parts = parts.copy()
+        self._parts, self._waiting = parts.copy(), list(waiting)
 
 
 def joseph(P: Floats, K: Floats, H: Floats, R: Floats) -> Floats:

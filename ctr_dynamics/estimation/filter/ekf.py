@@ -12,7 +12,7 @@ import numpy as np
 from filterpy.kalman import ExtendedKalmanFilter
 from numpy.typing import NDArray
 
-from ctr_dynamics.estimation.filter.adapted_variances import AdaptedVariances, ForceRange, joseph
+from ctr_dynamics.estimation.filter.adapted_variances import AdaptedVariances, ForceRange
 from ctr_dynamics.estimation.filter.covariance_factor import CovarianceFactor
 from ctr_dynamics.estimation.filter.factor_reduction import reduced
 from ctr_dynamics.estimation.filter.factor_schedule import FactorSchedule
@@ -23,7 +23,6 @@ from ctr_dynamics.estimation.filter.filter_records import (
     TipEstimate,
     Update,
 )
-from ctr_dynamics.estimation.filter.foretold_position import log_density
 from ctr_dynamics.estimation.filter.gating import Gate
 from ctr_dynamics.estimation.filter.parameter_priors import force_range, model_uncertainty
 from ctr_dynamics.estimation.filter.process_noise import ProcessNoise
@@ -32,6 +31,7 @@ from ctr_dynamics.estimation.filter.tip_window import TipWindow, insertion_fract
 from ctr_dynamics.estimation.step_output import FUSION_OFF
 from ctr_dynamics.kernels.factor_operations import move_unknowns
 from ctr_dynamics.kernels.tracker_measurement import fused_tip
+from ctr_dynamics.kernels.variance_likelihood import position_density, pull_to_zero
 from ctr_dynamics.model.model import Model
 from ctr_dynamics.model.simulator import Inputs, Simulator, State, StepResult
 from ctr_dynamics.sensing import Tip, TrackerModel
@@ -87,6 +87,7 @@ class RodEkf:
         self.schedule = FactorSchedule()
         self._strides: ColumnStrides | None = None
         self.gate = Gate(options.gate)
+        self._sees_position = bool(tracker.mask[:3].all())
         self.insertion_fraction = insertion_fraction(self.model)
         self._filters: dict[tuple[int, int], ExtendedKalmanFilter] = {}
 
@@ -251,10 +252,9 @@ class RodEkf:
         if not self.adapted.noisy:
             S = S + (self.adapted.noise - 1.0) * R
         self.pi += self.adapted.adapt(stamp, nu, H, S, R)
-        places = self.tracker.axes < 3
-        if places.sum() == 3:
+        if self._sees_position:
             changed = H @ self.pi @ H.T + self.adapted.noise * R
-            foretold = log_density(nu, S, R, places), log_density(nu, changed, R, places)
+            foretold = position_density(nu, S, R), position_density(nu, changed, R)
             record = record._replace(foretold=foretold)
         # 3. Gate: a single measurement outside is rejected, and so are all that the tracker's state explains.
         outside = self.gate.outside(record.nis, dof)
@@ -272,7 +272,7 @@ class RodEkf:
             )
         # 5. Gain and covariance, then what is left of a shift that is over; correction by both.
         x = self._fuse(nu, H, R)
-        x = x + self._end_shift(x)
+        self._end_shift(x)
         self._correct(state, x)
         self.schedule.since_correction = 0
         return record._replace(accepted=True)
@@ -291,30 +291,25 @@ class RodEkf:
         correction: Floats = ekf.x[:, 0]
         return correction
 
-    def _end_shift(self, x: Floats) -> Floats:
-        """What is to be added to the correction ``x`` (r + 16,), and the covariance after it: the tracker's shift is brought back to zero where the
-        tracker is sound and nothing speaks against it.
+    def _end_shift(self, x: Floats) -> None:
+        """Bring the tracker's shift back to zero where the tracker is sound and nothing speaks against it: the covariance changes, and the correction
+        ``x`` (r + 16,) in place.
 
         That is a measurement of the shift, zero within the noise of a position. Odds are by Bayes' rule: a shift could be anything up to the
         robot's length, which is improbable beside none unless it is many of its deviations from zero.
         """
-        r = self.factor.theta.shape[1]
-        rows = slice(r + SHIFT.start, r + SHIFT.stop)
-        variance, noise = self.pi[rows, rows], self.tracker.variance[0]
-        if not self.adapted.sound or variance.trace() < 0.01 * noise:
-            return np.zeros_like(x)
-        shift = self.bias[SHIFT] + x[rows]
-        against = shift @ np.linalg.solve(variance, shift)
-        _, size = np.linalg.slogdet(variance / self.adapted.reach**2)
-        if against > -size:
-            return np.zeros_like(x)
-        R, H = noise * np.eye(3), np.zeros((3, len(x)))
-        H[:, rows] = np.eye(3)
-        K = np.linalg.solve(variance + self.adapted.noise * R, self.pi[rows]).T
-        self.pi = joseph(self.pi, K, H, self.adapted.noise * R)
-        self.adapted.correct(K, H, R)
-        back: Floats = K @ -shift
-        return back
+        first = self.factor.theta.shape[1] + SHIFT.start
+        noise = float(self.tracker.variance[0])
+        variance = self.pi.diagonal()[first : first + 3].sum()
+        if not self.adapted.sound or variance < 0.01 * noise:
+            return
+        x[first : first + 3] += self.bias[SHIFT]
+        gain = np.empty((len(x), 3))
+        if pull_to_zero(self.pi, first, self.adapted.noise * noise, self.adapted.reach**2, x, gain):
+            H = np.zeros((3, len(x)))
+            H[:, first : first + 3] = np.eye(3)
+            self.adapted.correct(gain, H, noise * np.eye(3))
+        x[first : first + 3] -= self.bias[SHIFT]
 
     def compare(self, stamp: float, position: Floats, quaternion: Floats) -> Update:
         """The innovation of a measurement that is not fused; arguments as of :meth:`update`."""
@@ -323,9 +318,8 @@ class RodEkf:
             return compared
         nu, _, S, record = compared
         outside = self.gate.outside(record.nis, record.dof)
-        places = self.tracker.axes < 3
-        if places.sum() == 3:
-            foretold = log_density(nu, S, self.tracker.noise, places)
+        if self._sees_position:
+            foretold = position_density(nu, S, self.tracker.noise)
             record = record._replace(foretold=(foretold, foretold))
         return record._replace(reason="outside the gate" if outside else FUSION_OFF)
 
