@@ -4,26 +4,50 @@ well a position has been foretold; and whether a state has come back to zero.
 The grid's axes are shift, noise and force here, the longest last: its points are computed a SIMD batch at a time.
 """
 
+from __future__ import annotations
+
 import math
+from typing import NamedTuple
 
 import numpy as np
 
 from ctr_dynamics.kernels.compiler import njit
 from ctr_dynamics.kernels.kinds import ONE_BATCH, SIMD_WIDTH
-from ctr_dynamics.kernels.simd import fma, view, where_above
+from ctr_dynamics.kernels.simd import fma, largest, view, where_above
 
 compiled = njit(cache=True, nogil=True, error_model="numpy")
 
 
 @compiled
-def normal_density(nu, S, parts, first, second, third, work, determinant, square):
-    """What makes up the normal density of ``nu`` (k,), exp(-square / 2) / sqrt(determinant) but for a constant.
+def quadratic_forms(H, D, forms):
+    """H D H^T into ``forms`` (p, k, k), for ``H`` (k, n) and symmetric ``D`` (p, n, n)."""
+    k, n = H.shape
+    half = np.empty(n)
+    for part in range(len(D)):
+        for a in range(k):
+            half[:] = 0.0
+            for i in range(n):
+                factor = H[a, i]
+                if factor != 0.0:
+                    for j in range(n):
+                        half[j] += factor * D[part, i, j]
+            for b in range(a + 1):
+                total = 0.0
+                for j in range(n):
+                    total += half[j] * H[b, j]
+                forms[part, a, b] = forms[part, b, a] = total
 
-    Its covariance is S + first[i] parts[0] + second[j] parts[1] + third[m] parts[2], with ``S`` (k, k) and ``parts`` (3, k, k). Written:
-    ``determinant`` and ``square`` (b, c, a), flat; a, the length of ``first``, is a multiple of 8. Where the covariance is not positive definite
-    they are 1 and infinity. ``work`` (2k (k + 1) 8,) is scratch, as views hold no array. The Cholesky decomposition is the one without roots,
-    L D L^T.
+
+@compiled
+def normal_density(nu, S, parts, changes, work, determinant, square):
+    """What makes up the normal density of ``nu`` (k,), exp(-square / 2) / sqrt(determinant) but for a constant; returns the least square.
+
+    Its covariance is S + first[i] parts[0] + second[j] parts[1] + third[m] parts[2], with ``S`` (k, k), ``parts`` (3, k, k) and ``changes`` (first,
+    second, third). Written: ``determinant`` and ``square`` (b, c, a), flat; a, the length of ``first``, is a multiple of 8. Where the covariance is
+    not positive definite they are 1 and infinity. ``work`` (2k (k + 1) 8,) is scratch, as views hold no array. The Cholesky decomposition is the
+    one without roots, L D L^T.
     """
+    first, second, third = changes
     k, batches = len(nu), len(first) // SIMD_WIDTH
     rows = k * SIMD_WIDTH
     # L D and L; D^-1 and L^-1 nu
@@ -32,12 +56,13 @@ def normal_density(nu, S, parts, first, second, third, work, determinant, square
         view(ONE_BATCH, work[2 * k * rows :], 0, SIMD_WIDTH),
         view(ONE_BATCH, work[(2 * k + 1) * rows :], 0, SIMD_WIDTH),
     )
-    changes = view(ONE_BATCH, first, 0, SIMD_WIDTH)
+    forces = view(ONE_BATCH, first, 0, SIMD_WIDTH)
     determinants, squares = (
         view(ONE_BATCH, determinant, 0, SIMD_WIDTH),
         view(ONE_BATCH, square, 0, SIMD_WIDTH),
     )
     base = np.empty((k, k))
+    smallest = 0.0 * forces[0] + np.inf
     at = 0
     for j in range(len(second)):
         for m in range(len(third)):
@@ -45,7 +70,7 @@ def normal_density(nu, S, parts, first, second, third, work, determinant, square
                 for q in range(p + 1):
                     base[p, q] = S[p, q] + second[j] * parts[1, p, q] + third[m] * parts[2, p, q]
             for batch in range(batches):
-                change = changes[batch]
+                change = forces[batch]
                 zero = 0.0 * change
                 product, total, least = zero + 1.0, zero, zero + 1.0
                 for p in range(k):
@@ -65,31 +90,49 @@ def normal_density(nu, S, parts, first, second, third, work, determinant, square
                     inverse[p] = inverted
                     rest[p] = value
                     total = fma(value * value, inverted, total)
+                total = where_above(least, 0.0, total, zero + np.inf)
                 determinants[at] = where_above(least, 0.0, product, zero + 1.0)
-                squares[at] = where_above(least, 0.0, total, zero + np.inf)
+                squares[at] = total
+                smallest = where_above(smallest, total, total, smallest)
                 at += 1
+    return -largest(-smallest)
 
 
-def log_likelihood(nu, S, parts, first, second, third):
-    """(a, b, c) logarithms of the normal density of ``nu`` but for a constant; arguments as of :func:`normal_density`, of any length.
+class DensityBuffers(NamedTuple):
+    """For normal densities of k dimensions on a grid: ``determinant`` and ``density`` (b, c, a), and ``work``, scratch of :func:`normal_density`."""
 
-    Minus infinity where the covariance is not positive definite.
+    determinant: np.ndarray
+    density: np.ndarray
+    work: np.ndarray
+
+    @classmethod
+    def of(cls, shape: tuple[int, ...], k: int) -> DensityBuffers:
+        """Buffers for a grid of the ``shape`` (b, c, a)."""
+        return cls(np.empty(shape), np.empty(shape), np.empty(2 * k * (k + 1) * SIMD_WIDTH))
+
+
+def densities(nu, S, parts, changes, buffers):
+    """(b, c, a) normal densities of ``nu``, but for a constant, in the ``buffers``; arguments as of :func:`normal_density`.
+
+    None where no covariance is one. The densities are by an exponential that is 1 at its largest, so that they do not all vanish.
     """
-    padded = np.empty(SIMD_WIDTH * -(-len(first) // SIMD_WIDTH))
-    padded[: len(first)], padded[len(first) :] = first, first[-1]
-    determinant, square = np.empty((2, len(second), len(third), len(padded)))
-    work = np.empty(2 * len(nu) * (len(nu) + 1) * SIMD_WIDTH)
-    normal_density(nu, S, parts, padded, second, third, work, determinant.reshape(-1), square.reshape(-1))
-    result = -0.5 * (np.log(determinant) + square)
-    return result[:, :, : len(first)].transpose(2, 0, 1)
+    determinant, density, work = buffers
+    least = normal_density(nu, S, parts, changes, work, determinant.reshape(-1), density.reshape(-1))
+    if not math.isfinite(least):
+        return None
+    np.subtract(least, density, out=density)
+    np.multiply(density, 0.5, out=density)
+    np.exp(density, out=density)
+    np.sqrt(determinant, out=determinant)
+    return np.divide(density, determinant, out=density)
 
 
 @compiled
 def update_probabilities(weights, likelihood, changes, marginals):
     """A step of a hidden Markov chain: each variance may have changed independently, then Bayes' rule. In place.
 
-    ``weights`` (b, c, a): joint probabilities; ``likelihood`` (b, c, a): by a constant. ``changes``, of shift, noise and force: each (2, length),
-    the probability that a value is left, and that it is the one that is taken then. ``marginals``: written, of shift, noise and force.
+    ``weights`` (b, c, a): joint probabilities; ``likelihood`` (b, c, a or more): by a constant. ``changes``, of shift, noise and force: each (2,
+    length), the probability that a value is left, and that it is the one that is taken then. ``marginals``: written, of shift, noise and force.
     """
     (shift, noise, force), (B, C, A) = changes, weights.shape
     left = np.empty(A)
@@ -218,3 +261,19 @@ def _inverse(V, x):
         for j in range(3):
             square += x[i] * inverse[i, j] * x[j]
     return inverse, math.log(determinant), square
+
+
+@compiled
+def new_randomness(pi, parts, first, variance, remains):
+    """Three states from ``first`` on have moved at random by ``variance``; ``pi`` (n, n) and ``parts`` (3, n, n) change in place.
+
+    That belongs to the second of the parts. Of what the second and the third hold from before, the shares ``remains`` are left.
+    """
+    for part in (1, 2):
+        share = remains[part - 1]
+        for i in range(len(pi)):
+            for j in range(len(pi)):
+                parts[part, i, j] *= share
+    for i in range(first, first + 3):
+        pi[i, i] += variance
+        parts[1, i, i] += variance

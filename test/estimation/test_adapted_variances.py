@@ -11,7 +11,14 @@ from ctr_dynamics.estimation.filter.adapted_variances import (
     AdaptedVariances,
     ForceRange,
 )
-from ctr_dynamics.kernels.variance_likelihood import log_likelihood, position_density, pull_to_zero
+from ctr_dynamics.kernels.variance_likelihood import (
+    DensityBuffers,
+    densities,
+    new_randomness,
+    position_density,
+    pull_to_zero,
+    quadratic_forms,
+)
 from ctr_dynamics.sensing.tracker import SHIFT, STATES
 
 NEVER = AdaptationOptions(sound_s=1e30)  # faults of the tracker are ruled out
@@ -150,21 +157,37 @@ def test_the_weights_are_those_of_the_likelihoods():
         pi = pi + more
 
 
-def test_the_likelihood_kernel_equals_its_numpy_twin():
+def test_the_densities_equal_their_numpy_twin():
     rng = np.random.default_rng(8)
     S, *parts = (root @ root.T for root in rng.normal(size=(4, 6, 6)))
     S, parts, nu = S + np.eye(6), np.array(parts), rng.normal(size=6)
-    grids = [rng.uniform(0.0, 5.0, size) for size in (3, 2, 4)]
+    grids = [rng.uniform(0.0, 5.0, size) for size in (8, 2, 4)]
     grids[0][0] = -1e3  # no covariance
-    result = log_likelihood(nu, S, parts, *grids)
-    assert result.shape == (3, 2, 4)
-    for i, j, m in np.ndindex(result.shape):
+    found = densities(nu, S, parts, tuple(grids), DensityBuffers.of((2, 4, 8), 6))
+    assert not found[:, :, 0].any()
+    wanted = np.zeros((2, 4, 8))
+    for j, m, i in np.ndindex(wanted.shape):
         trial = S + grids[0][i] * parts[0] + grids[1][j] * parts[1] + grids[2][m] * parts[2]
-        if i == 0:
-            assert result[i, j, m] == -math.inf
-        else:
-            wanted = -0.5 * (np.linalg.slogdet(trial)[1] + nu @ np.linalg.solve(trial, nu))
-            assert result[i, j, m] == pytest.approx(wanted, rel=1e-10)
+        if i > 0:
+            wanted[j, m, i] = math.exp(-0.5 * nu @ np.linalg.solve(trial, nu)) / math.sqrt(
+                np.linalg.det(trial)
+            )
+    np.testing.assert_allclose(found / found.max(), wanted / wanted.max(), rtol=1e-10)
+    grids[0][:] = -1e3
+    assert densities(nu, S, parts, tuple(grids), DensityBuffers.of((2, 4, 8), 6)) is None
+
+
+def test_forms_and_new_randomness_equal_their_numpy_twins():
+    rng = np.random.default_rng(9)
+    D, H = rng.normal(size=(3, 9, 9)), rng.normal(size=(4, 9))
+    D, forms = D @ D.transpose(0, 2, 1), np.empty((3, 4, 4))
+    quadratic_forms(H, D, forms)
+    np.testing.assert_allclose(forms, H @ D @ H.T, rtol=1e-12, atol=1e-12)
+    pi, parts = D[0].copy(), D.copy()
+    new_randomness(pi, parts, 5, 0.7, (0.25, 0.5))
+    jump = np.diag([0.0] * 5 + [0.7] * 3 + [0.0])
+    np.testing.assert_allclose(pi, D[0] + jump)
+    np.testing.assert_allclose(parts, np.array([D[0], 0.25 * D[1] + jump, 0.5 * D[2]]))
 
 
 def test_the_density_of_a_position_equals_its_numpy_twin():

@@ -23,11 +23,18 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg.lapack import dsygv
 
-from ctr_dynamics.kernels.variance_likelihood import log_likelihood, update_probabilities
+from ctr_dynamics.kernels.kinds import SIMD_WIDTH
+from ctr_dynamics.kernels.variance_likelihood import (
+    DensityBuffers,
+    densities,
+    new_randomness,
+    quadratic_forms,
+    update_probabilities,
+)
 from ctr_dynamics.sensing.tracker import SHIFT, STATES
 
 Floats = NDArray[np.float64]
-FORCE_PART, SHIFT_PART, NOISE_PART = 0, 1, 2
+FORCE_PART, SHIFT_PART, NOISE_PART = 0, 1, 2  # in the order of the kernels
 
 
 @dataclass(frozen=True)
@@ -127,6 +134,10 @@ class AdaptedVariances:
         self._changes = tuple(
             np.stack([rate, prior]) for rate, prior in zip(self._rates, self.priors, strict=True)
         )
+        # whole batches of forces; those beyond the last are not read
+        self._forces = np.full(SIMD_WIDTH * -(-len(grid) // SIMD_WIDTH), self.grids[0][-1])
+        self._forces[: len(grid)] = self.grids[0]
+        self._buffers: dict[int, DensityBuffers] = {}  # by the size of an innovation
         self._parts = np.zeros((3, 0, 0))
         self._clear()
 
@@ -212,12 +223,8 @@ class AdaptedVariances:
         """The shift may have jumped since the last measurement, before one of the time ``stamp`` (s); ``pi`` (n, n) changes in place."""
         # what the filter has fused while the tracker was sound is no error of a fault that begins now
         remains = math.exp(-self._elapsed(stamp) / self.options.memory_s)
-        self.parts[SHIFT_PART] *= remains * (1.0 - self.steady)
-        self.parts[NOISE_PART] *= remains * (1.0 - self.quiet)
-        first = len(pi) - STATES
-        for i in range(first + SHIFT.start, first + SHIFT.stop):
-            pi[i, i] += self.shift**2
-            self.parts[SHIFT_PART, i, i] += self.shift**2
+        left = remains * (1.0 - self.steady), remains * (1.0 - self.quiet)
+        new_randomness(pi, self.parts, len(pi) - STATES + SHIFT.start, self.shift**2, left)
 
     def adapt(self, stamp: float, nu: Floats, H: Floats, S: Floats, R: Floats) -> Floats:
         """Take in an innovation of the time ``stamp`` (s).
@@ -232,14 +239,19 @@ class AdaptedVariances:
         """
         options = self.options
         # 1. Likelihood of all variances.
-        parts = H @ self.parts @ H.T
+        k = len(nu)
+        parts = np.empty((3, k, k))
+        quadratic_forms(H, self.parts, parts)
         parts[NOISE_PART] += self.noise * R
         present = (self.sigma**2, self.shift**2, self.noise)
-        ratios = [grid / value for grid, value in zip(self.grids, present, strict=True)]
-        likelihood = log_likelihood(nu, S, parts, *(ratio - 1.0 for ratio in ratios))
-        best = likelihood.max()
-        if not math.isfinite(best):
-            return np.zeros_like(self.parts[0])
+        force, shift, noise = (
+            grid / value for grid, value in zip((self._forces, *self.grids[1:]), present, strict=True)
+        )
+        if k not in self._buffers:
+            self._buffers[k] = DensityBuffers.of((len(shift), len(noise), len(force)), k)
+        likelihood = densities(nu, S, parts, (force - 1.0, shift - 1.0, noise - 1.0), self._buffers[k])
+        if likelihood is None:
+            return np.zeros_like(self._parts[0])
         # 2. Hidden Markov chain: each may have changed since the last innovation, then Bayes' rule.
         elapsed = self._elapsed(stamp)
         self._stamp = max(stamp, self._stamp)
@@ -247,14 +259,13 @@ class AdaptedVariances:
             left[0] = -np.expm1(-elapsed * rate)
         marginals = [np.empty_like(grid) for grid in self.grids]
         weights = self.weights.transpose(1, 2, 0).copy()  # in the order of the kernels
-        update_probabilities(
-            weights, np.exp(likelihood - best).transpose(1, 2, 0), _rolled(self._changes), _rolled(marginals)
-        )
+        update_probabilities(weights, likelihood, _rolled(self._changes), _rolled(marginals))
         self.weights = weights.transpose(2, 0, 1)
         self.steady, self.quiet = float(marginals[1][0]), float(marginals[2][0])
         # 3. The filter goes over to the mean variances.
         force, shift, noise = (
-            float(marginal @ ratio) for marginal, ratio in zip(marginals, ratios, strict=True)
+            float(marginal @ grid) / value
+            for marginal, grid, value in zip(marginals, self.grids, present, strict=True)
         )
         force = min(max(force, 1.0 / options.largest_change), options.largest_change)
         # a force that has become less has left its trace in Pi
