@@ -19,6 +19,7 @@ from ctr_dynamics.estimation.monitoring.health import Health
 from ctr_dynamics.estimation.monitoring.innovation_log import InnovationLog
 from ctr_dynamics.estimation.open_loop import OpenLoopRun
 from ctr_dynamics.estimation.timeline import DT, seconds
+from ctr_dynamics.kernels import rotations
 from ctr_dynamics.model.collocation_pair import CollocationPair
 from ctr_dynamics.model.model import Model
 from ctr_dynamics.model.paired_steps import PairedSteps
@@ -79,6 +80,13 @@ class Runs:
     def running(self) -> bool:
         """Whether there is a state to go on from."""
         return self.fused.state is not None
+
+    def expected_orientation(self) -> tuple[float, float, float, float] | None:
+        """(4,) wxyz that the tracker should report by the open-loop run now; None while nothing runs, or where it does not measure all of it."""
+        if not self.running or not self.tracker.mask[3:].all():
+            return None
+        w, x, y, z = rotations.multiply(self.tracker.rotation, self.open_loop.tips.last.mean[3:7]).tolist()
+        return w, x, y, z
 
     def stop(self) -> None:
         """Have no state to go on from: the next step is a start."""

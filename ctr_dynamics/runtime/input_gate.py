@@ -83,8 +83,14 @@ class InputGate:
     def pose(self, message: PoseIn, arrival_ns: int) -> PoseIn | None:
         """The pose to use, with its time as the checks want it; None where it is left out. ``arrival_ns``: see :meth:`joint_state`."""
         self._follow_resets()
+        expected = self._estimator.runs.expected_orientation()
         verdict = self.checks.pose(
-            message.stamp_ns, arrival_ns, message.position, message.quaternion_xyzw, message.frame_id
+            message.stamp_ns,
+            arrival_ns,
+            message.position,
+            message.quaternion_xyzw,
+            message.frame_id,
+            expected,
         )
         if self._left_out(self.checks.poses.findings, verdict) or not verdict.orientation:
             self._health.dropped += 1

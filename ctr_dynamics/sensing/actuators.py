@@ -155,9 +155,14 @@ class ActuatorSignal(Signal):
         return kind
 
     @property
+    def drive_positions(self) -> list[Floats]:
+        """Drive positions (2 N,) of all stamps, before the backlash."""
+        return self._drive if self._loose else self.values
+
+    @property
     def drive_position(self) -> Floats:
         """The last drive position (2 N,), before the backlash."""
-        return self._drive[-1] if self._loose else self.values[-1]
+        return self.drive_positions[-1]
 
     def forget(self, before_ns: int) -> None:
         """Drop samples that no time from ``before_ns`` on needs, delayed as they are."""

@@ -144,6 +144,20 @@ def test_placeholders_of_a_hidden_tracker(clean, reference, play, monkeypatch):
     assert problems(estimator, "tracker") == {"placeholder": 40}
 
 
+def test_orientations_with_the_scalar_first(clean, play, monkeypatch):
+    def reorder(item, _):
+        x, y, z, w = item.message.quaternion_xyzw
+        return [item._replace(message=item.message._replace(quaternion_xyzw=(w, x, y, z)))]
+
+    estimator, outputs = play(changed(clean, PoseIn, reorder), monkeypatch)
+    found = problems(estimator, "tracker")
+    assert list(found) == ["scalar first"]
+    assert found["scalar first"] == estimator.health.dropped
+    assert estimator.health.accepted == 0, "poses that came before it was known were left out too"
+    assert all(out.valid for out in outputs)
+    assert "w last" in estimator.health.tracker["scalar first"].last
+
+
 def test_wrapped_angles_are_unwrapped_bit_for_bit(clean):
     """Two gates: one is given angles that grow beyond pi, the other the same wrapped."""
     from ctr_dynamics.estimation.estimator import Estimator

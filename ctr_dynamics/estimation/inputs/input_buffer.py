@@ -6,12 +6,14 @@ Inputs are validated, and odd ones counted. A new one tells from which stamp on 
 from __future__ import annotations
 
 import bisect
+from collections import deque
 from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ctr_dynamics.estimation.inputs.gap_bridge import KnownActuators, bridge
 from ctr_dynamics.estimation.inputs.input_validation import Unusable, joint_values, wrench_values
 from ctr_dynamics.estimation.inputs.measurement_queue import MeasurementQueue
 from ctr_dynamics.estimation.monitoring.health import Health
@@ -30,7 +32,7 @@ SMOOTHED_NS, INTERVALS = (
     40_000_000,
     4,
 )  # accelerations are looked for in the last 0.16 s; encoder noise is small in rates over 40 ms
-LONGEST_BRIDGE = 1000  # steps that are taken again, along a straight line, where joints come back after a gap
+LONGEST_BRIDGE = 1000  # steps that are taken again where joints come back after a gap
 
 
 class JointGap(NamedTuple):
@@ -106,6 +108,8 @@ class InputBuffer:
         self.measurements.clear()
         self.backwards = 0
         self.gap: JointGap | None = None
+        self._after_gap: KnownActuators | None = None
+        self._gaps: deque[tuple[int, int]] = deque(maxlen=20)  # the last ones, ns
         self._accelerations: tuple[int, Floats] | None = None  # of the actuators, and the stamp up to which
 
     def carry_load(self, load: Signal) -> None:
@@ -142,14 +146,44 @@ class InputBuffer:
             )
             return None
         self.backwards = 0
+        given, waiting = KnownActuators(stamp_ns, value), self._after_gap
+        self._after_gap = None
+        if waiting is not None and 0 < stamp_ns - waiting.stamp_ns <= self.timeout_ns:
+            from_ns = self._end_gap(waiting, given)
+            self._take(given)
+            return from_ns
+        if waiting is not None:  # the only one for long
+            self._end_gap(waiting, None)
         last = self.joints.stamps[-1] if self.joints.stamps else None
-        taken = self.timeline.taken_ns
         if last is not None and stamp_ns - last > self.timeout_ns:
-            self.gap = JointGap(last, stamp_ns, value - self.joints.drive_position)
-            if taken is not None and taken < stamp_ns and taken - last > LONGEST_BRIDGE * STEP_NS:
-                # too many steps were taken with the held value to be taken again: go on from there, not from a straight line over the gap
-                held, _ = Signal.at(self.joints, taken, self.timeout_ns if self.extrapolating else 0)
-                self.joints.add(taken, held)
+            if stamp_ns - last <= LONGEST_BRIDGE * STEP_NS:
+                self._after_gap = given  # the next one tells the rate there
+                return None
+            return self._end_gap(given, None)
+        return self._take(given)
+
+    def _end_gap(self, first: KnownActuators, second: KnownActuators | None) -> int:
+        """Have the actuators known over a gap of which ``first`` is the end; ``second`` is the one after it, None where that is not near.
+
+        They took a cubic with the rates before and after, or a straight line.
+        """
+        stamp_ns, value = first
+        last, taken = self.joints.stamps[-1], self.timeline.taken_ns
+        self.gap = JointGap(last, stamp_ns, value - self.joints.drive_position)
+        self._gaps.append((last, stamp_ns))
+        if taken is not None and taken < stamp_ns and taken - last > LONGEST_BRIDGE * STEP_NS:
+            # too many steps were taken with the held value to be taken again: go on from there, not from a line over the gap
+            held, _ = Signal.at(self.joints, taken, self.timeout_ns if self.extrapolating else 0)
+            self.joints.add(taken, held)
+        elif second is not None:
+            for point in bridge(self.joints.stamps, self.joints.drive_positions, first, second):
+                self.joints.add(*point)
+        self._take(first)
+        return last + min(self.joints.delay_ns, 0)
+
+    def _take(self, given: KnownActuators) -> int | None:
+        """Store a joint state; see :meth:`add_joints`."""
+        stamp_ns, value = given
         kind = self.joints.add(stamp_ns, value)
         if kind == "duplicate":
             self.health.note(
@@ -255,6 +289,8 @@ class InputBuffer:
         """Whether no joint states around ``time_s`` (s from t0) tell what drove the robot then: a gap longer than the timeout, over or not."""
         assert self.t0_ns is not None
         stamps, time_ns = self.joints.stamps, self.t0_ns + time_s * 1e9
+        if any(begin < time_ns < end for begin, end in self._gaps):
+            return True
         i = bisect.bisect_left(stamps, time_ns)
         until = time_ns if i == len(stamps) else stamps[i]
         return i > 0 and until - stamps[i - 1] > self.timeout_ns
