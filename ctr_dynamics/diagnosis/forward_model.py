@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,8 +20,10 @@ from ctr_dynamics.effects import EFFECTS, EffectQuantity, Plant, apply_effects, 
 from ctr_dynamics.errors import InputError
 from ctr_dynamics.kernels.kinds import SIMD_WIDTH
 from ctr_dynamics.kernels.rotations import conjugate_rows, multiply_rows, to_vector_rows
+from ctr_dynamics.model.collocation_steps import RESCUE
+from ctr_dynamics.model.collocation_trajectory import run_collocation
 from ctr_dynamics.model.model import Model
-from ctr_dynamics.model.time_scheme import make_scheme
+from ctr_dynamics.model.time_scheme import collocation, make_scheme
 from ctr_dynamics.model.trajectory import InputRows, Trajectory, run
 from ctr_dynamics.robot import Robot
 from ctr_dynamics.sensing.interpolation import Signal
@@ -63,7 +66,7 @@ class ForwardModel:
         self.options = options or ForwardModelOptions()
         nodes, dt = self.options.nodes, self.options.dt_s
         self.nodes = nodes
-        self.scheme = make_scheme("sdirk3", dt)
+        self.scheme = collocation(dt)
         self.models = {False: Model(robot, nodes=nodes), True: Model(robot, nodes=nodes, extended=True)}
         self.nominal = make_plant(robot)
         self._free = free_axis(np.array(recording.axes))
@@ -146,16 +149,18 @@ class ForwardModel:
             position[late], quaternion[late] = np.nan, np.nan
         return Prediction(position, quaternion, trajectory, trajectory.failure)
 
-    def _run(self, plant: Plant, extended: bool, **columns: object) -> Trajectory:
-        return run(
-            self.models[extended],
-            self.scheme,
-            plant.block,
-            self.inputs(plant, extended),
-            self.recording.duration,
-            events=(self._load_events + plant.load_delay).tolist(),
-            **columns,  # type: ignore[arg-type]
-        )
+    def _run(self, plant: Plant, extended: bool, **columns: Any) -> Trajectory:
+        """The estimator's steps; where these cannot be taken to the end, as with friction of tens of times the usual, steps of one stage after the
+        other, each with its own Jacobian."""
+        rows, events = self.inputs(plant, extended), (self._load_events + plant.load_delay).tolist()
+        given = (plant.block, rows, self.recording.duration)
+        model = self.models[extended]
+        found = run_collocation(model, self.scheme, *given, events=events, **columns)
+        if found.failure:
+            other = run(model, make_scheme(RESCUE, self.scheme.dt), *given, events=events, **columns)
+            if not other.failure:
+                return other
+        return found
 
     def residual(self, prediction: Prediction) -> Floats:
         """(s, 6) measurement minus prediction: position in m in the tracker's axes, rotation vector in rad in the sensor's axes, without the turn

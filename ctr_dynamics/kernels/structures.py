@@ -218,6 +218,22 @@ class CollocationRun(NamedTuple):
 
 
 @structure
+class CollocationTangent(NamedTuple):
+    """Columns of a run: ``fields`` (r / 2, fields, 2), ``unknowns`` (r, stages, mt) of the last step in units, a ``guess`` of the next one's, which
+    ``weights`` (degrees, stages, stages) extrapolate, and ``tip`` (rows, r), the first rows of the state there; with buffers of the ``lanes`` of two
+    of them, ``tables`` (r / 2, size) of their couplings, and the change ``epsilon`` by which they are found."""
+
+    fields: np.ndarray
+    unknowns: np.ndarray
+    guess: np.ndarray
+    weights: np.ndarray
+    tip: np.ndarray
+    lanes: SweepBuffers
+    tables: np.ndarray
+    epsilon: float
+
+
+@structure
 class RunPair(NamedTuple):
     """Two runs that take their steps together."""
 

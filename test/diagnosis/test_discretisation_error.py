@@ -40,7 +40,9 @@ def test_the_error_of_the_solver_is_that_of_the_point(recording, robot, known, m
     there = fit(problem, [friction], {friction.key: friction.off + 0.1}, iterations=0)
     assert there is not None
     assert renew_correction(problem, there.point, SILENT) is None  # about the same: all stays
-    np.testing.assert_array_equal(problem.residual(there.point), there.residual)
+    np.testing.assert_allclose(
+        problem.residual(there.point), there.residual, atol=1e-4
+    )  # another way of Newton's
     measured = discretisation_error.differences
 
     def larger(found):

@@ -5,8 +5,10 @@ In: a problem. Out: the re-calibrated fit, against which every gain counts, and 
 
 from __future__ import annotations
 
+from ctr_dynamics.diagnosis.forward_model import Key
 from ctr_dynamics.diagnosis.inference.discretisation_error import correct_discretisation
 from ctr_dynamics.diagnosis.inference.fit_problem import Local, Problem
+from ctr_dynamics.diagnosis.inference.fit_quality import excess
 from ctr_dynamics.diagnosis.inference.map_fit import Fit, fit
 from ctr_dynamics.diagnosis.run_context import RunContext
 from ctr_dynamics.effects import EFFECTS, EffectQuantity, effect_quantities
@@ -28,6 +30,8 @@ def calibrate(problem: Problem, context: RunContext) -> tuple[Fit, dict[str, flo
     """
     context.report("re-calibration inside tolerance")
     first = fit(problem, (), {}, polish=False)
+    if first is not None:
+        first = _from_growing_spans(problem, first, context)
     if first is None:
         raise InputError(
             "the model cannot be simulated near the nominal robot", do="check the robot file and the bag"
@@ -45,3 +49,26 @@ def calibrate(problem: Problem, context: RunContext) -> tuple[Fit, dict[str, flo
         there = problem.residual(again.point)
         again = fit(problem, (), again.point, None if there is None else Local(there, again.by_key)) or again
     return again, numerics
+
+
+def _from_growing_spans(problem: Problem, first: Fit, context: RunContext) -> Fit:
+    """``first``, or a better fit that begins with the first part of the recordings and goes on to more and more of them.
+
+    A frequency that is a little off is out of phase by turns after seconds, and a fit to all of them at once may stop at any of the minima between.
+    """
+    o = problem.options.calibration
+    if excess(problem, first) < problem.options.search.little_left:
+        return first
+    context.report("re-calibration of growing parts")
+    point: dict[Key, float] = {}
+    for part in o.parts_of_recording:
+        models = problem.forward_models
+        shorter = problem.on([m.recording.until(part * m.recording.duration) for m in models])
+        if shorter.size == 0:
+            continue
+        found = fit(shorter, (), point, polish=False)
+        if found is None:
+            return first
+        point = found.point
+    other = fit(problem, (), point, polish=False, limit=first.cost)
+    return first if other is None or other.cost > first.cost else other
