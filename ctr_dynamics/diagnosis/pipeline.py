@@ -98,6 +98,8 @@ def diagnose_recordings(
         raise InputError(
             "the re-calibrated model cannot be linearised", do="check the robot file and the bag"
         )
+    recalibrated = result.recalibrated = found.no_cause.fit
+    result.whiteness_recalibrated = whiteness(problem, recalibrated)
     if context.out_of_time:
         result.notes.append(
             f"the time budget of {context.time_budget_s:g} s is used up: the search was not completed"

@@ -1,5 +1,7 @@
 """Fits of hypotheses: sizes that a derivative does not reach, and alternatives in the place of a cause."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from diagnosis_cases import Vibration, quantity
@@ -9,7 +11,12 @@ from ctr_dynamics.diagnosis.inference.candidates import candidates, causes_of
 from ctr_dynamics.diagnosis.inference.fit_problem import make_problem
 from ctr_dynamics.diagnosis.inference.hypotheses import Hypothesis, best_size_nearby
 from ctr_dynamics.diagnosis.inference.map_fit import fit
-from ctr_dynamics.diagnosis.inference.search_moves import SearchState, alternatives, fit_alternatives
+from ctr_dynamics.diagnosis.inference.search_moves import (
+    SearchState,
+    alternatives,
+    begin_again_without_causes,
+    fit_alternatives,
+)
 from ctr_dynamics.diagnosis.inference.sensitivities import sensitivities_at
 from ctr_dynamics.diagnosis.run_context import RunContext
 
@@ -45,3 +52,21 @@ def test_what_looks_like_a_cause_is_fitted_in_its_place(recording, robot, known)
     assert right.fit.cost < wrong.cost - 1.0
     known_ones = [*state.found, *new]
     assert not [s for s in alternatives(problem, known_ones, here) if s[0].effect == "payload_mass"]
+
+
+def test_nuisances_that_a_cause_has_led_to_replace_those_without(recording, robot, known):
+    """A fit that has stopped early is no fit to count causes against."""
+    mass = known["payload_mass", "added_kg"]
+    problem = make_problem(robot, [recording], [replace(mass, tolerance=mass.scale)], np.ones(6, bool))
+    stopped, whole = fit(problem, (), {}, iterations=0), fit(problem, (), {})
+    assert stopped is not None
+    assert whole is not None
+    other = candidates([known["density", "all.scale"]], recording.position)[0]
+    led = fit(problem, causes_of([other]), whole.point)
+    assert led is not None
+    state = SearchState(
+        problem, [other], stopped, SILENT, [Hypothesis((other,), led), Hypothesis((), stopped)]
+    )
+    assert begin_again_without_causes(state)
+    assert state.recalibrated.cost == pytest.approx(whole.cost, abs=1.0)
+    assert not begin_again_without_causes(state)

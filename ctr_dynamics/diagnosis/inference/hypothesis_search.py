@@ -24,6 +24,7 @@ from ctr_dynamics.diagnosis.inference.search_moves import (
     add_alternatives,
     add_further_cause,
     add_pairs,
+    begin_again_without_causes,
     drop_causes,
     fit_single_causes,
     leaders,
@@ -45,6 +46,8 @@ def search_hypotheses(
     are not there yet.
     """
     found = search_once(problem, pool, recalibrated, context)
+    if found is not None:
+        recalibrated = found.no_cause.fit
     if found is None or explains(problem, found.best, recalibrated) or context.out_of_time:
         return found
     if found.best.has_impacts:
@@ -85,6 +88,8 @@ def search_once(
         return None
     screened = screen(problem, here, recalibrated, (), pool)
     fit_single_causes(state, screened, here)
+    if begin_again_without_causes(state):
+        return search_once(problem, state.pool, state.recalibrated, context)
     large_misfit = excess(problem, recalibrated) > o.large_misfit
     if large_misfit and excess(problem, state.best.fit) > o.little_left and not context.out_of_time:
         screened, here = try_large_sizes(state, screened, here)

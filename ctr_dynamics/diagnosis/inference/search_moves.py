@@ -109,6 +109,22 @@ def fit_single_causes(
         )
 
 
+def begin_again_without_causes(state: SearchState) -> bool:
+    """Whether the nuisances of the best hypothesis are a better fit by themselves than that without causes, whose place they take.
+
+    A cause can lead the way to them that the fit without it did not find.
+    """
+    best, problem = state.best, state.problem
+    if not best.members:
+        return False
+    other = fit_without(problem, (), best.fit, state.recalibrated.cost)
+    if other is None or other.fit.cost > state.recalibrated.cost - problem.options.search.further_gain:
+        return False
+    state.context.report(f"once more, from the nuisances beside {', '.join(best.effects)}")
+    state.recalibrated = other.fit
+    return True
+
+
 def try_large_sizes(
     state: SearchState, screened: list[Screened], here: Sensitivities
 ) -> tuple[list[Screened], Sensitivities]:
