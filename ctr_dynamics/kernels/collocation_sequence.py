@@ -10,11 +10,12 @@ import math
 import numpy as np
 
 from ctr_dynamics.kernels.collocation import (
+    ACCOUNT,
+    FRESH,
+    OUTCOME,
     TWO_RUNS,
     advance_stages,
     newton_step,
-    predict,
-    remember_stages,
     renew,
 )
 from ctr_dynamics.kernels.compiler import njit
@@ -206,26 +207,23 @@ def stage_columns(kind, damping, mesh, scheme, solver, factors, done, dparameter
 
 
 @njit(nogil=True, error_model="numpy")
-def advance_stages_often(kind, damping, mesh, scheme, solver, run, past, at, inputs, fresh, tips):
+def advance_stages_often(kind, damping, mesh, scheme, solver, run, known, at, inputs, fresh, tips):
     """Steps with ``inputs`` (K, stages, inputs) at the times ``at`` (K, stages) s until one fails; returns (steps taken, sweeps, outcome of the
     last, known stages).
 
-    ``run``: :class:`~ctr_dynamics.kernels.structures.CollocationRun`; ``past``: times (P,) s, unknowns (P, mt) of the last stages, and how many of
-    them are known. ``tips`` (K, rows) takes the first rows of the state at the tip.
+    ``run``: :class:`~ctr_dynamics.kernels.structures.CollocationRun`; ``known``: of its last stages, those that tell what comes next. ``tips`` (K,
+    rows) takes the first rows of the state at the tip.
     """
-    times, unknowns, known = past
-    x = np.empty((1, STAGES, unknowns.shape[1]))
-    total = 0
+    account = np.zeros((1, ACCOUNT), np.int64)
+    account[0, FRESH] = fresh
+    first, total = len(run.nodes) - state_rows(kind.tubes).size, 0
     for k in range(len(inputs)):
-        predict(times, unknowns, known, solver.point.units, at[k], x[0])
-        outcome, sweeps, _ = advance_stages(kind, damping, mesh, scheme, solver, run, inputs[k], x, fresh)
+        sweeps, _ = advance_stages(kind, damping, mesh, scheme, solver, run, known, inputs[k], at[k], account)
         total += sweeps
-        if outcome != CONVERGED:
-            return k, total, outcome, known
-        fresh = False
-        remember_stages(times, unknowns, at[k], x[0])
-        known = min(known + STAGES, len(times))
-        first = len(run.nodes) - state_rows(kind.tubes).size
+        if account[0, OUTCOME] != CONVERGED:
+            return k, total, account[0, OUTCOME], known
+        account[0, FRESH] = 0
+        known = min(known + STAGES, len(run.times))
         for i in range(tips.shape[1]):
             tips[k, i] = run.nodes[first + i]
     return len(inputs), total, CONVERGED, known
@@ -239,7 +237,7 @@ def advance_columns_often(
     scheme,
     solver,
     run,
-    past,
+    known,
     at,
     inputs,
     fresh,
@@ -251,24 +249,28 @@ def advance_columns_often(
 ):
     """The same with columns: ``dparameters`` (NP, r), ``dinputs`` (K, stages, inputs, r), ``tangent``:
     :class:`~ctr_dynamics.kernels.structures.CollocationTangent`; ``dtips`` (K, rows, r) takes those of the tip."""
-    times, unknowns, known = past
-    x = np.empty((1, STAGES, unknowns.shape[1]))
-    before = np.empty(run.bank.shape[1])
+    before, newest = np.empty(run.bank.shape[1]), len(run.times) - STAGES
     total = 0
     for k in range(len(inputs)):
-        predict(times, unknowns, known, solver.point.units, at[k], x[0])
         before[:] = run.bank[Y_NOW]
-        outcome, sweeps, _ = advance_stages(kind, damping, mesh, scheme, solver, run, inputs[k], x, fresh)
+        taken, sweeps, outcome, known = advance_stages_often(
+            kind,
+            damping,
+            mesh,
+            scheme,
+            solver,
+            run,
+            known,
+            at[k : k + 1],
+            inputs[k : k + 1],
+            fresh,
+            tips[k : k + 1],
+        )
         total += sweeps
-        if outcome != CONVERGED:
+        if taken == 0:
             return k, total, outcome, known
         fresh = False
-        remember_stages(times, unknowns, at[k], x[0])
-        known = min(known + STAGES, len(times))
-        first = len(run.nodes) - state_rows(kind.tubes).size
-        for i in range(tips.shape[1]):
-            tips[k, i] = run.nodes[first + i]
-        done = (run.parameters, inputs[k], before, x[0])
+        done = (run.parameters, inputs[k], before, run.unknowns[newest:])
         spent = stage_columns(
             kind, damping, mesh, scheme, solver, run.factors, done, dparameters, dinputs[k], tangent
         )

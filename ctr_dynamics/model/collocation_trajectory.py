@@ -206,9 +206,8 @@ class _Run:
         beta = rows[-1, -1, input_rows(model.n)["beta"]]
         work = self.steps.workspaces.of(state.key, state.mesh, beta, scheme)
         run = state.run(self.steps.parameters, work.factors_in)
-        past = (state.times, state.unknowns, state.known)
         common = (
-            model.kind, self.damping, work.segments.mesh, scheme.coefficients, work.solver, run, past, at, rows, not state.usable, tips,
+            model.kind, self.damping, work.segments.mesh, scheme.coefficients, work.solver, run, state.known, at, rows, not state.usable, tips,
         )  # fmt: skip
         columns = self.columns
         if columns is None:
