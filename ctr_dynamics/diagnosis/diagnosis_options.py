@@ -100,7 +100,7 @@ class CalibrationOptions:
     stale: float = option(0.3, "of the step", "error of a prediction from which the Jacobian may be renewed")
     travelled: float = option(3.0, "whitened", "sum of these errors from which it is renewed")
     parts_of_recording: tuple[float, ...] = option(
-        (0.25, 0.35, 0.5, 0.7),
+        (0.125, 0.18, 0.25, 0.35, 0.5, 0.7),
         "of a recording",
         "fitted before all of it, where a first fit leaves more than noise",
     )
