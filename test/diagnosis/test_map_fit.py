@@ -7,9 +7,12 @@ import pytest
 from diagnosis_cases import Vibration, quantity
 
 from ctr_dynamics.diagnosis.diagnosis_options import DiagnosisOptions
+from ctr_dynamics.diagnosis.inference import calibration
+from ctr_dynamics.diagnosis.inference.calibration import _from_growing_spans
 from ctr_dynamics.diagnosis.inference.fit_problem import make_problem
 from ctr_dynamics.diagnosis.inference.gaussian_posterior import posterior
 from ctr_dynamics.diagnosis.inference.map_fit import GaussNewton, fit
+from ctr_dynamics.diagnosis.run_context import RunContext
 
 OPTIONS = DiagnosisOptions()
 PAYLOAD = ("payload_mass", "added_kg")
@@ -87,3 +90,16 @@ def test_nuisances_stay_near_their_tolerances_unless_they_may_go_far(recording, 
     assert near.values[0] == pytest.approx(OPTIONS.calibration.reach * nuisance.tolerance)
     assert 7 < far.values[0] / nuisance.tolerance < 11
     assert 7 < cause.values[0] / nuisance.tolerance < 11
+
+
+def test_a_frequency_is_found_by_growing_parts(recording, robot, known, monkeypatch):
+    """A first fit that has stopped at a wrong minimum is replaced, and one to noise is left as it is."""
+    mass = known["payload_mass", "added_kg"]
+    problem = make_problem(robot, [recording], [replace(mass, tolerance=mass.scale)], np.ones(6, bool))
+    stopped, right = fit(problem, (), {}, iterations=0), fit(problem, (), {})
+    found = _from_growing_spans(problem, stopped, RunContext(workers=1))
+    assert found.cost < stopped.cost - 1.0
+    assert found.cost == pytest.approx(right.cost, abs=0.5)
+    assert _from_growing_spans(problem, right, RunContext(workers=1)) is right
+    monkeypatch.setattr(calibration, "is_acceptable", lambda *_: False)
+    assert _from_growing_spans(problem, stopped, RunContext(workers=1)) is stopped

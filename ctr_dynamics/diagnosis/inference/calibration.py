@@ -8,7 +8,7 @@ from __future__ import annotations
 from ctr_dynamics.diagnosis.forward_model import Key
 from ctr_dynamics.diagnosis.inference.discretisation_error import correct_discretisation
 from ctr_dynamics.diagnosis.inference.fit_problem import Local, Problem
-from ctr_dynamics.diagnosis.inference.fit_quality import excess
+from ctr_dynamics.diagnosis.inference.fit_quality import excess, is_acceptable
 from ctr_dynamics.diagnosis.inference.map_fit import Fit, fit
 from ctr_dynamics.diagnosis.run_context import RunContext
 from ctr_dynamics.effects import EFFECTS, EffectQuantity, effect_quantities
@@ -67,7 +67,7 @@ def _from_growing_spans(problem: Problem, first: Fit, context: RunContext) -> Fi
         if shorter.size == 0:
             continue
         found = fit(shorter, (), point, polish=False)
-        if found is None:
+        if found is None or not is_acceptable(shorter, found):  # what is left is no matter of phases
             return first
         point = found.point
     other = fit(problem, (), point, polish=False, limit=first.cost)
