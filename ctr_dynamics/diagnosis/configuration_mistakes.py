@@ -139,6 +139,8 @@ def find_mistake(
 ) -> FoundMistake | None:
     """The mistake that leaves least when it is undone, where the misfit is gross and it explains nearly all."""
     o, fine = options.configuration, options.forward_model.fine
+    first = recording.until(o.longest_s)
+    recording = first if len(first.stamps) else recording
     before = misfit(recording, robot, fine)
     if before < o.gross * noise_floor(robot) * math.sqrt(2.0):
         return None

@@ -72,6 +72,7 @@ class ConfigurationOptions:
     """Configuration mistakes: units, signs and orders."""
 
     gross: float = option(8.0, "noise rms", "misfit below which no mistake is looked for")
+    longest_s: float = option(20.0, "s", "of a recording that shows a gross mistake, whatever comes after")
     improvement: float = option(0.25, "of the misfit", "what a mistake may leave when it is undone")
 
 
