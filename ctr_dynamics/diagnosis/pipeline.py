@@ -28,8 +28,8 @@ from ctr_dynamics.diagnosis.verdict.decision import (
     Evidence,
     Verdict,
     decide,
+    hypothesis_for_verdict,
     is_unexplained,
-    needed_hypothesis,
 )
 from ctr_dynamics.diagnosis.verdict.residual_tests import rms, whiteness
 from ctr_dynamics.diagnosis.verdict.separability import Cause, observability
@@ -112,7 +112,7 @@ def diagnose_recordings(
         if any(not is_wrong(problem, e) for e in found.hypotheses):
             context.report("evidence of the validation bags")
             weigh_by_prediction(found, problem, held_out, context)
-    best = needed_hypothesis(found.hypotheses, options.verdict.needed_gain)
+    best = hypothesis_for_verdict(found, options)
     result.extended = best.fit
     result.whiteness_extended = whiteness(problem, best.fit)
 

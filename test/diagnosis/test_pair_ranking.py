@@ -21,7 +21,7 @@ from ctr_dynamics.diagnosis.inference.screening import rank_pairs
 from ctr_dynamics.diagnosis.inference.search_moves import SearchState, add_pairs
 from ctr_dynamics.diagnosis.inference.sensitivities import Sensitivities
 from ctr_dynamics.diagnosis.run_context import RunContext
-from ctr_dynamics.diagnosis.verdict.decision import needed_hypothesis
+from ctr_dynamics.diagnosis.verdict.decision import hypothesis_for_verdict, needed_hypothesis
 from ctr_dynamics.effects import EffectParameter, EffectQuantity
 
 OPTIONS = DiagnosisOptions()
@@ -189,3 +189,14 @@ def test_a_cause_that_gains_little_is_not_needed(made):
     three.score, pair.score, single.score, none.score = 0.0, -9.0, -20.0, -40.0
     three.fitted_score, pair.fitted_score, single.fitted_score, none.fitted_score = 0.0, -1.0, -12.0, -40.0
     assert needed_hypothesis((three, pair, single, none), OPTIONS.verdict.needed_gain) is pair
+
+
+@pytest.mark.parametrize(("probability", "clean"), [(0.95, False), (0.85, True)])
+def test_no_bag_is_clean_where_a_cause_is_as_sure_as_a_name(made, probability, clean):
+    """By the evidence that a cause has to gain it is not needed; nobody would bet on the robot file."""
+    _, pool, _ = made
+    single, none = Hypothesis((pool["one"],), None), Hypothesis((), None)
+    none.score = none.fitted_score = -3.0
+    found = WeighedHypotheses([single, none], np.array([probability, 1.0 - probability]), none, None, [], [])
+    assert needed_hypothesis(found.hypotheses, OPTIONS.verdict.needed_gain) is none
+    assert hypothesis_for_verdict(found, OPTIONS) is (none if clean else single)

@@ -80,6 +80,15 @@ def needed_hypothesis(hypotheses: Sequence[Hypothesis], needed_gain: float) -> H
     return min(fewer, key=lambda e: (len(e.members), -e.score))
 
 
+def hypothesis_for_verdict(found: WeighedHypotheses, options: DiagnosisOptions) -> Hypothesis:
+    """The one that is needed; the likeliest where none with causes is, and yet it is as sure that something is wrong as a name must be."""
+    needed = needed_hypothesis(found.hypotheses, options.verdict.needed_gain)
+    if needed.members or not found.best.members:
+        return needed
+    right = sum(float(p) for e, p in zip(found.hypotheses, found.probabilities, strict=True) if not e.members)
+    return found.best if 1.0 - right >= options.verdict.named else needed
+
+
 def is_unexplained(problem: Problem, found: WeighedHypotheses, best: Hypothesis, evidence: Evidence) -> bool:
     """Whether ``best`` leaves what is neither noise, nor small and without effect on the bags that were not fitted."""
     o = problem.options
@@ -134,7 +143,8 @@ def _without_remainder(
     apart = all(cause.is_apart(o.verdict) for cause in result.causes)
     # who names more names these too
     probability = sum(p for effects, p in sets if set(best.effects) <= set(effects))
-    sure = probability >= o.verdict.named
+    needed = needed_hypothesis(found.hypotheses, o.verdict.needed_gain)
+    sure = probability >= o.verdict.named and bool(needed.members or not best.members)
     if not evidence.excited and not (best.members and apart and sure):
         result.word, result.causes = "not_excited", []
     elif not best.members:
