@@ -115,7 +115,7 @@ def begin_again_without_causes(state: SearchState) -> bool:
     A cause can lead the way to them that the fit without it did not find.
     """
     best, problem = state.best, state.problem
-    if not best.members:
+    if not best.members or not is_acceptable(problem, best.fit):
         return False
     other = fit_without(problem, (), best.fit, state.recalibrated.cost)
     if other is None or other.fit.cost > state.recalibrated.cost - problem.options.search.further_gain:
