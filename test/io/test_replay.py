@@ -52,6 +52,7 @@ class StandIn:
         self.invalid = range(0)
         self.noted: list[tuple[str, str, str]] = []
         self.health = Health()
+        self.runs = SimpleNamespace(expected_orientation=lambda: None)
         self.health.note = lambda *what: self.noted.append(what[:3])  # type: ignore[method-assign]
 
     def add_joint_state(self, stamp_ns, names, positions) -> None:
