@@ -42,10 +42,11 @@ from ctr_dynamics.model.time_scheme import Collocation
 from ctr_dynamics.model.trajectory import (
     CHUNK,
     PATIENCE,
-    SENSITIVE,
     TIP_ROWS,
+    ColumnEffects,
     InputRows,
     Trajectory,
+    steps_with_meaning,
     to_inputs,
     while_fitting,
 )
@@ -55,28 +56,17 @@ EPSILON = 1e-6  # of a column's unit: above rounding, and strong friction is str
 HALVINGS = 2  # of a step, before the rescue
 
 
-class _Columns:
-    """Columns of the fields along a simulation, with their buffers; two and two, zeros filling the last."""
+class _Columns(ColumnEffects):
+    """Columns of the fields along a simulation, two and two, with their buffers."""
 
-    def __init__(self, model: Model, effect: Floats, input_effect: Callable[[Floats], Floats]) -> None:
-        self.asked = effect.shape[1]
-        self.count = -(-self.asked // PAIR) * PAIR
-        self.model, self.effect = model, self._padded(effect)
-        self._input_effect = input_effect
+    def __init__(self, model: Model, effect: Floats, input_effect: Callable[[Floats], Floats] | None) -> None:
+        super().__init__(model, effect, input_effect, PAIR)
         self._lanes: dict[Key, SweepBuffers] = {}
         self._tables: dict[float, Floats] = {}
         self._tangent: CollocationTangent | None = None
         self._made_for: tuple[object, ...] = ()
         self.fields = np.zeros((self.count // PAIR, 0, PAIR))
         self.tip_of_all = np.zeros((TIP_ROWS, self.count))
-
-    def _padded(self, columns: Floats) -> Floats:
-        spare = [(0, 0)] * (columns.ndim - 1) + [(0, self.count - self.asked)]
-        return np.ascontiguousarray(np.pad(columns, spare))
-
-    def input_effect(self, times: Floats) -> Floats:
-        """(k, inputs, columns) derivatives of the inputs at times (k,)."""
-        return self._padded(self._input_effect(times))
 
     @property
     def tip(self) -> Floats:
@@ -306,29 +296,14 @@ def run_collocation(
     guess: Floats | None = None,
     events: Sequence[float] = (),
 ) -> Trajectory:
-    """Simulate from rest in the static equilibrium of the first inputs.
-
-    Args:
-        parameters: (NP,) block; the actuators and the tip wrench in it are not read.
-        inputs: gives (k, model.input_count) alpha, alpha rate, beta, force, torque and, for the extended model, beta rate (rad, rad/s, m, N,
-            N m, m/s) at times (k,) s.
-        duration: s; the number of steps is the largest that does not pass it.
-        effect: (NP, r) derivative of the parameter block by r quantities, in units in which a millionth is a small change.
-        input_effect: gives (k, inputs, r) derivatives of the inputs at times (k,).
-        guess: (5 + N,) unknowns of the static equilibrium to start from.
-        events: s, times at which the inputs jump or bend: steps are divided there, since a step across one is of first order only.
-    Raises:
-        InputError: no static equilibrium at the first inputs.
-    """
+    """Simulate from rest, as :func:`ctr_dynamics.model.trajectory.run` does with other schemes; arguments and errors are those."""
     dt, stages = scheme.dt, scheme.stages
     steps = int(np.floor(duration / dt + 1e-9))
     columns: _Columns | None = None
     out: Floats | None = None
     if effect is not None:
-        r = effect.shape[1]
-        give = input_effect or (lambda times: np.zeros((len(times), model.input_count, r)))
-        columns = _Columns(model, effect, give)
-        out = np.zeros((steps + 1, TIP_ROWS, r))
+        columns = _Columns(model, effect, input_effect)
+        out = np.zeros((steps + 1, TIP_ROWS, columns.asked))
     this = _Run(model, scheme, parameters, inputs, columns, tolerance, guess)
     tip = np.empty((steps + 1, TIP_ROWS))
     tip[0] = this.tip
@@ -347,7 +322,7 @@ def run_collocation(
             dtips = None if out is None else out[k + 1 : k + 1 + usable]
             taken = this.fast(scheme, at[:usable], rows[:usable], tip[k + 1 : k + 1 + usable], dtips)
             if out is not None and this.columns is not None:
-                lost = _lost(out[k + 1 : k + 1 + taken])
+                lost = steps_with_meaning(out[k + 1 : k + 1 + taken])
                 if lost < taken:
                     out[k + 1 + lost :] = 0.0
                     this.columns = None
@@ -374,17 +349,4 @@ def run_collocation(
         if out is not None and this.columns is not None:
             out[k + 1] = this.columns.tip
         k += 1
-    done = k + 1
-    return Trajectory(
-        dt * np.arange(done, dtype=np.float64),
-        tip[:done],
-        None if out is None else out[:done],
-        failure,
-        this.sweeps,
-    )
-
-
-def _lost(columns: Floats) -> int:
-    """Number of steps until one of ``columns`` (K, 13, r) is beyond ``SENSITIVE``."""
-    beyond = np.abs(columns[:, :3]).max(axis=(1, 2)) > SENSITIVE
-    return int(np.argmax(beyond)) if beyond.any() else len(columns)
+    return Trajectory.of_steps(k, dt, tip, out, failure, this.sweeps)

@@ -61,18 +61,55 @@ class Trajectory:
     failure: str = ""
     sweeps: int = 0
 
+    @classmethod
+    def of_steps(
+        cls, taken: int, dt: float, tip: Floats, columns: Floats | None, failure: str, sweeps: int
+    ) -> Trajectory:
+        """The first ``taken`` steps of ``dt`` (s), of which the arrays have room for more."""
+        done = taken + 1
+        t = dt * np.arange(done, dtype=np.float64)
+        return cls(t, tip[:done], None if columns is None else columns[:done], failure, sweeps)
 
-class _Columns:
-    """Columns of the stored fields along a simulation, with their buffers.
 
-    Batches of eight columns lie apart, each in one piece of memory; columns of zeros fill the last one.
+class ColumnEffects:
+    """What r quantities do to parameters and inputs, as whole batches of columns; columns of zeros fill the last one.
+
+    Args:
+        model: the robot. effect: (NP, r) derivative of the parameter block by the quantities.
+        input_effect: gives (k, inputs, r) derivatives of the inputs at times (k,); None where they do not depend on the quantities.
+        batch: columns of a batch.
+
+    Attributes:
+        asked: r. count: columns of all batches. effect: (NP, count).
     """
 
-    def __init__(self, model: Model, effect: Floats, input_effect: Callable[[Floats], Floats]) -> None:
-        self.asked = effect.shape[1]
-        self.count = -(-self.asked // SIMD_WIDTH) * SIMD_WIDTH
-        self.model, self.effect = model, self._padded(effect)
+    def __init__(
+        self, model: Model, effect: Floats, input_effect: Callable[[Floats], Floats] | None, batch: int
+    ) -> None:
+        self.model, self.asked = model, effect.shape[1]
+        self.count = -(-self.asked // batch) * batch
+        self.effect = self._padded(effect)
         self._input_effect = input_effect
+
+    def _padded(self, columns: Floats) -> Floats:
+        spare = [(0, 0)] * (columns.ndim - 1) + [(0, self.count - self.asked)]
+        return np.ascontiguousarray(np.pad(columns, spare))
+
+    def input_effect(self, times: Floats) -> Floats:
+        """(k, inputs, count) derivatives of the inputs at times (k,)."""
+        if self._input_effect is None:
+            return np.zeros((len(times), self.model.input_count, self.count))
+        return self._padded(self._input_effect(times))
+
+
+class _Columns(ColumnEffects):
+    """Columns of the stored fields along a simulation, with their buffers.
+
+    Batches of eight columns lie apart, each in one piece of memory.
+    """
+
+    def __init__(self, model: Model, effect: Floats, input_effect: Callable[[Floats], Floats] | None) -> None:
+        super().__init__(model, effect, input_effect, SIMD_WIDTH)
         # a batch for columns beside the unknowns' lanes
         self.lanes = lanes_for(unknown_lanes(model.kind).count + SIMD_WIDTH)
         self.differences = FiniteDifferences(EPSILON, model.tangent_perturbation)
@@ -84,14 +121,6 @@ class _Columns:
             np.zeros((state_rows(model.n).size, self.count)),
         )
         self._buffers: dict[Key, TangentBuffers] = {}
-
-    def _padded(self, columns: Floats) -> Floats:
-        spare = [(0, 0)] * (columns.ndim - 1) + [(0, self.count - self.asked)]
-        return np.ascontiguousarray(np.pad(columns, spare))
-
-    def input_effect(self, times: Floats) -> Floats:
-        """(k, inputs, columns) derivatives of the inputs at times (k,)."""
-        return self._padded(self._input_effect(times))
 
     def buffers(self, key: Key, mesh: Mesh, slots: int) -> TangentBuffers:
         """Buffers for the sections ``key``."""
@@ -210,10 +239,8 @@ def run(
     columns: _Columns | None = None
     out: Floats | None = None
     if effect is not None:
-        r = effect.shape[1]
-        give = input_effect or (lambda times: np.zeros((len(times), model.input_count, r)))
-        columns = _Columns(model, effect, give)
-        out = np.empty((steps + 1, TIP_ROWS, r))
+        columns = _Columns(model, effect, input_effect)
+        out = np.empty((steps + 1, TIP_ROWS, columns.asked))
         out[0] = columns.start(state, parameters, first, columns.input_effect(np.zeros(1))[0], RATES + stages)
     divided = _divided(events, dt) if scheme.one_step else {}
     k, sweeps, failure, hard = 0, 0, "", 0
@@ -238,7 +265,7 @@ def run(
             if taken:
                 state.inputs = to_inputs(n, rows_now[taken - 1, -1])
             if columns is not None and out is not None:
-                lost = _lost(out[k + 1 : k + 1 + taken]) if outcome != NO_TANGENT else taken - 1
+                lost = steps_with_meaning(out[k + 1 : k + 1 + taken]) if outcome != NO_TANGENT else taken - 1
                 if lost < taken:
                     out[k + 1 + lost :] = 0.0
                     columns = None
@@ -276,17 +303,10 @@ def run(
                     out[k + 1] = columns.tip
             tip[k + 1] = state.nodes[-1, :TIP_ROWS]
             k += 1
-    done = k + 1
-    return Trajectory(
-        dt * np.arange(done, dtype=np.float64),
-        tip[:done],
-        None if out is None else out[:done],
-        failure,
-        sweeps,
-    )
+    return Trajectory.of_steps(k, dt, tip, out, failure, sweeps)
 
 
-def _lost(columns: Floats) -> int:
+def steps_with_meaning(columns: Floats) -> int:
     """Number of steps until one of ``columns`` (K, 13, r) is beyond ``SENSITIVE``."""
     beyond = np.abs(columns[:, :3]).max(axis=(1, 2)) > SENSITIVE
     return int(np.argmax(beyond)) if beyond.any() else len(columns)

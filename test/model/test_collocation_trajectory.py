@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
-from test_trajectory import ROBOT, extended_robot, inputs_of
+from test_trajectory import ROBOT, extended_robot, inputs_of, plain_parameters
 
-from ctr_dynamics.model import collocation_trajectory
+from ctr_dynamics.model import collocation_trajectory, trajectory
 from ctr_dynamics.model.collocation_trajectory import run_collocation
 from ctr_dynamics.model.model import Model
 from ctr_dynamics.model.simulator import Simulator
@@ -88,18 +88,7 @@ def wrong_columns(model, slide, parameters, inputs, **given):
 def test_columns_of_a_plain_run():
     """Stiffness, damping, friction, weight; angles, force; with a change of sections on the way, over which the columns are carried."""
     model = Model(ROBOT, nodes=12)
-    block, layout = model.parameters, model.layout
-    parameters = [
-        ("bending_stiffness", 0, 0.02 * block[layout["bending_stiffness"]][0]),
-        ("torsional_stiffness", 1, 0.02 * block[layout["torsional_stiffness"]][1]),
-        ("precurvature", 0, 0.01),
-        ("bending_damping", 0, 1e-6),
-        ("body_mass", 0, 1e-4),
-        ("base_coulomb", 0, 0.05),
-        ("tube_viscous", 0, 1e-5),
-        ("gravity", 0, 0.1),
-    ]
-    assert not wrong_columns(model, 0.03, parameters, [(0, 0.01), (6, 0.01)])
+    assert not wrong_columns(model, 0.03, plain_parameters(model), [(0, 0.01), (6, 0.01)])
     # beta itself on sections that stay: a shift of beta also shifts the time at which they change
     assert not wrong_columns(model, 0.0, [], [(4, 1e-4), (5, 1e-4)])
 
@@ -181,7 +170,7 @@ def test_columns_end_where_they_tell_nothing(monkeypatch):
     whole = follow(model, effect=effect)
     size = np.abs(whole.columns[:, :3]).max(axis=(1, 2))
     k = int(np.argmax(size > 1.5 * size[0]))
-    monkeypatch.setattr(collocation_trajectory, "SENSITIVE", 1.5 * size[0])
+    monkeypatch.setattr(trajectory, "SENSITIVE", 1.5 * size[0])
     cut = follow(model, effect=effect)
     np.testing.assert_allclose(cut.tip, whole.tip, atol=1e-4)
     np.testing.assert_allclose(cut.columns[:k], whole.columns[:k], atol=1e-12)

@@ -67,6 +67,21 @@ def test_run_equals_steps(slide):
     assert moved[-1] == pytest.approx(at(found.t[-1]).beta[1])
 
 
+def plain_parameters(model):
+    """(group, index, unit) of parameters of every kind that a plain run has: stiffness, shape, damping, friction, weight."""
+    block, layout = model.parameters, model.layout
+    return [
+        ("bending_stiffness", 0, 0.02 * block[layout["bending_stiffness"]][0]),
+        ("torsional_stiffness", 1, 0.02 * block[layout["torsional_stiffness"]][1]),
+        ("precurvature", 0, 0.01),
+        ("bending_damping", 0, 1e-6),
+        ("body_mass", 0, 1e-4),
+        ("base_coulomb", 0, 0.05),
+        ("tube_viscous", 0, 1e-5),
+        ("gravity", 0, 0.1),
+    ]
+
+
 def compare(model, slide, parameters, inputs, tolerance):
     """Columns of a run against central differences of runs.
 
@@ -122,23 +137,7 @@ def compare(model, slide, parameters, inputs, tolerance):
 def test_sensitivities_of_a_plain_run():
     """Stiffness, damping, friction, weight; angles, force; with a change of sections on the way, over which the columns are carried."""
     model = Model(ROBOT, nodes=12)
-    block, layout = model.parameters, model.layout
-    compare(
-        model,
-        0.03,
-        [
-            ("bending_stiffness", 0, 0.02 * block[layout["bending_stiffness"]][0]),
-            ("torsional_stiffness", 1, 0.02 * block[layout["torsional_stiffness"]][1]),
-            ("precurvature", 0, 0.01),
-            ("bending_damping", 0, 1e-6),
-            ("body_mass", 0, 1e-4),
-            ("base_coulomb", 0, 0.05),
-            ("tube_viscous", 0, 1e-5),
-            ("gravity", 0, 0.1),
-        ],
-        [(0, 0.01), (6, 0.01)],
-        2e-3,
-    )
+    compare(model, 0.03, plain_parameters(model), [(0, 0.01), (6, 0.01)], 2e-3)
     # beta itself on sections that stay: a shift of beta also shifts the time at which they change
     compare(model, 0.0, [], [(4, 1e-4), (5, 1e-4)], 2e-3)
 
