@@ -8,15 +8,9 @@ from typing import Annotated
 
 import typer
 
-from ctr_dynamics.cli.recording_options import (
-    BAG_HELP,
-    RecordingChoice,
-    settings_from,
-    with_recording_options,
-)
+from ctr_dynamics.cli.measured_tips import read_measured
+from ctr_dynamics.cli.recording_options import BAG_HELP, RecordingChoice, with_recording_options
 from ctr_dynamics.io.atomic_files import atomic_file, check_targets
-from ctr_dynamics.io.inputs.input_mapping import parse_remap
-from ctr_dynamics.robot_files import load_robot
 
 
 @with_recording_options
@@ -47,25 +41,20 @@ def align(
     """
     from ctr_dynamics.calibration import alignment
     from ctr_dynamics.calibration.alignment_report import file_text, lines
-    from ctr_dynamics.calibration.reading import mount_of, read_tips
-    from ctr_dynamics.sensing.tracker_parameters import with_robot_file, with_tracker_parameters
+    from ctr_dynamics.calibration.reading import mount_of
 
-    loaded = load_robot(robot)
     check_targets({"output": output}, {"bag": bag, "robot file": robot})
-    settings = with_robot_file(settings_from(choice.params, choice.assignments), loaded)
-    measured = read_tips(bag, loaded, settings, parse_remap(choice.remap))
-    for note in measured.notes:
-        print(f"ctr-dynamics: note: {note}", file=sys.stderr)
+    tips = read_measured(bag, robot, choice)
     found = alignment.align(
-        with_tracker_parameters(loaded, settings),
-        measured.samples,
-        file=loaded,
-        mount=mount_of(settings),
+        tips.robot,
+        tips.measured.samples,
+        file=tips.file,
+        mount=mount_of(tips.settings),
         unknown_registration=unknown_registration,
         most_lag=most_lag,
     )
     print("\n".join(lines(found)))
-    text, warning = file_text(found, settings, f"ctr-dynamics align {bag.name} --robot {robot}")
+    text, warning = file_text(found, tips.settings, f"ctr-dynamics align {bag.name} --robot {robot}")
     with atomic_file(output) as temporary:
         temporary.write_text(text, encoding="utf-8")
     if warning:

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from ctr_dynamics.cli.recording_options import RecordingChoice, settings_from, with_recording_options
+from ctr_dynamics.cli.measured_tips import read_measured
+from ctr_dynamics.cli.recording_options import RecordingChoice, with_recording_options
 from ctr_dynamics.io.atomic_files import atomic_file, check_targets
-from ctr_dynamics.io.inputs.input_mapping import parse_remap
-from ctr_dynamics.robot_files import load_robot
 
 
 @with_recording_options
@@ -48,22 +46,20 @@ def calibrate(
     has not become smaller.
     """
     from ctr_dynamics.calibration.calibration_report import lines, robot_text
-    from ctr_dynamics.calibration.reading import mount_of, read_tips
+    from ctr_dynamics.calibration.reading import mount_of
     from ctr_dynamics.calibration.robot_calibration import calibrate as calibrate_robot
-    from ctr_dynamics.sensing.tracker_parameters import with_robot_file, with_tracker_parameters
 
-    loaded = load_robot(robot)
     check_targets({"output": output}, {"tips": tips, "robot file": robot})
-    settings = with_robot_file(settings_from(choice.params, choice.assignments), loaded)
-    measured = read_tips(tips, loaded, settings, parse_remap(choice.remap))
-    for note in measured.notes:
-        print(f"ctr-dynamics: note: {note}", file=sys.stderr)
-    start = with_tracker_parameters(loaded, settings)
+    read = read_measured(tips, robot, choice)
     found = calibrate_robot(
-        start, measured.samples, until=fit_until, mount=mount_of(settings), note=f"on {tips.name}"
+        read.robot,
+        read.measured.samples,
+        until=fit_until,
+        mount=mount_of(read.settings),
+        note=f"on {tips.name}",
     )
     print("\n".join(lines(found)))
     with atomic_file(output) as temporary:
-        temporary.write_text(robot_text(found, start != loaded), encoding="utf-8")
+        temporary.write_text(robot_text(found, read.robot != read.file), encoding="utf-8")
     print(f"output  {output}")
     return 0 if found.after.rms < found.before.rms else 1

@@ -10,10 +10,10 @@ from typing import Annotated
 
 import typer
 
-from ctr_dynamics.cli.recording_options import RecordingChoice, settings_from, with_recording_options
+from ctr_dynamics.cli.measured_tips import read_measured
+from ctr_dynamics.cli.recording_options import RecordingChoice, with_recording_options
 from ctr_dynamics.errors import InputError
 from ctr_dynamics.io.atomic_files import atomic_file, check_targets
-from ctr_dynamics.io.inputs.input_mapping import parse_remap
 from ctr_dynamics.model.model import Model
 from ctr_dynamics.model.pose_table import output_cells, output_header, read_poses, solve_poses
 from ctr_dynamics.robot_files import load_robot
@@ -94,19 +94,13 @@ def statics(
 def _compared(poses: Path, robot: str, output: Path, nodes: int, choice: RecordingChoice) -> int:
     """Expected beside measured tips; 1 where the model has no solution."""
     from ctr_dynamics.calibration.comparison import HEADER, compare, table
-    from ctr_dynamics.calibration.reading import read_tips
-    from ctr_dynamics.sensing.tracker_parameters import with_robot_file, with_tracker_parameters
 
-    loaded = load_robot(robot)
-    settings = with_robot_file(settings_from(choice.params, choice.assignments), loaded)
-    tips = read_tips(poses, loaded, settings, parse_remap(choice.remap))
-    for note in tips.notes:
-        print(f"ctr-dynamics: note: {note}", file=sys.stderr)
-    found = compare(with_tracker_parameters(loaded, settings), tips.samples, nodes)
+    tips = read_measured(poses, robot, choice)
+    found = compare(tips.robot, tips.measured.samples, nodes)
     with atomic_file(output) as temporary, temporary.open("w", newline="", encoding="utf-8") as stream:
         writer = csv.writer(stream, lineterminator="\n")
         writer.writerow(HEADER)
-        writer.writerows([f"{value:.9g}" for value in row] for row in table(found, tips.lines))
+        writer.writerows([f"{value:.9g}" for value in row] for row in table(found, tips.measured.lines))
     print(f"{found.errors.count} tips  {found.errors.text()}")
     print(f"output  {output}")
     return 1 if found.errors.unsolved else 0
