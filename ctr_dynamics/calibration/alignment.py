@@ -6,6 +6,7 @@ on from there, with the robot's own parameters free inside their tolerances, so 
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,6 +18,7 @@ from ctr_dynamics.calibration.tip_fit import (
     DELAY,
     MOUNT,
     Coordinate,
+    Key,
     TipFit,
     TipModel,
     fit_tips,
@@ -204,18 +206,18 @@ def mount_angle(mount: Floats) -> float:
     return float(np.linalg.norm(to_vector(mount)))
 
 
+def mount_vector(model: TipModel, point: Mapping[Key, float], beside: Floats | None) -> Floats:
+    """Rotation vector (3,) of the sensor in the tip frame at ``point``, with the mount (4,) that the samples' orientations are already rid of."""
+    found = model.mount_at(point)
+    return to_vector(found if beside is None else multiply(found, beside))
+
+
 def registered(robot: Robot, rotation: Floats, translation: Floats) -> Robot:
     """``robot`` with the registration ``rotation`` (4,) wxyz and ``translation`` (3,) m."""
-    tracker = robot.tracker
-    changed = {
-        "registration_rotation": tracker.registration_rotation.model_copy(
-            update={"value": tuple(to_vector(rotation).tolist())}
-        ),
-        "registration_translation": tracker.registration_translation.model_copy(
-            update={"value": tuple(translation.tolist())}
-        ),
-    }
-    return robot.model_copy(update={"tracker": tracker.model_copy(update=changed)})
+    return robot.with_tracker(
+        registration_rotation=tuple(to_vector(rotation).tolist()),
+        registration_translation=tuple(translation.tolist()),
+    )
 
 
 def _alignment(robot: Robot, model: TipModel, found: TipFit, mount: Floats | None) -> Alignment:
@@ -230,10 +232,6 @@ def _alignment(robot: Robot, model: TipModel, found: TipFit, mount: Floats | Non
     def deviation(effect: str, names: tuple[str, ...]) -> Floats:
         return np.array([sigma.get((effect, name), 0.0) for name in names])
 
-    turn = from_vector(np.array([point.get(key, 0.0) for key in MOUNT]))
-    total = multiply(turn, model.mount)
-    if mount is not None:
-        total = multiply(total, mount)
     return Alignment(
         lag=tracker.delay,
         lag_sigma=sigma[DELAY],
@@ -243,7 +241,7 @@ def _alignment(robot: Robot, model: TipModel, found: TipFit, mount: Floats | Non
         rotation_sigma=deviation("registration_rotation", ("rx_rad", "ry_rad", "rz_rad")),
         translation=shift,
         translation_sigma=deviation("registration_translation", ("tx_m", "ty_m", "tz_m")),
-        mount=to_vector(total),
+        mount=mount_vector(model, point, mount),
         mount_sigma=np.array([sigma.get(key, 0.0) for key in MOUNT]),
         errors=tip_errors(found.residual, model),
         fit=found,

@@ -15,12 +15,12 @@ from ctr_dynamics.calibration.alignment import (
     first_lag,
     first_mount,
     mount_angle,
+    mount_vector,
     static_quantities,
 )
 from ctr_dynamics.calibration.tip_errors import TipErrors, tip_errors
 from ctr_dynamics.calibration.tip_fit import (
     DELAY,
-    MOUNT,
     Coordinate,
     Key,
     TipFit,
@@ -33,7 +33,6 @@ from ctr_dynamics.diagnosis.inference.map_fit import Fit
 from ctr_dynamics.diagnosis.output.robot_export import robot_with
 from ctr_dynamics.effects import effect_quantities
 from ctr_dynamics.errors import InputError
-from ctr_dynamics.kernels.rotations import from_vector, multiply, to_vector
 from ctr_dynamics.robot import Robot
 from ctr_dynamics.robot_files import robot_to_dict
 from ctr_dynamics.robot_files.loader import robot_from_dict
@@ -122,17 +121,14 @@ def calibrate(
             coordinates += mount_coordinates()
     fit = fit_tips(model, coordinates, start)
     judge, seen_again = TipModel(robot, unseen, model.mount), TipModel(robot, seen, model.mount)
-    nominal = TipModel(robot, unseen, model.mount)
-    total = multiply(from_vector(np.array([fit.point.get(key, 0.0) for key in MOUNT])), model.mount)
     errors = [
         tip_errors(m.residual(p, m.tips(p)), m)
-        for m, p in ((nominal, {}), (judge, fit.point), (seen_again, fit.point))
+        for m, p in ((judge, {}), (judge, fit.point), (seen_again, fit.point))
     ]
     text = f"calibrated{f' {note}' if note else ''}: {1e3 * errors[1].rms:.2f} mm rms on held-out tips"
     calibrated = calibrated_robot(robot, fit, text)
     if free:
-        vector = to_vector(multiply(total, mount) if mount is not None else total)
-        calibrated = calibrated.with_mount(tuple(vector.tolist()))
+        calibrated = calibrated.with_mount(tuple(mount_vector(model, fit.point, mount).tolist()))
     return Calibration(
         robot=calibrated,
         fit=fit,

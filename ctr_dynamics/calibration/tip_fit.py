@@ -16,14 +16,9 @@ from ctr_dynamics.calibration.static_tips import NODES, StaticTips, Tips
 from ctr_dynamics.calibration.tip_samples import TipSamples
 from ctr_dynamics.effects import EffectQuantity, Plant, apply_effects, make_plant
 from ctr_dynamics.errors import InputError
-from ctr_dynamics.kernels.rotations import (
-    conjugate_rows,
-    from_vector,
-    multiply,
-    multiply_rows,
-    to_vector_rows,
-)
+from ctr_dynamics.kernels.rotations import conjugate, from_vector, multiply, multiply_rows
 from ctr_dynamics.robot import Robot
+from ctr_dynamics.sensing.tracker import free_axis, pose_differences
 
 Floats = NDArray[np.float64]
 Key = tuple[str, str]
@@ -132,34 +127,20 @@ class TipModel:
         plant = self.plant(point)
         return self._solver.solve(plant, plant.tracker.age, start)
 
+    def mount_at(self, point: Mapping[Key, float]) -> Floats:
+        """Orientation (4,) wxyz of the sensor in the tip frame at ``point``, beside the one that the bag was read with."""
+        return multiply(from_vector(np.array([point.get(key, 0.0) for key in MOUNT])), self.mount)
+
     def residual(self, point: Mapping[Key, float], tips: Tips) -> Floats:
         """(s, 6) measured minus expected, see :class:`TipFit`; NaN where there is no tip."""
         samples, tracker = self.samples, self.plant(point).tracker
         position, quaternion = tracker.reported(samples.stamps, tips.pose[:, :3], tips.pose[:, 3:])
-        turn = from_vector(np.array([point.get(key, 0.0) for key in MOUNT]))
-        mount = multiply(turn, self.mount)
-        back = np.tile(mount * [1.0, -1.0, -1.0, -1.0], (len(quaternion), 1))
-        error = multiply_rows(conjugate_rows(quaternion), multiply_rows(samples.quaternion, back))
-        out = np.zeros((len(quaternion), 6))
-        out[:, :3] = samples.position - position
-        if samples.axes[3:].any():
-            out[:, 3:] = to_vector_rows(self._measured_turn(error))
+        back = np.tile(conjugate(self.mount_at(point)), (len(quaternion), 1))
+        turned = multiply_rows(samples.quaternion, back)
+        out = pose_differences(samples.position, turned, position, quaternion, free_axis(samples.axes))
         out *= samples.axes
         out[~tips.found] = np.nan
         return out
-
-    def _measured_turn(self, error: Floats) -> Floats:
-        """Rotations (s, 4) without the turn about the one axis that is not measured, which is arbitrary."""
-        axes = self.samples.axes[3:]
-        if axes.sum() != 2:
-            return error
-        free = 1 + int(np.argmin(axes))
-        twist = np.zeros_like(error)
-        twist[:, 0], twist[:, free] = error[:, 0], error[:, free]
-        size = np.linalg.norm(twist, axis=1)
-        twist[size < 1e-9] = [1.0, 0.0, 0.0, 0.0]
-        twist /= np.maximum(size, 1e-9)[:, None]
-        return multiply_rows(error, conjugate_rows(twist))
 
 
 def fit_tips(

@@ -292,6 +292,14 @@ class Robot(Block):
         """Length of tube 1 in front of the base plate, m, at rest; no tube reaches farther."""
         return float(self.lengths[0] + self.rest.beta.value[0])
 
+    def with_tracker(self, **values: float | tuple[float, ...]) -> Robot:
+        """The robot with other values of its tracker's quantities, by their names; units and tolerances stay."""
+        tracker = self.tracker
+        changed = {
+            name: getattr(tracker, name).model_copy(update={"value": value}) for name, value in values.items()
+        }
+        return self.model_copy(update={"tracker": tracker.model_copy(update=changed)})
+
     def with_mount(self, rotation: tuple[float, ...]) -> Robot:
         """The robot with its tracker's sensor turned by the rotation vector (3,) rad in the tip frame."""
         mount = VectorQuantity.model_validate({"value": rotation, "unit": "rad"})

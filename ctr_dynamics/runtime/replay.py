@@ -252,8 +252,9 @@ def replay(
     if not isinstance(robot, Robot):
         robot = load_robot(robot)
     settings = with_robot_file(settings, robot)
-    opened = bag if isinstance(bag, Bag) else open_bag(bag, input_mapping(settings))
-    opened.read_for(robot.n_tubes, input_mapping(settings).mount_xyzw)
+    mapping = input_mapping(settings)
+    opened = bag if isinstance(bag, Bag) else open_bag(bag, mapping)
+    opened.read_for(robot.n_tubes, mapping.mount_xyzw)
     opened.check_inputs()
     settings, rate_note = with_joint_rate(opened, settings)
     settings = settings.replace({"robot": robot.source or robot.name})

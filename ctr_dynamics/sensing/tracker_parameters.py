@@ -24,14 +24,12 @@ def with_tracker_parameters(robot: Robot, settings: Settings) -> Robot:
     extra = from_vector(rotation)
     turned = multiply(extra, from_vector(np.array(tracker.registration_rotation.value)))
     moved = matrix(extra) @ np.array(tracker.registration_translation.value) + translation
-    values = {
-        "registration_rotation": tuple(to_vector(turned).tolist()),
-        "registration_translation": tuple(moved.tolist()),
-        "lever_arm": tuple((np.array(tracker.lever_arm.value) + lever).tolist()),
-        "delay": float(tracker.delay.value + delay),
-    }
-    changed = {name: getattr(tracker, name).model_copy(update={"value": v}) for name, v in values.items()}
-    return robot.model_copy(update={"tracker": tracker.model_copy(update=changed)})
+    return robot.with_tracker(
+        registration_rotation=tuple(to_vector(turned).tolist()),
+        registration_translation=tuple(moved.tolist()),
+        lever_arm=tuple((np.array(tracker.lever_arm.value) + lever).tolist()),
+        delay=float(tracker.delay.value + delay),
+    )
 
 
 def with_robot_file(settings: Settings, robot: Robot) -> Settings:
