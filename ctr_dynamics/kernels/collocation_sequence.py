@@ -2,7 +2,7 @@
 
 The derivatives (columns) are those of the step itself. All stages of a column stand side by side with those of another one in the lanes of one
 sweep, with the parameters, inputs, fields and unknowns moved a little along the column. What the boundary values must follow is found by Newton's
-method with the step's own Jacobian, in one or two sweeps, since the problem is linear.
+method with a Jacobian of their own, in a few sweeps, since the problem is linear. The run is the same, bit by bit, without columns.
 """
 
 import math
@@ -140,7 +140,7 @@ def _residual_column(b, base, g, scale, epsilon, F):
 
 
 @njit(nogil=True, error_model="numpy")
-def stage_columns(kind, damping, mesh, scheme, solver, factors, done, dparameters, dinputs, tangent):
+def stage_columns(kind, damping, mesh, scheme, solver, done, dparameters, dinputs, tangent):
     """Columns over one solved step, whose solution is in the buffers of the ``solver``.
 
     ``done``: parameters (NP,), inputs (stages, inputs), fields before (fields,), unknowns (stages, mt). ``dparameters`` (NP, r), ``dinputs`` (stages,
@@ -149,12 +149,15 @@ def stage_columns(kind, damping, mesh, scheme, solver, factors, done, dparameter
     """
     parameters, inputs, before, x = done
     base, units, scale = solver.stages, solver.point.units, solver.point.residual_units
-    b, epsilon, dfields = tangent.lanes, tangent.epsilon, tangent.fields
+    b, epsilon, dfields, factors = tangent.lanes, tangent.epsilon, tangent.fields, tangent.factors
     L, mt, main = SIMD_WIDTH, x.shape[1], len(tangent.lanes.history) // SIMD_WIDTH
     dx, z, F = np.empty((PAIR, STAGES, mt)), np.empty((PAIR, STAGES, mt)), np.empty((STAGES, mt))
     work = np.empty((2, 2, mt))
     tip = len(b.nodes) // L - state_rows(kind.tubes).size
-    total, fresh = 0, False
+    total, fresh = 0, not tangent.ready[0]
+    if fresh and not renew(kind, mesh, scheme, base, STAGES, 0, solver, factors):
+        return -1
+    tangent.ready[0] = True
     for pair in range(len(dfields)):
         coupling = stage_coupling(TWO_RUNS, damping, tangent.tables[pair])
         for g in range(PAIR):
@@ -185,6 +188,7 @@ def stage_columns(kind, damping, mesh, scheme, solver, factors, done, dparameter
                     break
                 # the Jacobian is of another place
                 if not renew(kind, mesh, scheme, base, STAGES, 0, solver, factors):
+                    tangent.ready[0] = False
                     return -1
                 fresh, left_before = True, math.inf
             if left < ACCURACY or (left < ROUNDING and left > 0.5 * left_before):
@@ -271,9 +275,7 @@ def advance_columns_often(
             return k, total, outcome, known
         fresh = False
         done = (run.parameters, inputs[k], before, run.unknowns[newest:])
-        spent = stage_columns(
-            kind, damping, mesh, scheme, solver, run.factors, done, dparameters, dinputs[k], tangent
-        )
+        spent = stage_columns(kind, damping, mesh, scheme, solver, done, dparameters, dinputs[k], tangent)
         if spent < 0:
             return k, total, NO_TANGENT, known
         total += spent

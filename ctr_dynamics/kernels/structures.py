@@ -221,7 +221,8 @@ class CollocationRun(NamedTuple):
 class CollocationTangent(NamedTuple):
     """Columns of a run: ``fields`` (r / 2, fields, 2), ``unknowns`` (r, stages, mt) of the last step in units, a ``guess`` of the next one's, which
     ``weights`` (degrees, stages, stages) extrapolate, and ``tip`` (rows, r), the first rows of the state there; with buffers of the ``lanes`` of two
-    of them, ``tables`` (r / 2, size) of their couplings, and the change ``epsilon`` by which they are found."""
+    of them, ``tables`` (r / 2, size) of their couplings, and the change ``epsilon`` by which they are found. ``factors`` of a Jacobian of their own,
+    which ``ready`` (1,) says to be there: the run must not depend on whether it has columns."""
 
     fields: np.ndarray
     unknowns: np.ndarray
@@ -231,6 +232,8 @@ class CollocationTangent(NamedTuple):
     lanes: SweepBuffers
     tables: np.ndarray
     epsilon: float
+    factors: SystemFactors
+    ready: np.ndarray
 
 
 @structure

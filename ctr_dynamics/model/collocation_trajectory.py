@@ -91,7 +91,7 @@ class _Columns(ColumnEffects):
                 unknowns, guess = self._tangent.unknowns, self._tangent.guess
             self._tangent = CollocationTangent(
                 self.fields, unknowns, guess, extrapolations(scheme.times), self.tip_of_all, self._lanes[key], self._tables[scheme.dt],
-                EPSILON,
+                EPSILON, work.factors_in(work.new_factors()), np.zeros(1, np.bool_),
             )  # fmt: skip
             self._made_for = made_for
         return self._tangent

@@ -40,4 +40,5 @@ def with_robot_file(settings: Settings, robot: Robot) -> Settings:
         stated["tracker.axes"] = tracker.axes
     if tracker.mount_rotation is not None:
         stated["tracker.mount_rotation_rad"] = list(tracker.mount_rotation.value)
-    return settings.replace({k: v for k, v in stated.items() if settings[k] == parameter(k).default})
+    stated = {k: v for k, v in stated.items() if settings[k] == parameter(k).default}
+    return settings.replace(stated) if stated else settings

@@ -168,6 +168,7 @@ def test_columns_end_where_they_tell_nothing(monkeypatch):
     effect = np.zeros((len(model.parameters), 1))
     effect[model.layout["bending_stiffness"].start] = 0.02 * model.parameters[0]
     whole = follow(model, effect=effect)
+    np.testing.assert_array_equal(whole.tip, follow(model).tip)
     size = np.abs(whole.columns[:, :3]).max(axis=(1, 2))
     k = int(np.argmax(size > 1.5 * size[0]))
     monkeypatch.setattr(trajectory, "SENSITIVE", 1.5 * size[0])
