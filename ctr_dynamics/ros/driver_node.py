@@ -16,7 +16,6 @@ from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.serialization import serialize_message
 from rclpy.signals import SignalHandlerOptions
-from rclpy.subscription import RCLError
 from rosgraph_msgs.msg import Clock
 
 from ctr_dynamics.errors import InputError
@@ -26,7 +25,7 @@ from ctr_dynamics.io.bag_reader import RawMessage
 from ctr_dynamics.io.messages import topics
 from ctr_dynamics.io.messages.cdr import CdrError, split_stamp
 from ctr_dynamics.ros import qos
-from ctr_dynamics.ros.node_runner import Stopped, exit_at_once, run_in_thread, stop_on_signals
+from ctr_dynamics.ros.node_runner import RCLError, Stopped, exit_at_once, run_in_thread, stop_on_signals
 from ctr_dynamics.ros.parameter_declaration import declare_table
 from ctr_dynamics.ros.topic_names import NAMESPACE, message_class, node_topic
 from ctr_dynamics.runtime.node_parameters import DRIVER

@@ -16,9 +16,9 @@ import rclpy
 from rclpy.context import Context
 from rclpy.exceptions import ParameterException
 from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedExecutor
+from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
-from rclpy.subscription import RCLError
 from rclpy.task import Future
 
 from ctr_dynamics.errors import InputError
@@ -26,6 +26,8 @@ from ctr_dynamics.errors import InputError
 AnyNode = TypeVar("AnyNode", bound=Node)
 Result = TypeVar("Result")
 POLL_S = 0.1
+# rclpy.subscription has it as well, but not before ROS 2 Kilted
+RCLError = rclpy_implementation.RCLError
 
 
 def make_executor(context: Context) -> Executor:
