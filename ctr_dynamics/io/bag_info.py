@@ -19,6 +19,7 @@ from ctr_dynamics.io.bag_checks import FRAME, Finding, Inspector, inspector_for
 from ctr_dynamics.io.bag_reader import INPUT_TOPICS, Bag, open_bag
 from ctr_dynamics.io.inputs.input_decoder import InputDecoder
 from ctr_dynamics.io.inputs.input_mapping import InputMapping, cure
+from ctr_dynamics.io.inputs.recorded_transforms import take_transforms
 from ctr_dynamics.io.messages import cdr
 from ctr_dynamics.io.messages.input_types import Decoded, accepts_type, has_stamp
 from ctr_dynamics.io.messages.topics import JOINT_STATES, TIP_LOAD, TOPIC, TRACKER_TIP
@@ -121,12 +122,19 @@ def inspect(path: str | Path, mapping: InputMapping | None = None, pose_frame: s
     times: dict[str, _Times] = {}
     inspectors: dict[str, Inspector] = {}
     decoder = InputDecoder(bag.mapping)
+    transforms = take_transforms(bag, decoder)
     for topic, log_ns, data, ros_type, encoding in bag.typed_messages():
         entry = times.get(topic)
         if entry is None:
             entry = times[topic] = _Times(
                 _stamped(topic, known[topic].ros_type if topic in known else ros_type)
             )
+        if topic in transforms:
+            entry.add(log_ns, data)
+            for pose in bag.values(decoder, topic, log_ns, data, ros_type, encoding):
+                times[TRACKER_TIP].take(log_ns, pose)
+                inspectors[TRACKER_TIP].take(pose)
+            continue
         if topic not in INPUT_TOPICS or (ros_type and not accepts_type(topic, ros_type)):
             entry.add(log_ns, data)
             continue
@@ -147,6 +155,9 @@ def inspect(path: str | Path, mapping: InputMapping | None = None, pose_frame: s
             times[JOINT_STATES].log[-1] if times[JOINT_STATES].log else rest.stamp_ns, rest
         )
         inspectors[JOINT_STATES].take(rest)
+    for pose in decoder.frames.rest():
+        times[TRACKER_TIP].take(times[TRACKER_TIP].log[-1] if times[TRACKER_TIP].log else pose.stamp_ns, pose)
+        inspectors[TRACKER_TIP].take(pose)
     times = {name: entry for name, entry in times.items() if len(entry.log)}
     starts = [t.log[0] for t in times.values()]
     ends = [t.log[-1] for t in times.values()]
@@ -154,6 +165,7 @@ def inspect(path: str | Path, mapping: InputMapping | None = None, pose_frame: s
     problems = [Finding("warning", "", note) for note in bag.notes]
     problems += [Finding("note", "", note) for note in bag.unchecked]
     problems += [Finding("note", JOINT_STATES, note) for note in decoder.joints.notes]
+    problems += [Finding("note", TRACKER_TIP, note) for note in decoder.frames.notes]
     reports = [
         _topic_report(known[name].ros_type, name, times.get(name), start_ns, problems) for name in known
     ]

@@ -13,6 +13,7 @@ from ctr_dynamics.errors import InputError
 from ctr_dynamics.io.bag_path import locate
 from ctr_dynamics.io.inputs.input_decoder import InputDecoder
 from ctr_dynamics.io.inputs.input_mapping import InputMapping, cure, listed, topic_names
+from ctr_dynamics.io.inputs.recorded_transforms import take_transforms
 from ctr_dynamics.io.messages.cdr import CdrError, JointStateIn, decode_joint_state
 from ctr_dynamics.io.messages.encode import encode_input
 from ctr_dynamics.io.messages.input_types import TYPES, Decoded, accepts_type, names_child, own_type, rank
@@ -162,7 +163,7 @@ class Bag:
         if here is None or not names_child(here.ros_type):
             return
         decoder = InputDecoder(self.mapping)
-        for _ in self._decoded(decoder, {TRACKER_TIP}):
+        for _ in self.as_recorded(decoder, {TRACKER_TIP}):
             pass
         wanted, seen = self.mapping.child_frame.lstrip("/"), sorted(decoder.children)
         if not seen or wanted in seen or (not wanted and len(seen) == 1):
@@ -241,7 +242,9 @@ class Bag:
             yield item
         for rest in decoder.joints.rest():
             yield InputMessage(JOINT_STATES, log_ns, rest)
-        for note in decoder.joints.notes:
+        for pose in decoder.frames.rest():
+            yield InputMessage(TRACKER_TIP, log_ns, pose)
+        for note in (*decoder.joints.notes, *decoder.frames.notes):
             if note not in self._input_notes:
                 self._input_notes.append(note)
 
@@ -258,8 +261,15 @@ class Bag:
         """
         self.check_inputs(required=())
         decoder = InputDecoder(self.mapping)
-        alike = self.mapping == InputMapping(self.mapping.remap)
-        for message in self.typed_messages(only):
+        transforms = take_transforms(self, decoder) if TRACKER_TIP in only else frozenset()
+        alike = not transforms and self.mapping == InputMapping(
+            self.mapping.remap, frame_id=self.mapping.frame_id
+        )
+        for message in self.typed_messages({*only, *transforms}):
+            if message.topic in transforms:
+                for value in self.values(decoder, *message):
+                    yield RawMessage(TRACKER_TIP, message.log_ns, encode_input(value))
+                continue
             plain = message.ros_type in ("", TYPES[message.topic][0]) and message.encoding == "cdr"
             if plain and alike and message.topic != JOINT_STATES:
                 yield RawMessage(*message[:3])
@@ -280,22 +290,46 @@ class Bag:
                 yield RawMessage(message.topic, message.log_ns, encode_input(value))
 
     def _decoded(self, decoder: InputDecoder, only: Collection[str]) -> Iterator[InputMessage]:
-        """Messages of the inputs ``only``; of a topic with several types, those of the type that comes first in ``TYPES``."""
+        """Messages of the inputs ``only``, poses in the frame that is wanted where the transforms say how."""
+        transforms = take_transforms(self, decoder) if TRACKER_TIP in only else frozenset()
+        return self.as_recorded(decoder, only, transforms)
+
+    def as_recorded(
+        self, decoder: InputDecoder, only: Collection[str], transforms: Collection[str] = ()
+    ) -> Iterator[InputMessage]:
+        """Messages of the inputs, poses in the frames in which they were recorded.
+
+        Of a topic with several types, those of the type that comes first in ``TYPES``. What cannot be decoded is counted in `malformed`.
+
+        Args:
+            decoder: decodes them. only: topics wanted. transforms: topics with poses of frames, which the decoder wants as well.
+        """
         kinds = {name: own_type(topic.ros_type) for name, topic in self.topics.items()}
-        for topic, log_ns, data, ros_type, encoding in self.typed_messages(only):
+        for message in self.typed_messages({*only, *transforms}):
+            topic, ros_type = message.topic, message.ros_type
             if ros_type and own_type(ros_type) != kinds.get(topic, own_type(ros_type)):
                 note = f"{topic}: messages of type {ros_type} are left out"
                 if note not in self._input_notes:
                     self._input_notes.append(note)
                 continue
-            try:
-                values = decoder.decode(topic, ros_type, encoding, data, log_ns)
-            except CdrError as error:
-                self.malformed[topic] = self.malformed.get(topic, 0) + 1
-                self._first_fault.setdefault(topic, str(error))
-                continue
-            for value in values:
-                yield InputMessage(topic, log_ns, value)
+            name = TRACKER_TIP if topic in transforms else topic  # poses that waited for a transform
+            for value in self.values(decoder, *message):
+                yield InputMessage(name, message.log_ns, value)
+
+    def values(
+        self, decoder: InputDecoder, topic: str, log_ns: int, data: bytes, ros_type: str, encoding: str
+    ) -> list[Decoded]:
+        """What a message holds; nothing where it cannot be decoded, which is counted in `malformed`.
+
+        Args:
+            decoder: decodes it. topic: of the inputs or of transforms. log_ns: arrival. data: as recorded. ros_type, encoding: its schema's.
+        """
+        try:
+            return decoder.decode(topic, ros_type, encoding, data, log_ns)
+        except CdrError as error:
+            self.malformed[topic] = self.malformed.get(topic, 0) + 1
+            self._first_fault.setdefault(topic, str(error))
+            return []
 
     def sha256(self) -> dict[str, str]:
         """SHA-256 of every file of the bag, by file name."""

@@ -25,6 +25,7 @@ def input_mapping(settings: Settings, remap: Mapping[str, str] | None = None) ->
         child_frame=settings["tracker.child_frame_id"],
         mount_xyzw=_quaternion(settings["tracker.mount_rotation_rad"]),
         arrival_stamps=settings["tracker.stamps"] == "arrival",
+        frame_id=pose_frame(settings),
     )
 
 

@@ -297,7 +297,8 @@ PARAMETERS: tuple[Parameter, ...] = (
         "str",
         "",
         "",
-        "Frame that the tracker's poses are in; empty: `output.frame_id`. The registration says how it lies.",
+        "Frame that the tracker's poses are in; empty: `output.frame_id`. The registration says how it lies. "
+        "Poses in another frame are brought into it by the transforms on `/tf` and `/tf_static`.",
     ),
     Parameter(
         "tracker.child_frame_id",

@@ -8,10 +8,8 @@ from dataclasses import dataclass, field
 from ctr_dynamics.errors import InputError
 from ctr_dynamics.io.inputs.joint_readings import JointReadings
 from ctr_dynamics.io.messages.input_types import TF_MESSAGE, TYPES, accepts_type, own_type
-from ctr_dynamics.io.messages.topics import JOINT_STATES, TRACKER_TIP
+from ctr_dynamics.io.messages.topics import JOINT_STATES, TF, TRACKER_TIP
 from ctr_dynamics.io.storage.stored_file import StoredTopic
-
-TF = "/tf"
 
 
 @dataclass(frozen=True)
@@ -24,6 +22,7 @@ class InputMapping:
         child_frame: child frame of the sensor, in messages that name one; empty: the only one there is.
         mount_xyzw: orientation of the sensor in the tip frame, unit quaternion in ROS order.
         arrival_stamps: whether a pose counts as measured when it came, whatever its header says.
+        frame_id: the frame that poses are brought into by the recorded transforms; empty: they are left as they are.
     """
 
     remap: Mapping[str, str] = field(default_factory=dict)
@@ -31,6 +30,7 @@ class InputMapping:
     child_frame: str = ""
     mount_xyzw: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 1.0)
     arrival_stamps: bool = False
+    frame_id: str = ""
 
 
 def parse_remap(texts: Iterable[str]) -> dict[str, str]:

@@ -29,6 +29,9 @@ DISTURBANCE = "/ctr/estimator/disturbance"
 DISTURBANCE_SIGMA = "/ctr/estimator/disturbance_sigma"
 VALID = "/ctr/estimator/valid"
 DIAGNOSTICS = "/diagnostics"
+TF = "/tf"
+TF_STATIC = "/tf_static"
+TRANSFORMS = (TF, TF_STATIC)  # what poses in other frames are brought into the tracker's by
 
 BACKBONE_FIELDS = ("s", "x", "y", "z", "qx", "qy", "qz", "qw", "vx", "vy", "vz", "ux", "uy", "uz", "sd")
 AXES = ("x", "y", "z", "rx", "ry", "rz")  # order of every six-vector and covariance
