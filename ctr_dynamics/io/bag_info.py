@@ -19,7 +19,6 @@ from ctr_dynamics.io.bag_checks import FRAME, Finding, Inspector, inspector_for
 from ctr_dynamics.io.bag_reader import INPUT_TOPICS, Bag, open_bag
 from ctr_dynamics.io.inputs.input_decoder import InputDecoder
 from ctr_dynamics.io.inputs.input_mapping import InputMapping, cure
-from ctr_dynamics.io.inputs.recorded_transforms import take_transforms
 from ctr_dynamics.io.messages import cdr
 from ctr_dynamics.io.messages.input_types import Decoded, accepts_type, has_stamp
 from ctr_dynamics.io.messages.topics import JOINT_STATES, TIP_LOAD, TOPIC, TRACKER_TIP
@@ -122,7 +121,7 @@ def inspect(path: str | Path, mapping: InputMapping | None = None, pose_frame: s
     times: dict[str, _Times] = {}
     inspectors: dict[str, Inspector] = {}
     decoder = InputDecoder(bag.mapping)
-    transforms = take_transforms(bag, decoder)
+    transforms = bag.take_transforms(decoder)
     for topic, log_ns, data, ros_type, encoding in bag.typed_messages():
         entry = times.get(topic)
         if entry is None:

@@ -12,12 +12,20 @@ from typing import NamedTuple
 from ctr_dynamics.errors import InputError
 from ctr_dynamics.io.bag_path import locate
 from ctr_dynamics.io.inputs.input_decoder import InputDecoder
-from ctr_dynamics.io.inputs.input_mapping import InputMapping, cure, listed, topic_names
-from ctr_dynamics.io.inputs.recorded_transforms import take_transforms
-from ctr_dynamics.io.messages.cdr import CdrError, JointStateIn, decode_joint_state
+from ctr_dynamics.io.inputs.input_mapping import InputMapping, check_topic, cure, listed, topic_names
+from ctr_dynamics.io.messages.cdr import CdrError, JointStateIn, PoseIn, decode_joint_state
 from ctr_dynamics.io.messages.encode import encode_input
-from ctr_dynamics.io.messages.input_types import TYPES, Decoded, accepts_type, names_child, own_type, rank
-from ctr_dynamics.io.messages.topics import INPUTS, JOINT_STATES, TIP_LOAD, TRACKER_TIP
+from ctr_dynamics.io.messages.input_types import TYPES, Decoded, names_child, own_type, rank
+from ctr_dynamics.io.messages.topics import (
+    INPUTS,
+    JOINT_STATES,
+    TF,
+    TF_STATIC,
+    TIP_LOAD,
+    TRACKER_TIP,
+    TRANSFORMS,
+    accepts_frame,
+)
 from ctr_dynamics.io.storage.open_file import open_file, unpacked_message
 from ctr_dynamics.io.storage.stored_file import (
     MAX_HELD_BYTES,
@@ -29,7 +37,6 @@ from ctr_dynamics.io.storage.stored_file import (
 
 __all__ = ["MAX_HELD_BYTES", "Bag", "BagTopic", "InputMessage", "RawMessage", "open_bag", "sha256_of"]
 INPUT_TOPICS = frozenset(topic.name for topic in INPUTS)
-ENCODINGS = ("cdr", "ros1")
 
 
 class RawMessage(NamedTuple):
@@ -150,7 +157,7 @@ class Bag:
                     do=" ".join([cures[0], *(f"and {c}" for c in cures[1:] if c.startswith("if "))]),
                 )
         for name in TYPES:
-            _check_topic(self.path, name, [t for t in stored if self.names.get(t.name) == name], stored)
+            check_topic(self.path, name, [t for t in stored if self.names.get(t.name) == name], stored)
         self._check_child()
 
     def _check_child(self) -> None:
@@ -261,7 +268,7 @@ class Bag:
         """
         self.check_inputs(required=())
         decoder = InputDecoder(self.mapping)
-        transforms = take_transforms(self, decoder) if TRACKER_TIP in only else frozenset()
+        transforms = self.take_transforms(decoder) if TRACKER_TIP in only else frozenset()
         alike = not transforms and self.mapping == InputMapping(
             self.mapping.remap, frame_id=self.mapping.frame_id
         )
@@ -291,7 +298,7 @@ class Bag:
 
     def _decoded(self, decoder: InputDecoder, only: Collection[str]) -> Iterator[InputMessage]:
         """Messages of the inputs ``only``, poses in the frame that is wanted where the transforms say how."""
-        transforms = take_transforms(self, decoder) if TRACKER_TIP in only else frozenset()
+        transforms = self.take_transforms(decoder) if TRACKER_TIP in only else frozenset()
         return self.as_recorded(decoder, only, transforms)
 
     def as_recorded(
@@ -315,6 +322,30 @@ class Bag:
             name = TRACKER_TIP if topic in transforms else topic  # poses that waited for a transform
             for value in self.values(decoder, *message):
                 yield InputMessage(name, message.log_ns, value)
+
+    def take_transforms(self, decoder: InputDecoder) -> frozenset[str]:
+        """Give a ``decoder`` the static transforms, which hold at all times; returns the topics whose messages it needs beside the inputs.
+
+        None where the poses are in the frame that is wanted.
+        """
+        recorded = self.topics.keys() & set(TRANSFORMS)
+        if not self.mapping.frame_id or not recorded or not self._frame_differs():
+            return frozenset()
+        for message in self.typed_messages({TF_STATIC}):
+            self.values(decoder, *message)
+        return frozenset(recorded & {TF})
+
+    def _frame_differs(self) -> bool:
+        """Whether the first pose names another frame than that which is wanted."""
+        counted = dict(self.malformed)
+        decoder = InputDecoder(replace(self.mapping, frame_id=""))
+        first = next(self.as_recorded(decoder, {TRACKER_TIP}), None)
+        self.malformed = counted  # whoever reads on counts these messages
+        return (
+            first is not None
+            and isinstance(first.message, PoseIn)
+            and not accepts_frame(first.message.frame_id, self.mapping.frame_id)
+        )
 
     def values(
         self, decoder: InputDecoder, topic: str, log_ns: int, data: bytes, ros_type: str, encoding: str
@@ -345,31 +376,6 @@ def _push(
     message = next(stream, None)
     if message is not None:
         heapq.heappush(heads, (message.log_ns, message.topic, number, message, stream))
-
-
-def _check_topic(path: Path, name: str, found: Sequence[StoredTopic], stored: Sequence[StoredTopic]) -> None:
-    """Check that messages of an input can be read; of several types one is enough.
-
-    Raises:
-        InputError: none has a type and an encoding that are read.
-    """
-    usable = [t for t in found if not t.ros_type or accepts_type(name, t.ros_type)]
-    if found and not usable:
-        first = found[0]
-        title = f"topic {first.name}" + (f" (for {name})" if first.name != name else "")
-        others = cure(name, [t for t in stored if t.name != first.name])
-        raise InputError(
-            f"{title} has type {first.ros_type!r}, {' or '.join(TYPES[name])} is expected",
-            where=str(path),
-            do=others if others.startswith("if") else "publish and record it as one of these",
-        )
-    wrong = next((t for t in usable if t.encoding not in ENCODINGS), None)
-    if wrong is not None:
-        raise InputError(
-            f"topic {wrong.name} has encoding {wrong.encoding!r}, 'cdr' of ROS 2 and 'ros1' are read",
-            where=str(path),
-            do="record it from ROS 2 with `ros2 bag record`",
-        )
 
 
 def sha256_of(path: Path) -> str:

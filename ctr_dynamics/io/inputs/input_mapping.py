@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 
 from ctr_dynamics.errors import InputError
 from ctr_dynamics.io.inputs.joint_readings import JointReadings
 from ctr_dynamics.io.messages.input_types import TF_MESSAGE, TYPES, accepts_type, own_type
 from ctr_dynamics.io.messages.topics import JOINT_STATES, TF, TRACKER_TIP
 from ctr_dynamics.io.storage.stored_file import StoredTopic
+
+ENCODINGS = ("cdr", "ros1")
 
 
 @dataclass(frozen=True)
@@ -108,3 +111,31 @@ def cure(topic: str, topics: Sequence[StoredTopic]) -> str:
     if topic == JOINT_STATES and any("MultiArray" in t.ros_type for t in topics if t.name in fitting):
         text += ", with joints.rotation_names and joints.translation_names for an array"
     return text
+
+
+def check_topic(path: Path, name: str, found: Sequence[StoredTopic], stored: Sequence[StoredTopic]) -> None:
+    """Check that messages of the input ``name`` can be read; of several types one is enough.
+
+    Args:
+        path: of the bag. found: channels of that topic. stored: all channels.
+
+    Raises:
+        InputError: none has a type and an encoding that are read.
+    """
+    usable = [t for t in found if not t.ros_type or accepts_type(name, t.ros_type)]
+    if found and not usable:
+        first = found[0]
+        title = f"topic {first.name}" + (f" (for {name})" if first.name != name else "")
+        others = cure(name, [t for t in stored if t.name != first.name])
+        raise InputError(
+            f"{title} has type {first.ros_type!r}, {' or '.join(TYPES[name])} is expected",
+            where=str(path),
+            do=others if others.startswith("if") else "publish and record it as one of these",
+        )
+    wrong = next((t for t in usable if t.encoding not in ENCODINGS), None)
+    if wrong is not None:
+        raise InputError(
+            f"topic {wrong.name} has encoding {wrong.encoding!r}, 'cdr' of ROS 2 and 'ros1' are read",
+            where=str(path),
+            do="record it from ROS 2 with `ros2 bag record`",
+        )
