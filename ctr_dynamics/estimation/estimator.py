@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from ctr_dynamics.estimation.backbone import Backbone
 from ctr_dynamics.estimation.discretisation import discretise
+from ctr_dynamics.estimation.inputs.actuator_error import add_actuator_error
 from ctr_dynamics.estimation.inputs.input_buffer import InputBuffer
 from ctr_dynamics.estimation.inputs.measurement_queue import tracker_of
 from ctr_dynamics.estimation.mode_tracker import ModeTracker
@@ -129,6 +130,7 @@ class Estimator:
         self._stability_due = False
         self._modes = ModeTracker(self.model, self.options.modes_every)
         self._without_idle = 0  # steps since the last idle work
+        self._driven_m = 0.0  # by which actuators may have moved the tip unknown to the last step
 
     # -- inputs --
 
@@ -330,11 +332,12 @@ class Estimator:
         if not runs.running:
             return self._start(k)
         # Uncorrected steps say nothing of the robot: measurements wait for the correction. Where that is not soon, they are fused for the
-        # time being, and counted when they are fused again.
+        # time being, and counted when they are fused again; but not where they would be taken for what the actuators have done.
         lag = late.lag
         soon = lag <= late.options.reuse_lag
         mark = None if soon else self.innovations.mark()
-        result = runs.step(k, fuse=lag == 0 or not soon, extrapolated=lag > 0)
+        astray = self._driven_m > self.robot.tracker.noise.position.value
+        result = runs.step(k, fuse=lag == 0 or not (soon or astray), extrapolated=lag > 0)
         late.history.record(k)
         runs.judge(result)
         if mark is not None:
@@ -385,7 +388,7 @@ class Estimator:
                 f"{self._length:g} m; the filter is reinitialised from the open-loop run",
             )
         fused.inflate_covariance(tip, self.runs.open_loop)
-        self._inflate(tip.covariance, tip.position, stamp)
+        self._driven_m = self._inflate(tip.covariance, tip.position, stamp)
         deviation = position_deviation(tip.covariance)
         since = fused.measured_ns if fused.measured_ns is not None else self.t0_ns
         health.tracker_age_s = max(0.0, (stamp - (since or stamp)) * 1e-9)
@@ -403,27 +406,15 @@ class Estimator:
         self.health.problem = reason
         return StepOutput.invalid(self.timeline.stamp(k), k, reason, self.innovations.take())
 
-    def _inflate(self, covariance: Floats, position: Floats, stamp: int) -> None:
-        """Add to the ``covariance`` (12, 12) of the tip, in place, what the actuators may have done since the last joints.
-
-        A rotation moves the tip at its distance from the axis, or half the robot's length where tubes turn against each other; a translation
-        moves it by as much.
-        """
-        if stamp <= self.inputs.joints.stamps[-1]:
-            return
-        error = self.inputs.extrapolation_error(stamp)
+    def _inflate(self, covariance: Floats, position: Floats, stamp: int) -> float:
+        """Add to the ``covariance`` (12, 12) of the tip, in place, what is not known of the actuators that drove it; returns that deviation, m."""
+        inputs = self.inputs
+        error = inputs.actuator_error.at(stamp)
         if not error.any():
-            return
-        n = self.model.n
-        half = 0.5 * (self._length + float(self.inputs.joints.values[-1][n]))
-        arm = max(half, math.hypot(position[0], position[1]))
-        age = (stamp - self.inputs.joints.stamps[-1]) * 1e-9
-        turned = float(error[:n] @ error[:n])
-        moved = arm**2 * turned + float(error[n:] @ error[n:])
-        for first, variance in ((0, moved), (3, turned)):
-            for i in range(first, first + 3):
-                covariance[i, i] += variance
-                covariance[6 + i, 6 + i] += variance * (2.0 / age) ** 2
+            return 0.0
+        half = 0.5 * (self._length + float(inputs.joints.values[-1][self.model.n]))
+        duration = max(stamp - inputs.joints.stamps[-1], self.late.lag * STEP_NS) * 1e-9
+        return add_actuator_error(covariance, position, error, half, duration)
 
     def _problem(self, stamp: int, deviation: float) -> str:
         """Why the output of that stamp (ns) and ``deviation`` of the tip (m) cannot be trusted; empty when it can."""
@@ -432,6 +423,11 @@ class Estimator:
         if age > limit:
             return f"joint states are missing: the last is {age:.3f} s old, limit {limit:g} s"
         largest = self._largest_deviation
+        if deviation > largest and 2.0 * self._driven_m**2 > deviation**2:
+            return (
+                f"joint states come too late: what the actuators did meanwhile may have moved the tip by {1e3 * deviation:.1f} mm, limit "
+                f"{1e3 * largest:.1f} mm (output.largest_deviation_m)"
+            )
         if deviation > largest:
             return f"the tip is known to no better than the limit of {1e3 * largest:.1f} mm (output.largest_deviation_m)"
         compared = self.health.fusing and self.health.tracker_alive and not self.runs.fused.late

@@ -159,6 +159,7 @@ class OutOfSequence:
         """Have nothing to correct and nothing to return to: the steps go on elsewhere."""
         self.history.checkpoints.clear()
         self._from_ns = None
+        self._inputs.actuator_error.corrected()
 
     # -- 1. what has changed --
 
@@ -261,6 +262,8 @@ class OutOfSequence:
             if not result.ok:
                 reuse_before = 0.0
             self._step_s += options.cost_weight * (time.perf_counter() - begin - self._step_s)
+        if self._from_ns is None:
+            self._inputs.actuator_error.corrected()
         # 4. Measurements that were counted before are not counted again.
         self._innovations.keep_new(mark)
         return restarted

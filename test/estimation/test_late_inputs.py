@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from estimation_cases import START_NS, bag_messages, check_outputs, estimator, play
+from estimation_cases import START_NS, bag_messages, check_outputs, estimator, play, truth_error
 
 STEP = 0.003
 
@@ -368,3 +368,36 @@ def test_no_more_steps_are_taken_at_once_than_asked_for(sweep):
     rest = made.advance(None)
     assert [out.k for out in rest] == list(range(2, 2 + len(rest)))
     assert len(rest) > 10
+
+
+@pytest.mark.parametrize("chance", [0.0, 0.3])
+def test_the_covariance_holds_what_late_joints_have_changed(sweep, chance):
+    """Joints and poses up to 60 ms late in spells, and little or no time for corrections: errors stay within the published deviation."""
+    rng, late, last = np.random.default_rng(3), [], 0
+    delays = np.repeat(rng.choice([0.0, 0.02, 0.06], 40), 3)  # of 10 ms each
+    for m in sorted(sweep, key=lambda m: m.stamp):
+        held_up = m.late(delays[m.stamp // 10_000_000 % len(delays)])
+        last = max(last, held_up.arrival)  # no message overtakes another
+        late.append(replace(held_up, arrival=last))
+    run = play(
+        late,
+        {"output.policy": "predict"},
+        tick=STEP,
+        spare=lambda made: math.inf if rng.random() < chance else 0.0,
+    )
+    error, steps = truth_error(run, "clean_sweep", "p_trk", since=0.3)
+    valid, covariance = run.column("valid")[steps], run.column("tip_covariance")[steps, :3, :3]
+    size = np.linalg.norm(error, axis=1)[valid]
+    deviation = np.sqrt(np.trace(covariance, axis1=1, axis2=2))[valid]
+    assert valid.mean() > 0.7
+    assert size.max() > 2e-3, "the late joints make no difference here: nothing is shown"
+    assert np.all(size < 3 * deviation + 0.3e-3)
+
+
+def test_joints_that_stay_away_in_motion_are_what_the_reason_names(sweep):
+    run = play(
+        [m for m in sweep if m.kind != "joints" or m.stamp < 1.1e9], {"output.policy": "predict"}, tick=STEP
+    )
+    first = next(out for out in run.outputs if not out.valid)
+    assert 1.1 < (first.stamp_ns - START_NS) * 1e-9 < 1.2
+    assert first.reason.startswith("joint states come too late")

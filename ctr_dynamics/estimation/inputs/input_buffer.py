@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ctr_dynamics.estimation.inputs.actuator_error import ActuatorError
 from ctr_dynamics.estimation.inputs.gap_bridge import KnownActuators, bridge
 from ctr_dynamics.estimation.inputs.input_validation import Unusable, joint_values, wrench_values
 from ctr_dynamics.estimation.inputs.measurement_queue import MeasurementQueue
@@ -28,10 +29,6 @@ Floats = NDArray[np.float64]
 LOAD_GRACE_NS = 100_000_000  # a first load that comes this soon after the joints is there from the start: nodes start one after another
 
 
-SMOOTHED_NS, INTERVALS = (
-    40_000_000,
-    4,
-)  # accelerations are looked for in the last 0.16 s; encoder noise is small in rates over 40 ms
 LONGEST_BRIDGE = 1000  # steps that are taken again where joints come back after a gap
 
 
@@ -41,23 +38,6 @@ class JointGap(NamedTuple):
     from_ns: int
     until_ns: int
     change: Floats
-
-
-def largest_acceleration(stamps: Sequence[int], values: Sequence[Floats]) -> Floats:
-    """Largest acceleration (size,) of a signal of late, 1/s^2: from its mean rates over the last intervals of ``SMOOTHED_NS``."""
-    ends = [len(stamps) - 1]
-    while len(ends) <= INTERVALS:
-        before = bisect.bisect_right(stamps, stamps[ends[-1]] - SMOOTHED_NS) - 1
-        if before < 0:
-            break
-        ends.append(before)
-    times = np.array([stamps[i] for i in ends], dtype=float) * 1e-9
-    places = np.array([values[i] for i in ends])
-    if len(ends) < 3:
-        return np.zeros(places.shape[1])
-    rates = np.diff(places, axis=0) / np.diff(times)[:, None]
-    middles = 0.5 * (times[1:] + times[:-1])
-    return np.abs(np.diff(rates, axis=0) / np.diff(middles)[:, None]).max(axis=0)
 
 
 class LoadChange(NamedTuple):
@@ -78,7 +58,8 @@ class InputBuffer:
 
     Attributes:
         timeline: where the estimator stands.
-        joints, load: by stamp. measurements: the measurement queue. backwards: joint states in a row whose time ran backwards.
+        joints, load: by stamp. actuator_error: of the joints that steps were driven by. measurements: the measurement queue.
+        backwards: joint states in a row whose time ran backwards.
         gap: the last one of the joints, until somebody sets it to None.
         window_ns: how late an input may come. timeout_ns: how long after the last joints steps are taken without.
         extrapolating: whether steps are taken on time, with extrapolated joints.
@@ -110,7 +91,7 @@ class InputBuffer:
         self.gap: JointGap | None = None
         self._after_gap: KnownActuators | None = None
         self._gaps: deque[tuple[int, int]] = deque(maxlen=20)  # the last ones, ns
-        self._accelerations: tuple[int, Floats] | None = None  # of the actuators, and the stamp up to which
+        self.actuator_error = ActuatorError(self.joints)
 
     def carry_load(self, load: Signal) -> None:
         """Have of loads only the last one of ``load``: what hangs on the robot does so whatever the estimator is told.
@@ -184,6 +165,7 @@ class InputBuffer:
     def _take(self, given: KnownActuators) -> int | None:
         """Store a joint state; see :meth:`add_joints`."""
         stamp_ns, value = given
+        revised = self._driven(stamp_ns)
         kind = self.joints.add(stamp_ns, value)
         if kind == "duplicate":
             self.health.note(
@@ -197,8 +179,21 @@ class InputBuffer:
             if self.load.stamps:
                 self._open_load(stamp_ns)
             return None
+        if revised is not None:
+            self.actuator_error.revise(revised[1], self._at(revised[0]))
         i = self.joints.stamps.index(stamp_ns) if kind == "late" else len(self.joints.stamps) - 1
         return (self.joints.stamps[i - 1] if i else stamp_ns) + min(self.joints.delay_ns, 0)
+
+    def _driven(self, stamp_ns: int) -> tuple[int, Floats] | None:
+        """Where a joint state of that stamp changes most what steps were driven by: the time (ns), and actuators as they are known without it."""
+        taken = self.timeline.taken_ns
+        if taken is None or stamp_ns > taken:
+            return None
+        time_ns = taken if stamp_ns > self.joints.stamps[-1] else stamp_ns
+        return time_ns, self._at(time_ns)
+
+    def _at(self, time_ns: int) -> Floats:
+        return self.joints.at(time_ns, self.timeout_ns if self.extrapolating else 0)[0]
 
     def add_load(
         self, stamp_ns: int, force: Sequence[float], torque: Sequence[float], frame_id: str
@@ -274,16 +269,6 @@ class InputBuffer:
         """The last step up to ``k`` that joints cover; ``k`` where they have been missing for too long to take steps again."""
         covered = (self.joints.stamps[-1] - self.timeline.stamp(0)) // STEP_NS
         return min(k, covered) if k - covered <= LONGEST_BRIDGE else k
-
-    def extrapolation_error(self, time_ns: int) -> Floats:
-        """(2 N,) deviation of actuators (rad and m) that are extrapolated to ``time_ns``: by the accelerations they have had of late."""
-        stamps, values = self.joints.stamps, self.joints.values
-        age = (time_ns - stamps[-1]) * 1e-9
-        if age <= 0.0:
-            return np.zeros(self.joints.size)
-        if self._accelerations is None or self._accelerations[0] != stamps[-1]:
-            self._accelerations = stamps[-1], largest_acceleration(stamps, values)
-        return (0.5 * age**2) * self._accelerations[1]
 
     def missing_at(self, time_s: float) -> bool:
         """Whether no joint states around ``time_s`` (s from t0) tell what drove the robot then: a gap longer than the timeout, over or not."""

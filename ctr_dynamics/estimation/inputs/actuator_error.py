@@ -1,0 +1,90 @@
+"""What is not known of the actuators that a step was driven by: they are extrapolated, or were and the step is not corrected yet."""
+
+from __future__ import annotations
+
+import bisect
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ctr_dynamics.sensing.interpolation import Signal
+
+Floats = NDArray[np.float64]
+SMOOTHED_NS, INTERVALS = (
+    40_000_000,
+    4,
+)  # accelerations are looked for in the last 0.16 s; encoder noise is small in rates over 40 ms
+
+
+def largest_acceleration(stamps: Sequence[int], values: Sequence[Floats]) -> Floats:
+    """Largest acceleration (size,) of a signal of late, 1/s^2: from its mean rates over the last intervals of ``SMOOTHED_NS``."""
+    ends = [len(stamps) - 1]
+    while len(ends) <= INTERVALS:
+        before = bisect.bisect_right(stamps, stamps[ends[-1]] - SMOOTHED_NS) - 1
+        if before < 0:
+            break
+        ends.append(before)
+    times = np.array([stamps[i] for i in ends], dtype=float) * 1e-9
+    places = np.array([values[i] for i in ends])
+    if len(ends) < 3:
+        return np.zeros(places.shape[1])
+    rates = np.diff(places, axis=0) / np.diff(times)[:, None]
+    middles = 0.5 * (times[1:] + times[:-1])
+    return np.abs(np.diff(rates, axis=0) / np.diff(middles)[:, None]).max(axis=0)
+
+
+class ActuatorError:
+    """Deviations (2 N,) of actuators, rad and m, from those that steps were driven by.
+
+    Args:
+        joints: actuators by stamp.
+    """
+
+    def __init__(self, joints: Signal) -> None:
+        self._joints = joints
+        self._accelerations: tuple[int, Floats] | None = None  # and the stamp up to which
+        self._uncorrected = np.zeros(joints.size)
+
+    def revise(self, before: Floats, after: Floats) -> None:
+        """Steps were driven by ``before`` (2 N,) where the actuators are now known to have been at ``after``."""
+        self._uncorrected = np.maximum(self._uncorrected, np.abs(after - before))
+
+    def corrected(self) -> None:
+        """All steps have been taken again with what is known."""
+        self._uncorrected[:] = 0.0
+
+    def at(self, time_ns: int) -> Floats:
+        """Of the step to that time: by the accelerations that the actuators have had of late, and by what is not corrected."""
+        stamps, values = self._joints.stamps, self._joints.values
+        age = (time_ns - stamps[-1]) * 1e-9
+        if age <= 0.0:
+            return self._uncorrected
+        if self._accelerations is None or self._accelerations[0] != stamps[-1]:
+            self._accelerations = stamps[-1], largest_acceleration(stamps, values)
+        return np.hypot((0.5 * age**2) * self._accelerations[1], self._uncorrected)
+
+
+def add_actuator_error(
+    covariance: Floats, position: Floats, error: Floats, length: float, duration: float
+) -> float:
+    """Add to the ``covariance`` (12, 12) of the tip, in place, what the ``error`` (2 N,) of the actuators does to it; returns its 3-D deviation (m).
+
+    A rotation moves the tip at its distance from the axis, or half the robot's length where tubes turn against each other; a translation moves it by
+    as much.
+
+    Args:
+        position: (3,) m, of the tip.
+        length: m, half of what stands out of the base.
+        duration: s, in which the error has come about.
+    """
+    n = len(error) // 2
+    arm = max(length, math.hypot(position[0], position[1]))
+    turned = float(error[:n] @ error[:n])
+    moved = arm**2 * turned + float(error[n:] @ error[n:])
+    for first, variance in ((0, moved), (3, turned)):
+        for i in range(first, first + 3):
+            covariance[i, i] += variance
+            covariance[6 + i, 6 + i] += variance * (2.0 / duration) ** 2
+    return math.sqrt(3.0 * moved)
