@@ -9,7 +9,7 @@ from typing import Any
 
 from ctr_dynamics.errors import InputError
 from ctr_dynamics.io.messages.schemas import schema, typestore
-from ctr_dynamics.io.messages.topics import INPUTS, OUTPUTS, TOPICS, Topic
+from ctr_dynamics.io.messages.topics import INPUTS, OUTPUTS, TOPICS, TRANSFORM_TOPICS, Topic
 
 INDEX = "README.md"
 
@@ -69,7 +69,7 @@ def page(topic: Topic) -> str:
         f"| type | `{topic.ros_type}` |",
         f"| direction | {direction} |",
         f"| rate | {topic.rate} |",
-        f"| QoS | {qos.reliability.replace('_', ' ')}, {qos.history} {qos.depth}, {qos.durability} "
+        f"| QoS | {qos.reliability.replace('_', ' ')}, {qos.history} {qos.depth}, {qos.durability.replace('_', ' ')} "
         f"(parameters `{parameters}`) |",
         "",
         "## Fields",
@@ -95,7 +95,7 @@ def index() -> str:
         "its frame is tube 1's.",
         "",
     ]
-    for title, group in (("Inputs", INPUTS), ("Outputs", OUTPUTS)):
+    for title, group in (("Inputs", INPUTS), ("Outputs", OUTPUTS), ("Frames", TRANSFORM_TOPICS)):
         lines += [f"## {title}", "", "| topic | type | rate | meaning |", "|---|---|---|---|"]
         lines += [f"| [`{t.name}`]({t.page}) | `{t.ros_type}` | {t.rate} | {t.meaning} |" for t in group]
         lines.append("")
@@ -104,7 +104,7 @@ def index() -> str:
 
 def pages() -> dict[str, str]:
     """File name and content of every page."""
-    return {INDEX: index(), **{topic.page: page(topic) for topic in TOPICS}}
+    return {INDEX: index(), **{topic.page: page(topic) for topic in (*TOPICS, *TRANSFORM_TOPICS)}}
 
 
 def main(folder: Path) -> None:

@@ -20,6 +20,7 @@ from ctr_dynamics.robot import Robot
 from ctr_dynamics.robot_files import load_robot
 from ctr_dynamics.runtime.joint_rate import with_joint_rate
 from ctr_dynamics.runtime.step_encoder import StepEncoder
+from ctr_dynamics.runtime.transform_encoder import transform_encoder
 from ctr_dynamics.sensing.tracker_parameters import with_robot_file
 from ctr_dynamics.view.server import Pace, ViewServer
 
@@ -90,7 +91,12 @@ def _replay(server: ViewServer, opened: Bag, robot: Robot, settings: Settings, s
     opened.read_for(robot.n_tubes, input_mapping(settings).mount_xyzw)
     settings, _ = with_joint_rate(opened, settings)
     estimator = Estimator(robot, settings)
-    encoder = StepEncoder(settings["output.frame_id"], robot.name, settings["output.backbone_every"])
+    encoder = StepEncoder(
+        settings["output.frame_id"],
+        robot.name,
+        settings["output.backbone_every"],
+        transform_encoder(settings, robot),
+    )
     inputs = opened.standard_messages()
     pending = next(inputs, None)
     pace = Pace(speed)

@@ -400,6 +400,7 @@ class Estimator:
             stamp, k, not problem, problem, tip.position, tip.quaternion, tip.covariance[:6, :6], tip.twist, tip.covariance[6:, 6:],
             predicted[:3], predicted[3:], self._backbone.rows(fused.state), self._modes.measure(fused.state, k), fused.ekf.force,
             tip.force_sigma, innovations, SolverStats(result.iterations, result.sweeps, result.reason),
+            fused.state.inputs.beta.tolist(),
         )  # fmt: skip
 
     def _invalid(self, k: int, reason: str) -> StepOutput:

@@ -105,6 +105,7 @@ class StepOutput(NamedTuple):
         predicted_position, predicted_quaternion_wxyz: the open-loop run, never corrected.
         backbone: float32 (P, 15): s, x, y, z, qx, qy, qz, qw, vx, vy, vz, ux, uy, uz, sd.
         disturbance_force, disturbance_sigma (3,): N, base axes.
+        beta: (n,) m, translations of the tubes; empty where they are not known.
     """
 
     stamp_ns: int
@@ -124,6 +125,7 @@ class StepOutput(NamedTuple):
     disturbance_sigma: Floats
     innovations: Sequence[Innovation] = ()
     solver: SolverStats = NO_WORK
+    beta: Sequence[float] = ()
 
     @classmethod
     def invalid(cls, stamp_ns: int, k: int, reason: str, innovations: list[Innovation]) -> StepOutput:

@@ -370,6 +370,14 @@ PARAMETERS: tuple[Parameter, ...] = (
         read_only=True,
     ),
     Parameter(
+        "output.publish_tf",
+        "bool",
+        False,
+        "",
+        "Publish the ends of the tubes as frames on `/tf`, and `ctr_base` in the tracker's frame where `tracker.frame_id` names one.",
+        read_only=True,
+    ),
+    Parameter(
         "qos.subscription_reliability",
         "str",
         "best_effort",

@@ -36,7 +36,7 @@ from ctr_dynamics.io.messages.cdr import (
 )
 from ctr_dynamics.parameters import Settings, input_mapping
 from ctr_dynamics.robot_files import load_robot
-from ctr_dynamics.ros import qos
+from ctr_dynamics.ros import qos, transform_topics
 from ctr_dynamics.ros.node_runner import Stopped, run_in_thread, run_node
 from ctr_dynamics.ros.parameter_declaration import declare, watch
 from ctr_dynamics.ros.publishers import Outputs
@@ -49,6 +49,7 @@ from ctr_dynamics.runtime.ring_buffer_recording import RingBufferRecording
 from ctr_dynamics.runtime.step_encoder import StepEncoder
 from ctr_dynamics.runtime.step_loop import Clock, StepLoop
 from ctr_dynamics.runtime.timing import StepTiming
+from ctr_dynamics.runtime.transform_encoder import transform_encoder
 from ctr_dynamics.runtime.warm_up import warm_up
 from ctr_dynamics.sensing.tracker_parameters import with_robot_file
 
@@ -93,14 +94,19 @@ class EstimatorNode(Node):
         self._shown: tuple[bool | None, bool] | None = (
             None  # validity and warning of a snap as last published
         )
+        transforms = transform_encoder(self.settings, self._robot)
         self.outputs = Outputs(
             self,
             qos.profile(self.settings["qos.publisher_reliability"], self.settings["qos.publisher_depth"]),
             self._qos_faults,
             StepEncoder(
-                self.settings["output.frame_id"], self._robot.name, self.settings["output.backbone_every"]
+                self.settings["output.frame_id"],
+                self._robot.name,
+                self.settings["output.backbone_every"],
+                transforms,
             ),
             self.recorder.put if self.recorder else None,
+            transform_topics.publisher(self, transforms),
         )
         self._now_ns = self._clock_source()
         self.loop = StepLoop(
@@ -121,6 +127,7 @@ class EstimatorNode(Node):
         watch(self, lambda: self.settings, self._prepare, self._apply)
         self.loop.start()
         self._inputs = [self._subscribe(topic) for topic in topics.INPUTS]
+        self._inputs += transform_topics.subscribe(self, self._taker)
         self.get_logger().info(
             f"robot '{self._robot.name}', policy '{self.timing.policy}', waiting for {topics.JOINT_STATES}"
         )
@@ -170,7 +177,8 @@ class EstimatorNode(Node):
         self._jumps = clock.create_jump_callback(threshold, post_callback=self._on_clock)
         return lambda: int(clock.now().nanoseconds)
 
-    def _subscribe(self, topic: topics.Topic) -> Any:
+    def _taker(self, topic: topics.Topic) -> Callable[[bytes], None]:
+        """Callback of the subscription to a topic."""
         loop, now_ns, record, ring_buffer = self.loop, self._now_ns, self.recorder, self.ring_buffer
 
         def arrived(data: bytes) -> None:
@@ -181,10 +189,13 @@ class EstimatorNode(Node):
             if ring_buffer is not None:
                 ring_buffer.put(topic.name, arrival_ns, data)
 
+        return arrived
+
+    def _subscribe(self, topic: topics.Topic) -> Any:
         return self.create_subscription(
             message_class(topic.ros_type),
             node_topic(topic.name),
-            arrived,
+            self._taker(topic),
             qos.profile(
                 self.settings["qos.subscription_reliability"], self.settings["qos.subscription_depth"]
             ),
@@ -378,7 +389,9 @@ class EstimatorNode(Node):
         estimator.carry_load(self._estimator)
         self._estimator = estimator
         self._gate = InputGate(estimator)
-        self._decoder = self._new_decoder(settings)
+        fresh = self._new_decoder(settings)
+        fresh.frames.take_over(self._decoder.frames)
+        self._decoder = fresh
         self.timing.policy = settings["output.policy"]
         self.loop.max_age_ns = round(settings["output.max_age_s"] * 1e9)
         self.timing.input_timeout_ns = round(settings["input_timeout_s"] * 1e9)

@@ -10,7 +10,7 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile
 
 from ctr_dynamics.io.messages import topics
-from ctr_dynamics.io.messages.encode import encode_diagnostics
+from ctr_dynamics.io.messages.encode import Encoded, encode_diagnostics
 from ctr_dynamics.ros.qos import QosFaults
 from ctr_dynamics.ros.topic_names import message_class, node_topic
 from ctr_dynamics.runtime.clock_offset import RisingStamps
@@ -25,7 +25,8 @@ class Outputs:
         profile: their quality of service.
         faults: told about subscribers that do not fit.
         encoder: makes the messages.
-        record: also given every message (topic, stamp in ns, bytes).
+        record: also given every message of the table (topic, stamp in ns, bytes).
+        transforms: publishes a message on /tf; None where the encoder makes none.
     """
 
     def __init__(
@@ -35,7 +36,9 @@ class Outputs:
         faults: QosFaults,
         encoder: StepEncoder,
         record: Callable[[str, int, bytes], None] | None = None,
+        transforms: Callable[[Encoded], None] | None = None,
     ) -> None:
+        self._transforms = transforms
         self.stamps = RisingStamps()
         self._last: Any = None  # the last step that was published
         self._encoder = encoder
@@ -56,7 +59,10 @@ class Outputs:
             return False
         self._last = out
         for message in self._encoder.encode(out):
-            self._send(*message)
+            if message.topic in self._publishers:
+                self._send(*message)
+            elif self._transforms is not None:
+                self._transforms(message)  # not recorded here: the node hears it on /tf as well
         return True
 
     @property

@@ -4,7 +4,13 @@ from __future__ import annotations
 
 from typing import Any
 
-from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy, qos_policy_name_from_kind
+from rclpy.qos import (
+    DurabilityPolicy,
+    HistoryPolicy,
+    QoSProfile,
+    ReliabilityPolicy,
+    qos_policy_name_from_kind,
+)
 
 RELIABILITY = {
     "best_effort": ReliabilityPolicy.BEST_EFFORT,
@@ -12,9 +18,20 @@ RELIABILITY = {
 }
 
 
-def profile(reliability: str, depth: int) -> QoSProfile:
-    """Volatile, keep-last profile; `reliability` is a key of RELIABILITY."""
-    return QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=depth, reliability=RELIABILITY[reliability])
+DURABILITY = {
+    "volatile": DurabilityPolicy.VOLATILE,
+    "transient_local": DurabilityPolicy.TRANSIENT_LOCAL,
+}
+
+
+def profile(reliability: str, depth: int, durability: str = "volatile") -> QoSProfile:
+    """Keep-last profile; `reliability` is a key of RELIABILITY, `durability` of DURABILITY."""
+    return QoSProfile(
+        history=HistoryPolicy.KEEP_LAST,
+        depth=depth,
+        reliability=RELIABILITY[reliability],
+        durability=DURABILITY[durability],
+    )
 
 
 class QosFaults:

@@ -35,6 +35,7 @@ from ctr_dynamics.runtime.input_gate import InputGate
 from ctr_dynamics.runtime.joint_rate import with_joint_rate
 from ctr_dynamics.runtime.replay_notes import AFTER_NS, no_step, replay_notes, shortfall
 from ctr_dynamics.runtime.step_encoder import StepEncoder
+from ctr_dynamics.runtime.transform_encoder import transform_encoder
 from ctr_dynamics.sensing.tracker_parameters import with_robot_file
 
 if TYPE_CHECKING:
@@ -325,7 +326,12 @@ def _run(
     log: ReplayLog | None,
 ) -> tuple[dict[str, Any], Sequence[float]]:
     """The replay itself; returns the numbers of the summary and the time spent on each step, s."""
-    encoder = StepEncoder(settings["output.frame_id"], robot.name, settings["output.backbone_every"])
+    encoder = StepEncoder(
+        settings["output.frame_id"],
+        robot.name,
+        settings["output.backbone_every"],
+        transform_encoder(settings, robot),
+    )
     player = Player(estimator)
     invalid = _InvalidStretches()
     steps = withheld = 0

@@ -16,6 +16,7 @@ from ctr_dynamics.estimation.step_output import ERROR, OK, Innovation, StepOutpu
 from ctr_dynamics.io.messages import templates, topics
 from ctr_dynamics.io.messages.cdr import ENCAPSULATION
 from ctr_dynamics.io.messages.encode import Encoded, StatusLike, encode_diagnostics
+from ctr_dynamics.runtime.transform_encoder import TransformEncoder
 
 _TRUE = ENCAPSULATION + b"\x01"
 _FALSE = ENCAPSULATION + b"\x00"
@@ -57,7 +58,8 @@ class StepEncoder:
     Args:
         frame_id: frame of all outputs.
         hardware_id: name of the robot in /diagnostics.
-        backbone_every: steps per display backbone.
+        backbone_every: steps per display backbone, and per message of transforms.
+        transforms: makes the latter; None for none.
     """
 
     def __init__(
@@ -65,7 +67,9 @@ class StepEncoder:
         frame_id: str = "ctr_base",
         hardware_id: str = "",
         backbone_every: int = topics.BACKBONE_EVERY,
+        transforms: TransformEncoder | None = None,
     ) -> None:
+        self._transforms = transforms
         self.frame_id = frame_id
         self.backbone_every = backbone_every
         self.hardware_id = hardware_id
@@ -134,6 +138,8 @@ class StepEncoder:
                     topics.BACKBONE, stamp, *self._path(points).fill(stamp, backbone[:, 1:8].astype(float))
                 )
             )
+            if self._transforms is not None:
+                messages.append(self._transforms.encode(out))
         return messages
 
     def _template(self, count: int) -> templates.Template:

@@ -161,6 +161,10 @@ class FrameTree:
             x, y, z, w = (v / norm for v in pose.quaternion_xyzw)
             link.add(pose.stamp_ns, Transform(pose.position, (x, y, z, w)))
 
+    def take_over(self, other: FrameTree) -> None:
+        """Know the transforms that another tree has been given."""
+        self._links = other._links
+
     def lookup(self, source: str, target: str, stamp_ns: int) -> Transform:
         """Pose of frame ``source`` in frame ``target``.
 

@@ -138,6 +138,19 @@ def path(topic: str, frame_id: str, points: int) -> Layout:
     return Layout(topic, writer.done(), stamps, numbers)
 
 
+def transforms(topic: str, frames: Sequence[tuple[str, str]]) -> Layout:
+    """A tf2_msgs/TFMessage of those (parent, child) frames; fills x, y, z, qx, qy, qz, qw of each."""
+    writer = CdrWriter()
+    stamps: list[int] = []
+    numbers: list[int] = []
+    writer.uint32(len(frames))
+    for parent, child in frames:
+        stamps.append(writer.header(0, parent))
+        writer.string(child)
+        numbers += _span(writer.float64s([0.0] * 7), 7)
+    return Layout(topic, writer.done(), stamps, numbers)
+
+
 _FLOAT32 = 7  # sensor_msgs/PointField.FLOAT32
 
 

@@ -55,7 +55,7 @@ class Qos:
     reliability: Literal["best_effort", "reliable"]
     depth: int
     history: str = "keep last"
-    durability: str = "volatile"
+    durability: Literal["volatile", "transient_local"] = "volatile"
 
 
 INPUT_QOS = Qos("best_effort", 50)
@@ -414,7 +414,43 @@ TOPICS: tuple[Topic, ...] = (
     ),
 )
 
-TOPIC: dict[str, Topic] = {topic.name: topic for topic in TOPICS}
+_TF_TYPE = "tf2_msgs/msg/TFMessage"
+_TF_FIELDS = (
+    Field("transforms[].header.stamp", "time of the transform", "s, ns"),
+    Field("transforms[].header.frame_id", "parent frame"),
+    Field("transforms[].child_frame_id", "frame"),
+    Field("transforms[].transform.translation", "its origin in the parent frame", "m"),
+    Field("transforms[].transform.rotation", "its orientation there, unit quaternion x, y, z, w"),
+)
+# They belong to everybody: the nodes open them where `tf2_msgs` is installed, as it is with every ROS 2.
+TRANSFORM_TOPICS: tuple[Topic, ...] = (
+    Topic(
+        TF,
+        _TF_TYPE,
+        "in",
+        Qos("best_effort", 100),
+        "any in; every 11th step out, with `output.publish_tf`",
+        "Frames that move: in for poses in other frames than the tracker's, out the ends of the tubes.",
+        _TF_FIELDS,
+        (
+            "Out, stamps are those of the steps. `ctr_tubeN_tip` is the end of tube N in `ctr_base`, with the orientation of tube 1's frame there. "
+            "Another `output.frame_id` changes the names: `left_base` makes `left_tube1_tip`.",
+            "With `tracker.frame_id` the registration is published too, as `ctr_base` in that frame.",
+            _NOT_INVALID,
+        ),
+    ),
+    Topic(
+        TF_STATIC,
+        _TF_TYPE,
+        "in",
+        Qos("reliable", 100, durability="transient_local"),
+        "once for each frame",
+        "Frames that do not move, for poses in other frames than the tracker's.",
+        _TF_FIELDS,
+    ),
+)
+
+TOPIC: dict[str, Topic] = {topic.name: topic for topic in (*TOPICS, *TRANSFORM_TOPICS)}
 INPUTS: tuple[Topic, ...] = tuple(topic for topic in TOPICS if topic.direction == "in")
 OUTPUTS: tuple[Topic, ...] = tuple(topic for topic in TOPICS if topic.direction == "out")
 
