@@ -19,7 +19,7 @@ from std_srvs.srv import SetBool, Trigger
 
 from ctr_dynamics.io.messages import topics
 from ctr_dynamics.io.messages.cdr import decode_pose_stamped, decode_stamp
-from ctr_dynamics.io.messages.encode import encode_joint_state, encode_pose_stamped
+from ctr_dynamics.io.messages.encode import encode_joint_state, encode_pose_stamped, encode_wrench_stamped
 from ctr_dynamics.robot_files import load_robot
 from ctr_dynamics.ros import qos
 from ctr_dynamics.ros.listener import Listener
@@ -42,6 +42,7 @@ class RestingRobot(threading.Thread):
         self.live = live
         self.joints_on = self.tracker_on = True
         self.tracker_frozen = False  # on: the last pose again and again
+        self.turning = 0.0  # rad/s of all tubes together
         self.noise = np.random.default_rng(0)
         self.shift_ns = shift_ns  # of the stamps
         self.joint_stamps: list[int] = []
@@ -49,7 +50,7 @@ class RestingRobot(threading.Thread):
         node = live.listener.node
         self.publishers = {
             name: node.create_publisher(message_class(topics.TOPIC[name].ros_type), name, profile)
-            for name in (topics.JOINT_STATES, topics.TRACKER_TIP)
+            for name in (topics.JOINT_STATES, topics.TRACKER_TIP, topics.TIP_LOAD)
         }
         self.stopped = threading.Event()
 
@@ -62,15 +63,26 @@ class RestingRobot(threading.Thread):
             encode_pose_stamped(stamp_ns, frame, position, quaternion)
         )
 
+    def load(self, stamp_ns: int, force) -> None:
+        data = encode_wrench_stamped(stamp_ns, "ctr_base", force, (0.0, 0.0, 0.0))
+        self.publishers[topics.TIP_LOAD].publish(data)
+
+    def turn(self, seconds: float) -> None:
+        """Turn all tubes on for that time."""
+        for i, name in enumerate(self.names):
+            self.positions[i] += self.turning * seconds * name.endswith("rotation")
+
     def agreeing_pose(self):
         """The model's last tip pose, None before there is one."""
         heard = self.live.listener.received[topics.TIP_POSE_PREDICTED]
         return decode_pose_stamped(heard[-1].data) if heard else None
 
     def run(self) -> None:
-        tick = 0
+        tick, last = 0, time.time_ns() + self.shift_ns
         while not self.stopped.is_set():
             now = time.time_ns() + self.shift_ns
+            self.turn((now - last) * 1e-9)
+            last = now
             if self.joints_on:
                 self.joint_stamps.append(now)
                 self.joints(now)
