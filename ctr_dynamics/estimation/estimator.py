@@ -394,7 +394,10 @@ class Estimator:
         health.tracker_age_s = max(0.0, (stamp - (since or stamp)) * 1e-9)
         innovations = self.innovations.take()
         self._settling.take(innovations)
-        problem = health.problem = self._problem(stamp, deviation)
+        unsettled = self._settling.problem(stamp)
+        if unsettled:
+            self.innovations.pass_over()
+        problem = health.problem = self._problem(stamp, deviation) or unsettled
         self._stability_due |= k % options.stability_every == 0
         return StepOutput(
             stamp, k, not problem, problem, tip.position, tip.quaternion, tip.covariance[:6, :6], tip.twist, tip.covariance[6:, 6:],
@@ -440,7 +443,7 @@ class Estimator:
             )
         if self.health.fusing and self.health.rejecting:
             return "the tracker contradicts the model: most of its last measurements are outside the gate"
-        return self._settling.problem(stamp)
+        return ""
 
     def _look_for_motion(self) -> None:
         """Have outputs wait after a gap of the joints, or after a start, in which the robot moved."""

@@ -50,6 +50,8 @@ def test_joints_that_move_after_a_start_make_outputs_wait():
     assert invalid
     assert all("while the robot moved" in out.reason for out in invalid)
     assert run.outputs[-1].valid
+    consistency = run.estimator.health.consistency
+    assert consistency.nis < 1.3  # 3.6 with the measurements of a motion that was not known yet
 
 
 @pytest.mark.parametrize("policy", ["predict", "wait"])

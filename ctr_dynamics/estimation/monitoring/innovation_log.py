@@ -58,6 +58,10 @@ class InnovationLog:
         while self._unjudged:
             self._health.consistency.add(self._unjudged.popleft())
 
+    def pass_over(self) -> None:
+        """What has been published is not judged: that the model does not know the robot's motion yet is no misfit."""
+        self._unjudged.clear()
+
     # -- corrections --
 
     def mark(self) -> Mark:
