@@ -44,7 +44,7 @@ def test_a_residual_that_changes_after_a_start_shows_motion(change, waits):
 
 
 def test_joints_that_move_after_a_start_make_outputs_wait():
-    messages = [m for m in bag_messages("clean_sweep", 2.5) if m.stamp >= 2e9]
+    messages = [m for m in bag_messages("clean_sweep", 4.8) if m.stamp >= 2e9]
     run = play(messages)
     invalid = [out for out in run.outputs if not out.valid]
     assert invalid
