@@ -101,6 +101,7 @@ setup(
         "console_scripts": [
             "ctr-dynamics = ctr_dynamics.cli.main:main",
             "estimator = ctr_dynamics.ros.programs:estimator",
+            "managed_estimator = ctr_dynamics.ros.programs:managed_estimator",
             "driver = ctr_dynamics.ros.programs:driver",
             "tube_markers = ctr_dynamics.ros.programs:tube_markers",
         ],

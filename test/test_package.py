@@ -18,7 +18,7 @@ import ctr_dynamics
 
 ROOT = Path(__file__).resolve().parent.parent
 ROBOTS = ("three_tube", "till2020_snap", "till2020_snap_example", "till2020_tissue")
-EXECUTABLES = ("ctr-dynamics", "driver", "estimator", "tube_markers")
+EXECUTABLES = ("ctr-dynamics", "driver", "estimator", "managed_estimator", "tube_markers")
 
 
 def run(*command, cwd, **extra):

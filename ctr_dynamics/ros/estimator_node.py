@@ -69,15 +69,29 @@ class EstimatorNode(Node):
 
     def __init__(self, stop: threading.Event) -> None:
         super().__init__(NAME, namespace=NAMESPACE, automatically_declare_parameters_from_overrides=True)
+        self._stop = stop
         self.settings = declare(self)
-        self._robot = load_robot(self.settings["robot"])
-        written = ("timing_report", "record.rolling_path", "record.path")
-        check_targets({name: self.settings[name] for name in written}, {"robot file": self._robot.source})
+        self.start_up()
+
+    # Start, in the stages of a managed node.
+
+    def start_up(self) -> None:
+        """Everything that is to be done before callbacks are served."""
         try:
-            self._estimator = run_in_thread(self._warm_estimator, stop)
+            self.set_up()
         except Stopped:
             self.destroy_node()  # so that others hear of the end
             raise
+        self.begin()
+
+    def set_up(self) -> None:
+        """Make everything that `begin` starts; raises as the class says."""
+        self._robot = load_robot(self.settings["robot"])
+        written = ("timing_report", "record.rolling_path", "record.path")
+        check_targets({name: self.settings[name] for name in written}, {"robot file": self._robot.source})
+        transforms = transform_encoder(self.settings, self._robot)
+        frames = transform_topics.publisher(self, transforms)
+        self._estimator = run_in_thread(self._warm_estimator, self._stop)
         self._gate = InputGate(self._estimator)
         self._decoder = self._new_decoder(self.settings)
         self._prepared: tuple[Settings, set[str], Estimator | None] | None = None
@@ -94,7 +108,6 @@ class EstimatorNode(Node):
         self._shown: tuple[bool | None, bool] | None = (
             None  # validity and warning of a snap as last published
         )
-        transforms = transform_encoder(self.settings, self._robot)
         self.outputs = Outputs(
             self,
             qos.profile(self.settings["qos.publisher_reliability"], self.settings["qos.publisher_depth"]),
@@ -106,10 +119,28 @@ class EstimatorNode(Node):
                 transforms,
             ),
             self.recorder.put if self.recorder else None,
-            transform_topics.publisher(self, transforms),
+            frames,
         )
         self._now_ns = self._clock_source()
-        self.loop = StepLoop(
+        self.loop = self._new_loop()
+        self._unwatch = watch(self, lambda: self.settings, self._prepare, self._apply)
+
+    def begin(self) -> None:
+        """Start stepping, offer the services and listen to the inputs."""
+        self._offered = [
+            self.create_service(Trigger, "~/reset", self._on_reset),
+            self.create_service(Trigger, "~/save_snapshot", self._on_save_snapshot),
+            self.create_service(SetBool, "~/enable_fusion", self._on_enable_fusion),
+        ]
+        self.loop.start()
+        self._inputs = [self._subscribe(topic) for topic in topics.INPUTS]
+        self._inputs += transform_topics.subscribe(self, self._taker)
+        self.get_logger().info(
+            f"robot '{self._robot.name}', policy '{self.timing.policy}', waiting for {topics.JOINT_STATES}"
+        )
+
+    def _new_loop(self) -> StepLoop:
+        return StepLoop(
             self._estimator,
             self._publish,
             self._housekeeping,
@@ -119,20 +150,6 @@ class EstimatorNode(Node):
             prefetch=self._prefetch,
             max_age_ns=round(self.settings["output.max_age_s"] * 1e9),
         )
-        self._offered = [
-            self.create_service(Trigger, "~/reset", self._on_reset),
-            self.create_service(Trigger, "~/save_snapshot", self._on_save_snapshot),
-            self.create_service(SetBool, "~/enable_fusion", self._on_enable_fusion),
-        ]
-        watch(self, lambda: self.settings, self._prepare, self._apply)
-        self.loop.start()
-        self._inputs = [self._subscribe(topic) for topic in topics.INPUTS]
-        self._inputs += transform_topics.subscribe(self, self._taker)
-        self.get_logger().info(
-            f"robot '{self._robot.name}', policy '{self.timing.policy}', waiting for {topics.JOINT_STATES}"
-        )
-
-    # Start.
 
     def _warm_estimator(self) -> Estimator:
         self.get_logger().info("compiling the kernels (seconds with a filled cache, minutes without)")
@@ -399,10 +416,18 @@ class EstimatorNode(Node):
 
     # End.
 
-    def close(self) -> None:
-        """Stop stepping, finish the recording, write the timing report, destroy the node."""
+    def end(self) -> None:
+        """Stop what `begin` has started."""
         self.loop.stop()
         self.loop.join()
+        for subscription in self._inputs:
+            self.destroy_subscription(subscription)
+        for service in self._offered:
+            self.destroy_service(service)
+
+    def take_down(self) -> None:
+        """Finish the recording, write the timing report, take the outputs away."""
+        self._unwatch()
         if self.recorder is not None:
             self.recorder.close()
         if self.ring_buffer is not None:
@@ -414,6 +439,12 @@ class EstimatorNode(Node):
                     part.write_text(json.dumps(self.timing.report(), indent=1), encoding="utf-8")
         except InputError as error:
             self.get_logger().error(f"the timing report could not be written: {error}")
+        self.outputs.close()
+
+    def close(self) -> None:
+        """End everything and destroy the node."""
+        self.end()
+        self.take_down()
         self.destroy_node()
 
 

@@ -13,6 +13,7 @@ from types import TracebackType
 from typing import Any
 
 ESTIMATOR = "ctr_dynamics.ros.estimator_node"
+MANAGED_ESTIMATOR = "ctr_dynamics.ros.managed_estimator_node"
 DRIVER = "ctr_dynamics.ros.driver_node"
 
 

@@ -30,6 +30,15 @@ def declare(node: Node) -> Settings:
     return _declare(node, PARAMETERS, Settings)
 
 
+def declared(node: Node) -> Settings:
+    """The values that the declared parameters have now.
+
+    Raises:
+        InputError: one that was set since cannot be used.
+    """
+    return Settings({p.name: _plain(node.get_parameter(p.name).value) for p in PARAMETERS})
+
+
 def declare_table(node: Node, table: Sequence[Parameter]) -> dict[str, Any]:
     """Declare the parameters of a ``table``, fixed from then on; returns their values by name.
 
@@ -69,8 +78,8 @@ def watch(
     current: Callable[[], Settings],
     prepare: Callable[[Settings, set[str]], None],
     apply: Callable[[], None],
-) -> None:
-    """Check parameters that are set while the node runs, then apply them.
+) -> Callable[[], None]:
+    """Check parameters that are set while the node runs, then apply them. The function that is returned ends that.
 
     Args:
         current: the settings in use.
@@ -95,6 +104,12 @@ def watch(
 
     node.add_on_set_parameters_callback(check)
     node.add_post_set_parameters_callback(changed)
+
+    def unwatch() -> None:
+        node.remove_on_set_parameters_callback(check)
+        node.remove_post_set_parameters_callback(changed)
+
+    return unwatch
 
 
 def _plain(value: Any) -> Any:

@@ -13,6 +13,14 @@ def estimator() -> int:
     return main()
 
 
+def managed_estimator() -> int:
+    """Run the estimator as a managed node; returns the exit code."""
+    one_blas_thread()
+    from ctr_dynamics.ros.managed_estimator_node import main
+
+    return main()
+
+
 def driver() -> int:
     """Run the driver node, which plays a bag; returns the exit code."""
     one_blas_thread()

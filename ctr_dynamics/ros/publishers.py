@@ -7,10 +7,11 @@ from typing import Any
 
 from rclpy.event_handler import PublisherEventCallbacks
 from rclpy.node import Node
+from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
 
 from ctr_dynamics.io.messages import topics
-from ctr_dynamics.io.messages.encode import Encoded, encode_diagnostics
+from ctr_dynamics.io.messages.encode import encode_diagnostics
 from ctr_dynamics.ros.qos import QosFaults
 from ctr_dynamics.ros.topic_names import message_class, node_topic
 from ctr_dynamics.runtime.clock_offset import RisingStamps
@@ -26,7 +27,7 @@ class Outputs:
         faults: told about subscribers that do not fit.
         encoder: makes the messages.
         record: also given every message of the table (topic, stamp in ns, bytes).
-        transforms: publishes a message on /tf; None where the encoder makes none.
+        transforms: publisher on /tf, which is taken over; None where the encoder makes none.
     """
 
     def __init__(
@@ -36,9 +37,9 @@ class Outputs:
         faults: QosFaults,
         encoder: StepEncoder,
         record: Callable[[str, int, bytes], None] | None = None,
-        transforms: Callable[[Encoded], None] | None = None,
+        transforms: Publisher[Any] | None = None,
     ) -> None:
-        self._transforms = transforms
+        self._node, self._transforms = node, transforms
         self.stamps = RisingStamps()
         self._last: Any = None  # the last step that was published
         self._encoder = encoder
@@ -62,7 +63,7 @@ class Outputs:
             if message.topic in self._publishers:
                 self._send(*message)
             elif self._transforms is not None:
-                self._transforms(message)  # not recorded here: the node hears it on /tf as well
+                self._transforms.publish(message.data)  # not recorded here: the node hears it as well
         return True
 
     @property
@@ -81,6 +82,12 @@ class Outputs:
         """Make the last step's messages again, for nobody, so that the next ones are made sooner."""
         if self._last is not None:
             self._encoder.encode(self._last)
+
+    def close(self) -> None:
+        """Take the publishers away."""
+        for publisher in (*self._publishers.values(), self._transforms):
+            if publisher is not None:
+                self._node.destroy_publisher(publisher)
 
     def diagnostics(self, stamp_ns: int, statuses: list[Any]) -> None:
         """Publish /diagnostics."""

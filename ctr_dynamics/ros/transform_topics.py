@@ -7,10 +7,10 @@ from collections.abc import Callable
 from typing import Any
 
 from rclpy.node import Node
+from rclpy.publisher import Publisher
 
 from ctr_dynamics.errors import InputError
 from ctr_dynamics.io.messages import topics
-from ctr_dynamics.io.messages.encode import Encoded
 from ctr_dynamics.ros import qos
 from ctr_dynamics.ros.topic_names import message_class
 from ctr_dynamics.runtime.transform_encoder import TransformEncoder
@@ -43,8 +43,8 @@ def subscribe(node: Node, arrived: Callable[[topics.Topic], Callable[[bytes], No
     ]
 
 
-def publisher(node: Node, encoder: TransformEncoder | None) -> Callable[[Encoded], None] | None:
-    """Publishes the messages of ``encoder``; None where there is none.
+def publisher(node: Node, encoder: TransformEncoder | None) -> Publisher[Any] | None:
+    """Publisher for the messages of ``encoder``; None where there is none.
 
     Raises:
         InputError: `tf2_msgs` is missing.
@@ -57,5 +57,4 @@ def publisher(node: Node, encoder: TransformEncoder | None) -> Callable[[Encoded
             do="source a ROS 2 installation, or leave output.publish_tf false",
         )
     kind = message_class(topics.TOPIC[topics.TF].ros_type)
-    output = node.create_publisher(kind, topics.TF, qos.profile("reliable", OUT_DEPTH))
-    return lambda message: output.publish(message.data)
+    return node.create_publisher(kind, topics.TF, qos.profile("reliable", OUT_DEPTH))

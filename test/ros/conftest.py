@@ -105,12 +105,17 @@ class Live:
     """An estimator process with a listener on all its outputs."""
 
     def __init__(
-        self, folder: Path, parameters: dict, ros_arguments=(), heard=None, reliability="reliable"
+        self,
+        folder: Path,
+        parameters: dict,
+        ros_arguments=(),
+        heard=None,
+        reliability="reliable",
+        module=ESTIMATOR,
     ) -> None:
+        self.managed = module != ESTIMATOR
         self.domain = int(os.environ["ROS_DOMAIN_ID"])
-        self.process = NodeProcess(
-            ESTIMATOR, parameters, self.domain, folder / "estimator.log", ros_arguments
-        )
+        self.process = NodeProcess(module, parameters, self.domain, folder / "estimator.log", ros_arguments)
         names = heard or [topic.name for topic in topics.OUTPUTS]
         self.listener = Listener(self.domain, names, reliability, depth=5000)
         self.robots: list[RestingRobot] = []
@@ -118,7 +123,7 @@ class Live:
     def __enter__(self) -> Live:
         self.listener.__enter__()
         ready = self.listener.wait_for(
-            lambda: self.listener.matched() or self.process.code is not None, PATIENCE_S
+            lambda: self.managed or self.listener.matched() or self.process.code is not None, PATIENCE_S
         )
         if not ready or self.process.code is not None:
             self.process.stop(PATIENCE_S)
