@@ -20,7 +20,7 @@ class ManagedEstimatorNode(LifecycleNodeMixin, EstimatorNode):
     """Node `/ctr/estimator`, which does nothing until it is told to.
 
     `configure` reads the robot file, compiles and opens the outputs. `activate` listens to the inputs and steps. `deactivate` stops that, and the
-    next activation starts anew from the joints of that time. `cleanup` gives everything back.
+    next activation reinitialises from the joints of that time. `cleanup` gives everything back.
 
     Raises:
         InputError: a parameter cannot be used.
