@@ -107,6 +107,7 @@ GLOSSARY = {
     "description": "free text",
     "gravity": "(3,) m/s^2",
     "friction": "Coulomb and viscous coefficients at the base plate and between tubes",
+    "model_error": "what the model itself gets wrong at the tip: position (m), rotation (rad), correlation time (s)",
     "encoders": "offset and noise of the rotary encoders, rad",
     "tracker": "registration, lever arm, delay and noise of the tip tracker",
     "rest": "rest position of the actuators: beta (m), alpha (rad)",

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 from ctr_dynamics.calibration.robot_calibration import Calibration
 from ctr_dynamics.robot_files import robot_to_yaml
 
@@ -16,6 +18,12 @@ def lines(found: Calibration) -> list[str]:
     mount = found.robot.tracker.mount_rotation
     if mount is not None:
         out.append(f"mount of the sensor  {', '.join(f'{v:.4f}' for v in mount.value)} rad")
+    error = found.robot.model_error
+    if error is not None:
+        out.append(
+            f"model error          {1e3 * error.position.value:.2f} mm, {math.degrees(error.rotation.value):.2f} deg per axis, "
+            f"for {error.time.value:.2g} s"
+        )
     out += [
         f"fitted tips {found.fitted.count:5d}   after   {found.fitted.text()}",
         f"held out    {found.before.count:5d}   before  {found.before.text()}",

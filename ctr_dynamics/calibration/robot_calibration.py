@@ -18,6 +18,7 @@ from ctr_dynamics.calibration.alignment import (
     mount_vector,
     static_quantities,
 )
+from ctr_dynamics.calibration.model_error import model_error_of
 from ctr_dynamics.calibration.tip_errors import TipErrors, tip_errors
 from ctr_dynamics.calibration.tip_fit import (
     DELAY,
@@ -121,14 +122,13 @@ def calibrate(
             coordinates += mount_coordinates()
     fit = fit_tips(model, coordinates, start)
     judge, seen_again = TipModel(robot, unseen, model.mount), TipModel(robot, seen, model.mount)
-    errors = [
-        tip_errors(m.residual(p, m.tips(p)), m)
-        for m, p in ((judge, {}), (judge, fit.point), (seen_again, fit.point))
-    ]
+    left = [m.residual(p, m.tips(p)) for m, p in ((judge, {}), (judge, fit.point), (seen_again, fit.point))]
+    errors = [tip_errors(r, m) for r, m in zip(left, (judge, judge, seen_again), strict=True)]
     text = f"calibrated{f' {note}' if note else ''}: {1e3 * errors[1].rms:.2f} mm rms on held-out tips"
     calibrated = calibrated_robot(robot, fit, text)
     if free:
         calibrated = calibrated.with_mount(tuple(mount_vector(model, fit.point, mount).tolist()))
+    calibrated = calibrated.model_copy(update={"model_error": model_error_of(left[1], unseen, robot)})
     return Calibration(
         robot=calibrated,
         fit=fit,

@@ -198,7 +198,7 @@ class _Search:
         )
         before = np.append(self.deviation, self.lasting)
         self.deviation = np.maximum(self.noise, spread)
-        self.lasting = _lasting(left[:, :3]) if self.model.samples.timed else 1.0
+        self.lasting = lasting_of(left[:, :3]) if self.model.samples.timed else 1.0
         now = np.append(self.deviation, self.lasting)
         return bool(np.any(np.abs(now - before) > 0.1 * before))
 
@@ -264,7 +264,7 @@ class _Search:
         )
 
 
-def _lasting(residual: Floats) -> float:
+def lasting_of(residual: Floats) -> float:
     """Variance of a mean over that of independent residuals (s, 3): 1 + 2 sum rho_k, up to the first k without correlation."""
     count = len(residual)
     centred = residual - residual.mean(axis=0)

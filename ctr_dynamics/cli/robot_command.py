@@ -15,7 +15,7 @@ from ctr_dynamics.io.atomic_files import atomic_file
 from ctr_dynamics.robot import Robot
 from ctr_dynamics.robot_files import datasheet as sheets
 from ctr_dynamics.robot_files import load_robot, robot_names
-from ctr_dynamics.robot_files.summary import doubts, tube_rows
+from ctr_dynamics.robot_files.summary import doubts, property_rows, tube_rows
 
 # Option -> (SI unit, several values, what is asked, answer that is offered).
 _ASKED: dict[str, tuple[str, bool, str, str]] = {
@@ -172,6 +172,8 @@ def _show(robot: Robot) -> None:
     print(f"robot {robot.name}")
     for row in rows:
         print("  ".join(f"{cell:<{width}}" for cell, width in zip(row, widths, strict=True)).rstrip())
+    for name, text in property_rows(robot):
+        print(f"{name:<22} {text}")
     for doubt in doubts(robot):
         print(f"ctr-dynamics: note: {doubt}", file=sys.stderr)
 

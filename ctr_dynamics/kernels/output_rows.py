@@ -34,7 +34,7 @@ def backbone_rows(s, nodes, fields, points, n, insertion_rate, rotation, bias, d
     """Fill ``rows`` (P, 15) float32: s, x, y, z, qx, qy, qz, qw, vx, vy, vz, ux, uy, uz, sd.
 
     ``nodes`` (P, S) states; ``fields`` (fields,) with ``points`` (P,) the point of each node; ``rotation`` (4,) nominal registration, ``bias``
-    (16,) tracker states; ``deviation`` (P,) m, the position's per axis (root of the third of its covariance's trace).
+    (22,) tracker states; ``deviation`` (P,) m, the position's per axis (root of the third of its covariance's trace).
     """
     F = field_rows(n).size
     quaternion, shift, _ = registration_error(rotation, bias)

@@ -202,6 +202,19 @@ class Actuators(Block):
     translation_speed: TranslationSpeed | None = None
 
 
+class ModelError(Block):
+    """What the model still gets wrong with the right parameters: position and rotation of the tip, slowly changing (Gauss-Markov).
+
+    Attributes:
+        position, rotation: 1-sigma of each axis, m and rad.
+        time: correlation time, s.
+    """
+
+    position: LengthSigma
+    rotation: AngleSigma
+    time: Duration
+
+
 class ActuatorVector(Block):
     """One number per tube, innermost first."""
 
@@ -233,6 +246,7 @@ class Robot(Block):
     """A concentric tube robot; tubes innermost first, everything in SI units and radians.
 
     ``actuators`` holds the speeds that they reach at most; None where nothing is known of them.
+    ``model_error`` holds what the model itself gets wrong; None: nothing.
     ``extensions`` holds values of effects by name and parameter. Which effects there are is not known here; who reads a robot file checks them.
     """
 
@@ -245,6 +259,7 @@ class Robot(Block):
     tracker: Tracker
     rest: Rest
     actuators: Actuators | None = None
+    model_error: ModelError | None = None
     extensions: dict[str, dict[str, Any]] = Field(default_factory=dict)
 
     _source: str = PrivateAttr("")

@@ -38,6 +38,68 @@ def tube_rows(robot: Robot) -> list[tuple[str, ...]]:
     return rows
 
 
+def property_rows(robot: Robot) -> list[tuple[str, str]]:
+    """Name and text of everything else that the file holds: masses, friction, sensors, errors, actuators and effects."""
+    rows: list[tuple[str, str]] = []
+    for tube in robot.tubes:
+        density = f"{tube.density.value:.0f} +- {tube.density.tolerance:.0f} kg/m^3"
+        body = tube.end_body
+        if body is not None:
+            density += f", body at the end {1e3 * body.mass.value:.3g} +- {1e3 * body.mass.tolerance:.2g} g"
+        rows.append((f"mass of {tube.name}", density))
+    g, friction = robot.gravity, robot.friction
+    down = ", ".join(f"{v:.2f}" for v in g.value)
+    rows.append(("gravity", f"{down} m/s^2 +- {math.degrees(g.direction_tolerance):.2f} deg"))
+    for name, pair in (("friction at the plate", friction.base), ("friction of tubes", friction.tubes)):
+        mu, c = pair.coulomb, pair.viscous
+        rows.append(
+            (
+                name,
+                f"{mu.value:.3g} +- {mu.tolerance:.2g}, viscous {c.value:.3g} +- {c.tolerance:.2g} N m s/rad",
+            )
+        )
+    offset = robot.encoders.offset
+    rows.append(
+        (
+            "encoders",
+            f"offset {math.degrees(offset.value):.3g} +- {math.degrees(offset.tolerance):.2g} deg, "
+            f"noise {math.degrees(robot.encoders.noise.value):.2g} deg",
+        )
+    )
+    tracker = robot.tracker
+    noise = tracker.noise
+    rows += [
+        (
+            "tracker",
+            f"axes {tracker.axes or 'xyzrpy'}, noise {1e3 * noise.position.value:.3g} mm and {math.degrees(noise.rotation.value):.2g} deg, "
+            f"drift {1e3 * noise.drift.value:.2g} mm in {noise.drift_time.value:g} s, "
+            f"delay {1e3 * tracker.delay.value:.3g} +- {1e3 * tracker.delay.tolerance:.2g} ms",
+        ),
+        (
+            "registration",
+            f"+- {1e3 * max(tracker.registration_translation.tolerance):.2g} mm and "
+            f"{math.degrees(max(tracker.registration_rotation.tolerance)):.2g} deg, "
+            f"lever arm {', '.join(f'{1e3 * v:.2f}' for v in tracker.lever_arm.value)} +- {1e3 * max(tracker.lever_arm.tolerance):.2g} mm",
+        ),
+    ]
+    error = robot.model_error
+    if error is not None:
+        told = f"{1e3 * error.position.value:.2f} mm and {math.degrees(error.rotation.value):.2f} deg per axis, for {error.time.value:.2g} s"
+    else:
+        told = "none is stated; ctr-dynamics calibrate measures it"
+    rows.append(("model error", told))
+    if robot.actuators is not None:
+        for name, speed, unit in (
+            ("rotation", robot.actuators.rotation_speed, "rad/s"),
+            ("translation", robot.actuators.translation_speed, "m/s"),
+        ):
+            if speed is not None:
+                rows.append((f"actuators, {name}", f"at most {speed.value:g} {unit}"))
+    for effect, values in robot.extensions.items():
+        rows.append((f"effect {effect}", ", ".join(f"{key} {value:g}" for key, value in values.items())))
+    return rows
+
+
 def doubts(robot: Robot) -> list[str]:
     """What is allowed and yet probably a mistake, one line each."""
     found: list[str] = []

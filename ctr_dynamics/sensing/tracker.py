@@ -38,16 +38,20 @@ STATE_NAMES = (
     ("registration_rotation", 3),
     ("registration_translation", 3),
     ("lever_arm", 3),
+    ("model_error_position", 3),
+    ("model_error_rotation", 3),
     ("delay", 1),
     ("drift", 3),
     ("shift", 3),
 )
 """Errors of the tracker that the estimator carries: name and number of axes, in their order.
 
-The drift is the slow one that the robot file states. The shift is a fault: it is 0 until the innovations show one."""
-STATES = 16
-ROTATION, TRANSLATION, LEVER, DELAY = slice(0, 3), slice(3, 6), slice(6, 9), 9
-DRIFT, SHIFT = slice(10, 13), slice(13, 16)
+The model error is how far the tip is shifted and turned from where the model has it, in base axes; unlike the others it is the robot's. The drift
+is the slow one of the tracker that the robot file states. The shift is a fault: it is 0 until the innovations show one."""
+STATES = 22
+ROTATION, TRANSLATION, LEVER = slice(0, 3), slice(3, 6), slice(6, 9)
+MODEL_POSITION, MODEL_ROTATION = slice(9, 12), slice(12, 15)
+DELAY, DRIFT, SHIFT = 15, slice(16, 19), slice(19, 22)
 
 # Gauss and Legendre's rule of five points on [0, 1]: the mean over the averaging window
 AVERAGE_POINTS = np.array([0.04691008, 0.23076534, 0.5, 0.76923466, 0.95308992])
@@ -106,7 +110,7 @@ class TrackerModel:
     Attributes:
         rotation: (4,) wxyz of R_reg; translation: (3,) m; lever: (3,) m in the tip frame; delay: s, > 0 when a pose is older than its stamp.
         mask: (6,) measured axes: position x, y, z in the tracker's frame, then rotation about the sensor's x, y, z.
-        variance: (6,) white noise. state_sigma: (16,) prior deviations of ``STATE_NAMES``.
+        variance: (6,) white noise. state_sigma: (22,) prior deviations of ``STATE_NAMES``.
         scale: reported over true distance; drift: (3,) m/s; skew: s/s, stamp = true time (1 + skew).
         averaging: s, length of the window over which poses are averaged. corrections: further links, in order.
     """
@@ -141,6 +145,8 @@ class TrackerModel:
                     file.registration_rotation.tolerance,
                     file.registration_translation.tolerance,
                     file.lever_arm.tolerance,
+                    np.full(3, robot.model_error.position.value if robot.model_error else 0.0),
+                    np.full(3, robot.model_error.rotation.value if robot.model_error else 0.0),
                     [file.delay.tolerance],
                     np.full(3, noise.drift.value),
                     np.zeros(3),
@@ -324,12 +330,12 @@ class TrackerModel:
     def innovation(
         self, bias: Floats, tip: Tip, pi: Floats, *measurement: Floats
     ) -> tuple[Floats, Floats, Floats, Floats]:
-        """An undistorted ``measurement`` (position (3,) m, quaternion (4,) wxyz) against what the ``tip`` and the states ``bias`` (16,) predict.
+        """An undistorted ``measurement`` (position (3,) m, quaternion (4,) wxyz) against what the ``tip`` and the states ``bias`` (22,) predict.
 
         Returns:
-            On the k measured axes: innovation (k,), position in the tracker's axes, rotation vector in the sensor's; H (k, r + 16), the
+            On the k measured axes: innovation (k,), position in the tracker's axes, rotation vector in the sensor's; H (k, r + 22), the
             derivative of the expected measurement by the columns' coefficients and the tracker states; its covariance S (k, k) under ``pi``
-            (r + 16, r + 16); and the innovation whitened by the Cholesky root of S.
+            (r + 22, r + 22); and the innovation whitened by the Cholesky root of S.
 
         Where one rotation axis is not measured, the sensor's turn about it is arbitrary and often large. It is taken off first, or it would turn
         the other two components.
@@ -347,7 +353,8 @@ class TrackerModel:
         """(7,) tip pose in ``ctr_base`` as the tracker realises it: position in m, quaternion wxyz.
 
         The base frame of a real robot is known through its registration only, so the estimated registration and lever-arm errors are part of the
-        pose: it is where a perfect tracker with the nominal geometry would see the tip. Drift, shift and delay are left out.
+        pose, and so is that of the model: it is where a perfect tracker with the nominal geometry would see the tip. Drift, shift and delay are left
+        out.
         """
         pose = np.empty(7)
         registered_pose(tip.mean, self.rotation, self.lever, bias, pose)

@@ -1,11 +1,12 @@
 """Robots that differ from their files: what is found, what it is worth, and what is written."""
 
 import csv
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from ctr_dynamics.calibration.calibration_report import robot_text
+from ctr_dynamics.calibration.calibration_report import lines, robot_text
 from ctr_dynamics.calibration.robot_calibration import calibrate, calibrated_robot, split
 from ctr_dynamics.calibration.tip_fit import Coordinate, TipFit, TipModel, fit_tips
 from ctr_dynamics.cli.main import main
@@ -97,6 +98,27 @@ def test_errors_that_last_count_for_less(robot, true):
         assert abs(fit.point["precurvature", "tube1.scale"] - SCALE) < 4.0 * fit.sigma[0]
     assert fit.lasting > 3.0
     assert sigma[1] > 3.0 * sigma[0]
+
+
+def test_what_the_model_gets_wrong_is_measured_and_written(robot, true, found):
+    """A departure that no parameter explains: its size and its time are those of what is left on held-out tips."""
+    assert found.robot.model_error is None  # noise explains all that is left
+    clean = tips_of(true, noise=NOISE)
+    slow = 1e-3 * np.sin(2 * np.pi * clean.stamps[:, None] / 2.0 + np.array([0.0, 1.0, 2.0]))
+    departed = calibrate(robot, replace(clean, position=clean.position + slow))
+    error = departed.robot.model_error
+    assert error.position.value == pytest.approx(1e-3 / np.sqrt(2.0), rel=0.2)
+    assert error.rotation.value < 1e-2
+    # 1 + 2 sum rho up to the first zero of a sine of the period T is T / pi in time, and half of that is written
+    assert error.time.value == pytest.approx(1.0 / np.pi, rel=0.3)
+    assert robot_from_dict(robot_to_dict(departed.robot)) == departed.robot
+    assert "model error" in "".join(lines(departed))
+
+
+def test_a_table_without_times_tells_no_model_error(robot, true):
+    tips = replace(tips_of(true, noise=NOISE), timed=False)
+    shifted = replace(tips, position=tips.position + 1e-3 * np.sin(np.arange(len(tips.stamps)))[:, None])
+    assert calibrate(robot, shifted).robot.model_error is None
 
 
 def test_split_by_time_and_of_tables(robot):

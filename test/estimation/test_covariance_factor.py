@@ -18,6 +18,7 @@ from ctr_dynamics.model.statics import Statics
 from ctr_dynamics.model.time_scheme import make_scheme
 from ctr_dynamics.robot_files import load_robot, robot_from_dict, robot_to_dict
 from ctr_dynamics.sensing import TrackerModel
+from ctr_dynamics.sensing.tracker import DELAY
 
 BETA, ALPHA, ZERO = np.array([-0.2521, -0.1977]), np.array([1.5708, 1.5708]), np.zeros(2)
 DT = 0.003
@@ -90,7 +91,7 @@ def test_uncertain_parameters_are_the_robot_files(robot, model):
         assert np.linalg.norm(column) == pytest.approx(9.81, abs=0.01)
     biases = TrackerModel.of_robot(robot).state_sigma
     assert biases[3:6] == pytest.approx([2e-4] * 3)
-    assert biases[9] == pytest.approx(1e-3)
+    assert biases[DELAY] == pytest.approx(1e-3)
 
 
 def test_every_axis_of_the_tracker_has_its_own_deviation(robot):

@@ -5,16 +5,24 @@ import math
 import numpy as np
 
 from ctr_dynamics.kernels.rotations import conjugate, from_vector, matrix, multiply, to_vector
-from ctr_dynamics.sensing.tracker import DRIFT, LEVER, ROTATION, SHIFT, TRANSLATION
+from ctr_dynamics.sensing.tracker import (
+    DRIFT,
+    LEVER,
+    MODEL_POSITION,
+    MODEL_ROTATION,
+    ROTATION,
+    SHIFT,
+    TRANSLATION,
+)
 
 
 def expected(model, bias, tip):
-    """Reading (position (3,) m, quaternion (4,) wxyz) that the tip and the tracker states (16,) predict."""
+    """Reading (position (3,) m, quaternion (4,) wxyz) that the tip and the tracker states (22,) predict."""
     registration = multiply(from_vector(bias[ROTATION]), model.rotation)
-    point = tip.position + matrix(tip.quaternion) @ (model.lever + bias[LEVER])
+    point = tip.position + matrix(tip.quaternion) @ (model.lever + bias[LEVER]) + bias[MODEL_POSITION]
     position = matrix(registration) @ point + model.translation + bias[TRANSLATION]
     position = position + bias[DRIFT] + bias[SHIFT]
-    return position, multiply(registration, tip.quaternion)
+    return position, multiply(registration, multiply(from_vector(bias[MODEL_ROTATION]), tip.quaternion))
 
 
 def residual(position, quaternion, expected_position, expected_quaternion, mask=None):

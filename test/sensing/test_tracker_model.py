@@ -16,7 +16,7 @@ from ctr_dynamics.kernels.rotations import (
 from ctr_dynamics.kernels.tracker_measurement import expected_measurement, pose_difference
 from ctr_dynamics.robot_files import load_robot
 from ctr_dynamics.sensing import Tip, TrackerModel
-from ctr_dynamics.sensing.tracker import STATE_NAMES, STATES, free_axis, pose_differences
+from ctr_dynamics.sensing.tracker import DELAY, STATE_NAMES, STATES, free_axis, pose_differences
 
 RNG = np.random.default_rng(4)
 STAMPS = np.linspace(0.1, 0.9, 17)
@@ -149,7 +149,7 @@ def test_states_and_their_deviations_follow_the_robot_file():
     robot = load_robot("till2020_tissue")
     tracker = TrackerModel.of_robot(robot)
     assert sum(axes for _, axes in STATE_NAMES) == STATES == len(tracker.state_sigma)
-    assert tracker.state_sigma[9] == robot.tracker.delay.tolerance
+    assert tracker.state_sigma[DELAY] == robot.tracker.delay.tolerance
 
 
 def test_rotations_of_arrays_are_those_of_one():

@@ -52,7 +52,7 @@ class RodEkf:
         options: tuning.
 
     Attributes:
-        theta: (p,) estimated changes of the uncertain parameters. bias: (16,) tracker states b. pi: (r + 16, r + 16) Pi.
+        theta: (p,) estimated changes of the uncertain parameters. bias: (22,) tracker states b. pi: (r + 22, r + 22) Pi.
         factor: V. tips: those of the last steps. adapted: of the unknown tip force. gate: counts rejections.
         insertion_fraction: of beta's rate, what the model's velocities hold already.
     """
@@ -278,7 +278,7 @@ class RodEkf:
         return record._replace(accepted=True)
 
     def _fuse(self, nu: Floats, H: Floats, R: Floats) -> Floats:
-        """The correction (r + 16,) by an innovation ``nu`` (k,) of derivative ``H`` (k, r + 16) and stated noise ``R`` (k, k), and the covariance
+        """The correction (r + 22,) by an innovation ``nu`` (k,) of derivative ``H`` (k, r + 22) and stated noise ``R`` (k, k), and the covariance
         after it: Joseph form."""
         size, dof = len(self.pi), len(nu)
         if (size, dof) not in self._filters:
@@ -293,7 +293,7 @@ class RodEkf:
 
     def _end_shift(self, x: Floats) -> None:
         """Bring the tracker's shift back to zero where the tracker is sound and nothing speaks against it: the covariance changes, and the correction
-        ``x`` (r + 16,) in place.
+        ``x`` (r + 22,) in place.
 
         That is a measurement of the shift, zero within the noise of a position. Odds are by Bayes' rule: a shift could be anything up to the
         robot's length, which is improbable beside none unless it is many of its deviations from zero.
@@ -345,7 +345,7 @@ class RodEkf:
         return Comparison(nu, H, S, Update(residual, variance, nis, len(nu), False, "", white))
 
     def _correct(self, state: State, x: Floats) -> None:
-        """Move everything by the correction ``x`` = (a, b) (r + 16,)."""
+        """Move everything by the correction ``x`` = (a, b) (r + 22,)."""
         factor, u = self.factor, self.uncertainty
         r = factor.theta.shape[1]
         x = u.confined(x, self.theta, factor.theta, self.pi)

@@ -65,7 +65,7 @@ class Update(NamedTuple):
 
 
 class Comparison(NamedTuple):
-    """A measurement against the tip of its time: innovation ``nu`` (k,), ``H`` (k, r + 16), ``S`` (k, k), and the record of it."""
+    """A measurement against the tip of its time: innovation ``nu`` (k,), ``H`` (k, r + 22), ``S`` (k, k), and the record of it."""
 
     nu: Floats
     H: Floats

@@ -43,7 +43,7 @@ class ModelUncertainty:
         return slice(len(self.names) - 3, len(self.names))
 
     def confined(self, x: np.ndarray, theta: np.ndarray, rows: np.ndarray, pi: np.ndarray) -> np.ndarray:
-        """The correction ``x`` (r + 16,), changed where it would move a parameter out of its range.
+        """The correction ``x`` (r + 22,), changed where it would move a parameter out of its range.
 
         It is moved along the covariance until that parameter is at the range's end. All else then takes its most likely value beside it
         (Simon 2010, projection of the estimate).
@@ -52,7 +52,7 @@ class ModelUncertainty:
             x: of the coefficients and the tracker states.
             theta: (p,) parameters before the correction.
             rows: (p, r) their rows of the covariance factor.
-            pi: (r + 16, r + 16) covariance of what ``x`` corrects.
+            pi: (r + 22, r + 22) covariance of what ``x`` corrects.
         """
         r = rows.shape[1]
         if not leaves_range(theta, rows, x[:r], self.lowest, self.highest):

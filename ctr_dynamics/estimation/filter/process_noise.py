@@ -1,8 +1,8 @@
-"""Process noise: the unknown tip force and the tracker's drift decay (Gauss-Markov) and get new randomness.
+"""Process noise: the unknown tip force, the model error and the tracker's drift decay (Gauss-Markov) and get new randomness.
 
 With the time constant T and n steps of dt, a state x of stationary variance s^2 becomes d x + w, with d = exp(-n dt / T) and
-var w = (1 - d^2) s^2. The tip force moves the fields, so its randomness is appended to the covariance factor as columns of its own. The drift is
-a tracker state.
+var w = (1 - d^2) s^2. The tip force moves the fields, so its randomness is appended to the covariance factor as columns of its own. The model error
+and the drift are tracker states.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from ctr_dynamics.estimation.filter.covariance_factor import CovarianceFactor
 from ctr_dynamics.estimation.filter.factor_reduction import APPENDED
 from ctr_dynamics.kernels.factor_operations import decay
 from ctr_dynamics.robot import Robot
-from ctr_dynamics.sensing.tracker import DRIFT, STATES
+from ctr_dynamics.sensing.tracker import DRIFT, MODEL_POSITION, MODEL_ROTATION, STATES
 
 Floats = NDArray[np.float64]
 
@@ -26,7 +26,7 @@ class ProcessNoise:
     """Process noise of one filter.
 
     Args:
-        robot: with the tracker's drift.
+        robot: with its model error and the tracker's drift.
         dt: s, one step.
         force_rows: rows of the tip force among the uncertain parameters.
         force_time: s, time constant of the tip force.
@@ -36,7 +36,14 @@ class ProcessNoise:
     def __init__(
         self, robot: Robot, dt: float, force_rows: slice, force_time: float, adapted: AdaptedVariances
     ) -> None:
-        self._noise, self.dt = robot.tracker.noise, dt
+        self.dt, noise = dt, robot.tracker.noise
+        self._slow = [(DRIFT, noise.drift.value, noise.drift_time.value)]
+        if robot.model_error is not None:
+            own = robot.model_error
+            self._slow += [
+                (MODEL_POSITION, own.position.value, own.time.value),
+                (MODEL_ROTATION, own.rotation.value, own.time.value),
+            ]
         self._rows, self._time = force_rows, force_time
         self.adapted = adapted
         self._decay = math.exp(-dt / force_time)
@@ -48,20 +55,21 @@ class ProcessNoise:
     def add(self, steps: int, pi: Floats, bias: Floats, factor: CovarianceFactor) -> Floats:
         """Process noise of the last ``steps`` steps.
 
-        The tracker states ``bias`` (16,) and the covariance ``pi`` (r + 16, r + 16) change in place. The factor gets a column for each axis of
+        The tracker states ``bias`` (22,) and the covariance ``pi`` (r + 22, r + 22) change in place. The factor gets a column for each axis of
         the force, and the covariance with them is returned.
         """
-        self._drift(steps, pi, bias, factor)
+        for part, sigma, time in self._slow:
+            self._wander(part, sigma, math.exp(-steps * self.dt / time), pi, bias)
         return self._force(steps, pi, factor)
 
-    def _drift(self, steps: int, pi: Floats, bias: Floats, factor: CovarianceFactor) -> None:
-        remains = math.exp(-steps * self.dt / self._noise.drift_time.value)
-        r = factor.theta.shape[1]
-        rows = slice(r + DRIFT.start, r + DRIFT.stop)
-        bias[DRIFT] *= remains
+    def _wander(self, part: slice, sigma: float, remains: float, pi: Floats, bias: Floats) -> None:
+        """The tracker states ``part`` of stationary deviation ``sigma`` decay by ``remains``, and get the randomness that keeps it."""
+        first = len(pi) - STATES
+        rows = slice(first + part.start, first + part.stop)
+        bias[part] *= remains
         pi[rows, :] *= remains
         pi[:, rows] *= remains
-        pi[rows, rows] += np.eye(3) * ((1 - remains**2) * self._noise.drift.value**2)
+        pi[rows, rows] += np.eye(3) * ((1 - remains**2) * sigma**2)
         self.adapted.decay(rows, remains)
 
     def _force(self, steps: int, pi: Floats, factor: CovarianceFactor) -> Floats:
