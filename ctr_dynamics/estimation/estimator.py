@@ -342,7 +342,9 @@ class Estimator:
         runs.judge(result)
         if mark is not None:
             self.innovations.discard(mark)
-        elif result.ok and runs.fused.follow_delay(runs.open_loop, k):
+        elif result.ok and (
+            runs.fused.follow_delay(runs.open_loop, k) or runs.fused.follow_model_error(runs.open_loop, k)
+        ):
             late.history.restart(k)
         health.sweeps += result.sweeps
         return self._output(k, result) if result.ok else self._invalid(k, f"step failed: {result.reason}")
@@ -395,7 +397,8 @@ class Estimator:
         innovations = self.innovations.take()
         self._settling.take(innovations)
         unsettled = self._settling.problem(stamp)
-        if unsettled:
+        if unsettled:  # measurements tell nothing of the model's error either
+            fused.model_error_search.clear()
             self.innovations.pass_over()
         problem = health.problem = self._problem(stamp, deviation) or unsettled
         self._stability_due |= k % options.stability_every == 0

@@ -16,15 +16,19 @@ from ctr_dynamics.estimation.inputs.run_inputs import InterpolatedInputs, RunInp
 from ctr_dynamics.estimation.monitoring.delay_search import DelaySearch, allowance
 from ctr_dynamics.estimation.monitoring.health import Health
 from ctr_dynamics.estimation.monitoring.innovation_log import InnovationLog
+from ctr_dynamics.estimation.monitoring.model_error_search import ModelErrorSearch
 from ctr_dynamics.estimation.open_loop import OpenLoopRun
 from ctr_dynamics.estimation.step_output import FUSION_OFF, UNKNOWN_DELAY, Innovation, MotionPoint
 from ctr_dynamics.estimation.timeline import DT, seconds
 from ctr_dynamics.kernels import rotations
 from ctr_dynamics.kernels.layout import parameters_of_inputs
+from ctr_dynamics.kernels.tracker_measurement import pose_difference
 from ctr_dynamics.model.simulator import State
 
 Floats = NDArray[np.float64]
-NEGLIGIBLE = 1e-4  # probability of another delay, below which it is no matter of the covariance
+NEGLIGIBLE = (
+    1e-4  # probability of another delay or model error, below which it is no matter of the covariance
+)
 
 
 class FusedState(NamedTuple):
@@ -59,7 +63,14 @@ class FusedRun:
         model = ekf.model
         rows = parameters_of_inputs(model.n)[: model.input_count]
         self._by_theta = ekf.uncertainty.effect[rows]  # encoder offsets and tip force
-        self.delay_search = DelaySearch(model.robot.tracker.noise.position.value, ekf.options.force_change)
+        noise = model.robot.tracker.noise
+        self.delay_search = DelaySearch(noise.position.value, ekf.options.force_change)
+        self.model_error_search = ModelErrorSearch(
+            noise.position.value,
+            noise.rotation.value,
+            float(model.robot.lengths[0]),
+            ekf.options.force_change,
+        )
         self.state: State | None = None
         self.measured_ns: int | None = None
         self.late = False
@@ -69,6 +80,7 @@ class FusedRun:
         """Have no state, and the parameters of the robot file."""
         self.ekf.forget_parameters()
         self.delay_search.clear()
+        self.model_error_search.clear()
         self.state, self.measured_ns, self.late = None, None, False
 
     def start(self, state: State, t: float) -> None:
@@ -100,6 +112,12 @@ class FusedRun:
                 own_s, seen = time_s - self.ekf.tracker.age, motion.position + motion.residual
                 self.delay_search.add(
                     measurement.stamp_ns, own_s, seen, *open_loop.tips.positions(), update.foretold
+                )
+                self.model_error_search.add(
+                    measurement.stamp_ns,
+                    motion.residual,
+                    self._turn(quaternion, motion.quaternion),
+                    update.foretold,
                 )
             if update.dof:
                 self.measured_ns = max(self.measured_ns or 0, measurement.stamp_ns)
@@ -139,6 +157,12 @@ class FusedRun:
         )  # fmt: skip
         return motion, position - estimate
 
+    def _turn(self, quaternion: Floats, open_loop: Floats) -> Floats:
+        """Rotation vector (a,) rad from that of the ``open_loop`` tip to a measured ``quaternion``, (4,) wxyz each, on the measured axes."""
+        tracker, none = self.ekf.tracker, np.zeros(3)
+        expected = rotations.multiply(tracker.rotation, open_loop)
+        return pose_difference(none, quaternion, none, expected, tracker.free)[3:][tracker.mask[3:]]
+
     def reinitialise(self, open_loop: OpenLoopRun, k: int) -> None:
         """Go on from the open-loop run at step ``k``: a correction has led this run astray."""
         assert open_loop.state is not None
@@ -168,21 +192,38 @@ class FusedRun:
         self.reinitialise(open_loop, k)
         return True
 
+    def follow_model_error(self, open_loop: OpenLoopRun, k: int) -> bool:
+        """Go on from the open-loop run at step ``k`` with a larger model error, if measurements follow that far better than the filter.
+
+        Without it, the filter takes the error of the model for a force and for wrong parameters, which move the velocities too.
+        """
+        if not self._health.fusing or self.late:
+            return False
+        found = self.model_error_search.found(self.ekf.model_error)
+        if found is None:
+            return False
+        self._health.model_error = found
+        self.ekf.expect_model_error(found)
+        self.model_error_search.begin_again()
+        self.reinitialise(open_loop, k)
+        return True
+
     def inflate_covariance(self, tip: TipEstimate, open_loop: OpenLoopRun) -> None:
-        """Have the covariance of ``tip`` hold what else may be right: the open-loop run where the tracker may be late, the tracker where it
-        is thought to be."""
+        """Have the covariance of ``tip`` hold what else may be right: the open-loop run where the tracker may be late or the model may err more
+        than the filter counts on, the tracker where it is thought to be late."""
         belief = self.delay_search.belief(self.ekf.delay)
-        if not self._health.fusing or belief.late < NEGLIGIBLE:
+        other = max(belief.late, self.model_error_search.probability(self.ekf.model_error))
+        if not self._health.fusing or other < NEGLIGIBLE:
             return
         if self.late:
             tip.covariance[:3, :3] += allowance(1.0 - belief.late) * np.multiply.outer(
                 self._apart, self._apart
             )
             return
-        other = open_loop.tips.last.mean
-        turn = rotations.to_vector(rotations.multiply(tip.quaternion, rotations.conjugate(other[3:7])))
-        apart = np.concatenate([tip.position - other[:3], turn, tip.twist - other[7:13]])
-        tip.covariance[:] += allowance(belief.late) * np.multiply.outer(apart, apart)
+        mean = open_loop.tips.last.mean
+        turn = rotations.to_vector(rotations.multiply(tip.quaternion, rotations.conjugate(mean[3:7])))
+        apart = np.concatenate([tip.position - mean[:3], turn, tip.twist - mean[7:13]])
+        tip.covariance[:] += allowance(other) * np.multiply.outer(apart, apart)
 
     def checkpoint(self) -> FusedState:
         """What :meth:`restore` returns to."""

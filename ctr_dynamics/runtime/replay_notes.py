@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 from ctr_dynamics.errors import InputError
@@ -19,7 +20,22 @@ LEAST_SHARE = 0.1  # less than a tenth of a recording that was used is next to n
 def replay_notes(bag: Bag, settings: Settings, numbers: dict[str, Any]) -> list[str]:
     """All notes on a replay, a line each. ``numbers``: its summary."""
     notes = [*bag.notes, *bag.unchecked, *_without_effect(bag, settings)]
-    return [*notes, *input_notes(numbers["input_problems"]), *_left_out(numbers)]
+    return [
+        *notes,
+        *input_notes(numbers["input_problems"]),
+        *_model_error(numbers["model_error"]),
+        *_left_out(numbers),
+    ]
+
+
+def _model_error(found: dict[str, float] | None) -> list[str]:
+    """Where the robot departs from its file by more than that states."""
+    if found is None:
+        return []
+    return [
+        f"the tip departs from its model by {1e3 * found['position']:.1f} mm and {math.degrees(found['rotation']):.1f} deg per axis, for "
+        f"{found['time']:g} s, beyond the robot file: the filter has counted on that; measure it with ctr-dynamics calibrate"
+    ]
 
 
 def shortfall(bag: Bag, settings: Settings, numbers: dict[str, Any]) -> str:

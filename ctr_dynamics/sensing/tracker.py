@@ -110,7 +110,8 @@ class TrackerModel:
     Attributes:
         rotation: (4,) wxyz of R_reg; translation: (3,) m; lever: (3,) m in the tip frame; delay: s, > 0 when a pose is older than its stamp.
         mask: (6,) measured axes: position x, y, z in the tracker's frame, then rotation about the sensor's x, y, z.
-        variance: (6,) white noise. state_sigma: (22,) prior deviations of ``STATE_NAMES``.
+        variance: (6,) white noise. state_sigma: (22,) prior deviations of ``STATE_NAMES``; those of
+            the robot itself are 0.
         scale: reported over true distance; drift: (3,) m/s; skew: s/s, stamp = true time (1 + skew).
         averaging: s, length of the window over which poses are averaged. corrections: further links, in order.
     """
@@ -145,8 +146,7 @@ class TrackerModel:
                     file.registration_rotation.tolerance,
                     file.registration_translation.tolerance,
                     file.lever_arm.tolerance,
-                    np.full(3, robot.model_error.position.value if robot.model_error else 0.0),
-                    np.full(3, robot.model_error.rotation.value if robot.model_error else 0.0),
+                    np.zeros(6),
                     [file.delay.tolerance],
                     np.full(3, noise.drift.value),
                     np.zeros(3),

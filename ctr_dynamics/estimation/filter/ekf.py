@@ -20,6 +20,7 @@ from ctr_dynamics.estimation.filter.filter_records import (
     Comparison,
     FilterOptions,
     FilterState,
+    ModelErrorSize,
     TipEstimate,
     Update,
 )
@@ -35,7 +36,7 @@ from ctr_dynamics.kernels.variance_likelihood import position_density, pull_to_z
 from ctr_dynamics.model.model import Model
 from ctr_dynamics.model.simulator import Inputs, Simulator, State, StepResult
 from ctr_dynamics.sensing import Tip, TrackerModel
-from ctr_dynamics.sensing.tracker import DELAY, SHIFT, STATES
+from ctr_dynamics.sensing.tracker import DELAY, MODEL_POSITION, MODEL_ROTATION, SHIFT, STATES
 
 Floats = NDArray[np.float64]
 
@@ -54,6 +55,7 @@ class RodEkf:
     Attributes:
         theta: (p,) estimated changes of the uncertain parameters. bias: (22,) tracker states b. pi: (r + 22, r + 22) Pi.
         factor: V. tips: those of the last steps. adapted: of the unknown tip force. gate: counts rejections.
+        model_error: size that the filter counts on.
         insertion_fraction: of beta's rate, what the model's velocities hold already.
     """
 
@@ -83,6 +85,7 @@ class RodEkf:
         force = ForceRange(least, most, options.force_change)
         noise = self.model.robot.tracker.noise.position.value
         self.adapted = AdaptedVariances(force, noise, self.model.robot.tubes[0].length)
+        self.model_error = ModelErrorSize.of_robot(self.model.robot)
         self._noise = ProcessNoise(self.model.robot, dt, self._force, options.force_time, self.adapted)
         self.schedule = FactorSchedule()
         self._strides: ColumnStrides | None = None
@@ -109,6 +112,12 @@ class RodEkf:
         self.pi[:r, :r] = pi_aa
         self.pi[r:, r:] = np.diag(self.tracker.state_sigma**2)
         self.pi[r + DELAY, r + DELAY] = self._delay_sigma**2
+        for part, sigma in (
+            (MODEL_POSITION, self.model_error.position),
+            (MODEL_ROTATION, self.model_error.rotation),
+        ):
+            rows = np.arange(r + part.start, r + part.stop)
+            self.pi[rows, rows] = sigma**2
         # the unknown force starts with its stationary deviation, in columns of its own
         scale = np.diag(self.factor.theta)[self._force]
         for axis, size in enumerate(scale):
@@ -135,6 +144,11 @@ class RodEkf:
         dt = self.simulator.scheme.dt
         self.tips.size += math.ceil(max(delay, 0.0) / dt) - math.ceil(max(self._delay, 0.0) / dt)
         self._delay, self._delay_sigma = delay, max(sigma, float(self.tracker.state_sigma[DELAY]))
+
+    def expect_model_error(self, size: ModelErrorSize) -> None:
+        """Start with a model error of another ``size``; :meth:`start` is next."""
+        self.model_error = size
+        self._noise.expect_model_error(size)
 
     def _block(self, inputs: Inputs) -> Floats:
         par = self.simulator.parameters.copy()

@@ -14,6 +14,7 @@ from ctr_dynamics.estimation.filter.covariance_factor import FactorState
 from ctr_dynamics.estimation.filter.factor_schedule import ScheduleState
 from ctr_dynamics.estimation.filter.gating import GateOptions
 from ctr_dynamics.estimation.filter.tip_window import TipWindowState
+from ctr_dynamics.robot import Robot
 
 Floats = NDArray[np.float64]
 
@@ -34,6 +35,22 @@ class FilterOptions:
     window: float = 0.2
     gate: GateOptions = field(default_factory=GateOptions)
     parameter_energy: float = 0.1
+
+
+class ModelErrorSize(NamedTuple):
+    """Deviations per axis of ``position`` (m) and ``rotation`` (rad) of the tip from where the model has it, and their correlation ``time`` (s)."""
+
+    position: float
+    rotation: float
+    time: float
+
+    @classmethod
+    def of_robot(cls, robot: Robot) -> ModelErrorSize:
+        """What the robot file states, or none."""
+        stated = robot.model_error
+        if stated is None:
+            return cls(0.0, 0.0, 1.0)
+        return cls(stated.position.value, stated.rotation.value, stated.time.value)
 
 
 class Update(NamedTuple):

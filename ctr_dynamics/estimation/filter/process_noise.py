@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from ctr_dynamics.estimation.filter.adapted_variances import AdaptedVariances
 from ctr_dynamics.estimation.filter.covariance_factor import CovarianceFactor
 from ctr_dynamics.estimation.filter.factor_reduction import APPENDED
+from ctr_dynamics.estimation.filter.filter_records import ModelErrorSize
 from ctr_dynamics.kernels.factor_operations import decay
 from ctr_dynamics.robot import Robot
 from ctr_dynamics.sensing.tracker import DRIFT, MODEL_POSITION, MODEL_ROTATION, STATES
@@ -37,13 +38,8 @@ class ProcessNoise:
         self, robot: Robot, dt: float, force_rows: slice, force_time: float, adapted: AdaptedVariances
     ) -> None:
         self.dt, noise = dt, robot.tracker.noise
-        self._slow = [(DRIFT, noise.drift.value, noise.drift_time.value)]
-        if robot.model_error is not None:
-            own = robot.model_error
-            self._slow += [
-                (MODEL_POSITION, own.position.value, own.time.value),
-                (MODEL_ROTATION, own.rotation.value, own.time.value),
-            ]
+        self._drift = (DRIFT, noise.drift.value, noise.drift_time.value)
+        self.expect_model_error(ModelErrorSize.of_robot(robot))
         self._rows, self._time = force_rows, force_time
         self.adapted = adapted
         self._decay = math.exp(-dt / force_time)
@@ -51,6 +47,14 @@ class ProcessNoise:
     def decay_force(self, theta: Floats, factor: CovarianceFactor) -> None:
         """The tip force of the parameters ``theta`` (p,) and its rows of the factor decay over one step, in place."""
         decay(self._decay, theta[self._rows], factor.theta[self._rows])
+
+    def expect_model_error(self, size: ModelErrorSize) -> None:
+        """Have a model error of that ``size`` from now on."""
+        self._slow = [
+            self._drift,
+            (MODEL_POSITION, size.position, size.time),
+            (MODEL_ROTATION, size.rotation, size.time),
+        ]
 
     def add(self, steps: int, pi: Floats, bias: Floats, factor: CovarianceFactor) -> Floats:
         """Process noise of the last ``steps`` steps.

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ctr_dynamics import chi_square
+from ctr_dynamics.estimation.filter.filter_records import ModelErrorSize
 from ctr_dynamics.estimation.monitoring.consistency_monitor import ConsistencyMonitor
 from ctr_dynamics.estimation.step_output import FUSION_OFF, UNKNOWN_DELAY, Innovation
 from ctr_dynamics.model.stability import Stability
@@ -84,6 +85,7 @@ class Health:
         force_sigma: N, deviation of the tip force in the process noise.
         shift_m: m, by which measured positions lie beside what any force on the robot explains; 0 where they do not.
         noise_ratio: deviation of the tracker's noise by the stated one; 1 while nothing else is established.
+        model_error: by which the robot is found to depart from its model beyond the robot file; None while it is not.
         residuals: of the measurements that were used; unused_residuals: of those that were rejected or dropped.
         distances: m, between measured and published positions, of the last measurements. apart_m: their median, as half of them may be outliers,
             whatever the filter made of them; 0 before there are ``FEWEST_APART``.
@@ -118,6 +120,7 @@ class Health:
     force_sigma: float = 0.0
     shift_m: float = 0.0
     noise_ratio: float = 1.0
+    model_error: ModelErrorSize | None = None
     tracker_age_s: float = 0.0
     consistency: ConsistencyMonitor = field(default_factory=ConsistencyMonitor)
     stability: Stability | None = None
@@ -278,6 +281,7 @@ class Health:
                 "not_used_residual_rms_m": self.unused_residuals.rms(self.fusing),
             },
             "nis": self.nis_summary(),
+            "model_error": self.model_error._asdict() if self.model_error else None,
             "rejected": self.rejected,
             "late": self.late,
             "dropped": self.dropped,

@@ -126,12 +126,22 @@ def stability(health: Health) -> Status:
 def consistency(health: Health) -> Status:
     """Mean NIS of the last second, and the process noise."""
     values = {"force deviation N": f"{health.force_sigma:.4g}"}
+    error = health.model_error
+    if error is not None:
+        values["model error m"] = f"{error.position:.4g}"
+        values["model error rad"] = f"{error.rotation:.4g}"
     if not health.recent:
         return Status("consistency", OK, "no samples yet", values)
     mean = sum(ratio for ratio, _ in health.recent) / len(health.recent)
     # the measurements of one second: white for a consistent filter, 6 degrees of freedom each
     limit = 1.0 + 4.0 * math.sqrt(2.0 / (6.0 * len(health.recent)))
     values["nis per dof, last second"] = f"{mean:.2f}"
+    if error is not None:
+        message = (
+            f"the tip departs from its model by {1e3 * error.position:.1f} mm and {math.degrees(error.rotation):.1f} deg per axis, "
+            "beyond the robot file: the filter counts on that now; ctr-dynamics calibrate measures it"
+        )
+        return Status("consistency", WARN, message, values)
     if mean > limit:
         message = f"mean NIS {mean:.2f} per degree of freedom, limit {limit:.2f}: the model misses an effect, or the noise is larger than stated"
         return Status("consistency", WARN, message, values)

@@ -1,0 +1,186 @@
+"""A robot whose tip departs from its model as neither parameters nor a force explain: the size of that departure.
+
+The robot file may state it (``model_error``). Where it does not, or states too little, the filter takes it for a force and for wrong parameters,
+and is worse than the open-loop run. So measurements are also compared with the open-loop run and a departure from it, a Gauss-Markov process of
+each of some sizes and times. These and the filter compete by how well each foretells the next position (prequential evidence, Dawid 1984).
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ctr_dynamics.estimation.filter.filter_records import ModelErrorSize
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class ModelErrorSearchOptions:
+    """When a model error is believed.
+
+    Attributes:
+        smallest: by the tracker's noise; less is not told from noise. largest: by the robot's length. Published models of real robots err by 1 to
+            3 % of it (Rucker et al. 2010, Dupont et al. 2010); what is farther is a wrong robot file or a fault of the tracker.
+        steps: between one size and the next, as a factor.
+        times_s: correlation times that are tried: of slow motion, not of a vibration.
+        prior: probability that a robot departs from its file beyond the tolerances. The file is trusted until evidence of a hundred to one.
+        believed: probability from which on the estimate begins again with the model error.
+        memory_s: s, for which evidence counts.
+        remembered: measurements that may be taken again.
+    """
+
+    smallest: float = 2.0
+    largest: float = 0.03
+    steps: float = 1.6
+    times_s: tuple[float, ...] = (0.3, 1.0, 3.0)
+    prior: float = 0.01
+    believed: float = 0.99
+    memory_s: float = 10.0
+    remembered: int = 200
+
+
+class Evidence(NamedTuple):
+    """What the measurements up to ``stamp_ns`` say.
+
+    Attributes:
+        level: (h, 3) m, departure of the tip for every hypothesis, as known from the past. variance: (h,) m^2, of it per axis.
+        departures: (h,) logarithm of the evidence of every hypothesis; filter: of what the filter foretold.
+        turned: rad^2, mean square of the rotation between measurements and open-loop run, per axis; weight: of how many measurements.
+    """
+
+    stamp_ns: int
+    level: Floats
+    variance: Floats
+    departures: Floats
+    filter: float
+    turned: float
+    weight: float
+
+
+class ModelErrorSearch:
+    """Evidence for every size of the model error against that of the filter.
+
+    Args:
+        position_noise, rotation_noise: m and rad per axis, deviations of a measured pose.
+        length: m, of the robot outside the base plate at most.
+        change_s: mean time between two changes of the unknown force. The filter may have met one with every measurement.
+        options: when a model error is believed.
+    """
+
+    def __init__(
+        self,
+        position_noise: float,
+        rotation_noise: float,
+        length: float,
+        change_s: float,
+        options: ModelErrorSearchOptions | None = None,
+    ) -> None:
+        self.options = options = options or ModelErrorSearchOptions()
+        self._noise, self._rotation_noise, self._change_s = position_noise, rotation_noise, change_s
+        least = options.smallest * position_noise
+        most = max(least, options.largest * length)
+        count = 1 + math.ceil(math.log(most / least) / math.log(options.steps))
+        sizes = np.geomspace(least, most, count)
+        self.sizes, self.times = (
+            np.repeat(sizes, len(options.times_s)),
+            np.tile(np.array(options.times_s), count),
+        )
+        self.clear()
+
+    def clear(self) -> None:
+        """Forget all measurements."""
+        self._evidence: deque[Evidence] = deque(maxlen=self.options.remembered)
+        self._begin_ns = 0
+
+    def add(self, stamp_ns: int, residual: Floats, turn: Floats, foretold: tuple[float, float]) -> None:
+        """Take in a measured tip that the filter has met; one of a stamp that is known takes its place.
+
+        Args:
+            stamp_ns: of its header.
+            residual: (3,) m, measured minus open-loop tip. turn: (a,) rad, rotation between them about the measured axes.
+            foretold: what the filter foretold; see :class:`~ctr_dynamics.estimation.filter.filter_records.Update`.
+        """
+        while self._evidence and self._evidence[-1].stamp_ns >= stamp_ns:
+            self._evidence.pop()  # its step is taken again
+        noise, square = self._noise**2, self.sizes**2
+        angle = float(turn @ turn) / len(turn) if len(turn) else 0.0
+        if not self._evidence:
+            self._begin_ns = stamp_ns
+            gain = square / (square + noise)
+            level = gain[:, None] * residual
+            none = np.zeros(len(square))
+            self._evidence.append(Evidence(stamp_ns, level, (1.0 - gain) * square, none, 0.0, angle, 1.0))
+            return
+        # 1. The departure decays and gets new randomness.
+        last, options = self._evidence[-1], self.options
+        elapsed = (stamp_ns - last.stamp_ns) * 1e-9
+        remains = np.exp(-elapsed / self.times)
+        before = remains**2 * last.variance + (1.0 - remains**2) * square
+        level = remains[:, None] * last.level
+        change, total = residual - level, before + noise
+        # 2. Density of the position, by that of the stated noise at zero.
+        density = -0.5 * ((change**2).sum(axis=1) / total + 3.0 * np.log(total / noise))
+        known, changed = foretold
+        likely = -math.expm1(-elapsed / self._change_s)
+        own = float(np.logaddexp(known + math.log1p(-likely), changed + math.log(likely)))
+        # 3. What is known of the past counts less and less.
+        decay, gain = math.exp(-elapsed / options.memory_s), before / total
+        weight = decay * last.weight + 1.0
+        self._evidence.append(
+            Evidence(
+                stamp_ns,
+                level + gain[:, None] * change,
+                before * (1.0 - gain),
+                decay * last.departures + density,
+                decay * last.filter + own,
+                last.turned + (angle - last.turned) / weight,
+                weight,
+            )
+        )
+
+    def probability(self, present: ModelErrorSize) -> float:
+        """That the model errs by more than ``present``, which the filter counts on."""
+        return float(self._weights(present).sum())
+
+    def _weights(self, present: ModelErrorSize) -> Floats:
+        """(h,) probabilities of the hypotheses beside the filter: of those by which the tip departs farther, and at least as fast.
+
+        Only where their own correlation time has passed: how a vibration begins is no slow departure yet.
+        """
+        none = np.zeros(len(self.sizes))
+        if not self._evidence:
+            return none
+        last, options = self._evidence[-1], self.options
+        farther = self.sizes > math.sqrt(options.steps) * present.position
+        faster = self.sizes**2 / self.times >= present.position**2 / present.time
+        seen = self.times <= (last.stamp_ns - self._begin_ns) * 1e-9
+        tried = farther & faster & seen
+        if not tried.any():
+            return none
+        prior = math.log(options.prior / len(self.sizes))
+        likely = np.where(tried, last.departures + prior, -np.inf)
+        most = max(last.filter, float(likely.max()))
+        weights: Floats = np.exp(likely - most)
+        return weights / (weights.sum() + math.exp(last.filter - most))
+
+    def found(self, present: ModelErrorSize) -> ModelErrorSize | None:
+        """The model error that is believed instead of ``present``, which the filter counts on; None where there is none."""
+        weights = self._weights(present)
+        if weights.sum() <= self.options.believed:
+            return None
+        best = int(weights.argmax())
+        turned = self._evidence[-1].turned - self._rotation_noise**2
+        rotation = max(math.sqrt(max(turned, 0.0)), present.rotation)
+        return ModelErrorSize(float(self.sizes[best]), rotation, float(self.times[best]))
+
+    def begin_again(self) -> None:
+        """The filter goes on from the open-loop run with the model error that was found, and foretells as well as that has done."""
+        if self._evidence:
+            last = self._evidence.pop()
+            self._evidence.append(last._replace(filter=float(max(last.filter, last.departures.max()))))

@@ -1,0 +1,94 @@
+"""A departure from the model, found in how well it foretells measurements."""
+
+import numpy as np
+import pytest
+from estimation_cases import check_outputs, play, rms, truth_error
+from test_model_error import SHIFT_M, departure, shifted_poses
+
+from ctr_dynamics.estimation.filter.filter_records import ModelErrorSize
+from ctr_dynamics.estimation.monitoring.model_error_search import ModelErrorSearch
+from ctr_dynamics.robot_files import load_robot
+
+NOISE, ROTATION_NOISE, LENGTH = 3e-4, 3e-3, 0.2
+NONE = ModelErrorSize(0.0, 0.0, 1.0)
+WELL = -1.7  # as a filter foretells whose model is right: 3 ln(1 + 1/4) / 2 and the innovation's square
+
+
+def search(departures, turn=0.0, foretold=(-20.0, -4.0), seed=1):
+    """Positions at 40 Hz that lie ``departures`` (k, 3) m from the open-loop run, beside a filter that has ``foretold`` every one like that."""
+    rng, found = np.random.default_rng(seed), ModelErrorSearch(NOISE, ROTATION_NOISE, LENGTH, 20.0)
+    for k, departure_m in enumerate(departures):
+        turned = np.array([turn, turn, turn]) + ROTATION_NOISE * rng.standard_normal(3)
+        found.add(25_000_000 * k, departure_m + NOISE * rng.standard_normal(3), turned, foretold)
+    return found
+
+
+def wandering(size, time, count, seed=2):
+    """A Gauss-Markov process (count, 3) of deviation ``size`` and correlation ``time`` (s), at 40 Hz."""
+    rng, remains = np.random.default_rng(seed), np.exp(-0.025 / time)
+    found = np.zeros((count, 3))
+    found[0] = size * rng.standard_normal(3)
+    for k in range(1, count):
+        found[k] = remains * found[k - 1] + size * np.sqrt(1.0 - remains**2) * rng.standard_normal(3)
+    return found
+
+
+@pytest.mark.parametrize(("size", "time"), [(1.2e-3, 1.0), (3e-3, 3.0), (3e-3, 0.3)])
+def test_a_departure_is_found_with_its_size_and_rotation(size, time):
+    found = search(wandering(size, time, 400), turn=0.05).found(NONE)
+    assert found is not None
+    assert size / 2.6 < found.position < 2.6 * size
+    assert found.rotation == pytest.approx(0.05, rel=0.05)
+    # the change from one measurement to the next is what foretells: size over the root of the time
+    assert found.position / np.sqrt(found.time) == pytest.approx(size / np.sqrt(time), rel=0.7)
+
+
+def test_nothing_is_found_beside_a_filter_that_foretells_well():
+    assert search(np.zeros((400, 3)), foretold=(WELL, WELL)).probability(NONE) < 1e-3
+    assert search(wandering(2e-3, 1.0, 400), foretold=(WELL, WELL)).found(NONE) is None
+
+
+def test_what_the_filter_counts_on_already_is_not_found_again():
+    wanders = search(wandering(2e-3, 1.0, 400))
+    found = wanders.found(NONE)
+    wanders.begin_again()
+    assert wanders.found(found) is None
+    assert wanders.probability(found) < 0.5
+
+
+def test_a_vibration_is_no_slow_departure():
+    """That of a wrong stiffness: the filter that knows the motion foretells it, though not to the noise."""
+    t = 0.025 * np.arange(400)
+    vibration = 3e-3 * np.stack([np.sin(35.0 * t), np.cos(35.0 * t), 0.0 * t], axis=1)
+    assert search(vibration, foretold=(-4.0, -4.0)).found(NONE) is None
+
+
+def test_a_departure_is_not_believed_before_its_own_time():
+    quick = search(wandering(3e-3, 3.0, 11))  # 0.25 s
+    assert quick.probability(NONE) == 0.0
+    found = search(wandering(3e-3, 3.0, 20)).found(NONE)
+    assert found is None or found.time < 0.5
+
+
+def test_measurements_that_are_taken_again_count_once():
+    departures = wandering(2e-3, 1.0, 60)
+    once, twice = search(departures), search(departures[:50])
+    rng = np.random.default_rng(1)
+    for k, departure_m in enumerate(departures):
+        turned, noise = ROTATION_NOISE * rng.standard_normal(3), NOISE * rng.standard_normal(3)
+        if k >= 30:
+            twice.add(25_000_000 * k, departure_m + noise, turned, (-20.0, -4.0))
+    assert twice.probability(NONE) == pytest.approx(once.probability(NONE), abs=1e-9)
+
+
+def test_a_robot_that_departs_from_its_file_is_followed(sweep):
+    """The same bag as with a stated error, and a file that states none."""
+    run = play(shifted_poses(sweep, load_robot("till2020_tissue").tracker))
+    check_outputs(run)
+    error = run.estimator.health.model_error
+    assert error is not None
+    assert error.position > SHIFT_M / 5.0
+    left, steps = truth_error(run, "clean_sweep", "p_trk", since=0.9)
+    left = left - np.array([departure(t)[0] for t in run.t[steps]])
+    assert rms(left) < 0.2 * SHIFT_M * np.sqrt(3.0)
+    assert isinstance(run.estimator.runs.fused.ekf.model_error, ModelErrorSize)
