@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 
 from ctr_dynamics.estimation.backbone import Backbone
 from ctr_dynamics.estimation.discretisation import discretise
-from ctr_dynamics.estimation.inputs.actuator_error import add_actuator_error
 from ctr_dynamics.estimation.inputs.input_buffer import InputBuffer
 from ctr_dynamics.estimation.inputs.measurement_queue import tracker_of
 from ctr_dynamics.estimation.mode_tracker import ModeTracker
@@ -31,6 +30,7 @@ from ctr_dynamics.estimation.out_of_sequence import OutOfSequence
 from ctr_dynamics.estimation.runs import Runs
 from ctr_dynamics.estimation.step_output import SolverStats, StepOutput
 from ctr_dynamics.estimation.timeline import seconds
+from ctr_dynamics.estimation.tip_jacobian import JacobianTracker
 from ctr_dynamics.io.messages.topics import STEP_NS
 from ctr_dynamics.model.model import Model
 from ctr_dynamics.model.simulator import StepResult
@@ -49,6 +49,7 @@ class EstimatorOptions:
     Attributes:
         stability_every: steps between looks at the elastic stability, 0.1 s: a tenth of the warning time of a snap.
         modes_every: steps between refreshes of the vibration modes, 0.4 s.
+        jacobian_every: steps between two of the tip's Jacobian, 0.1 s.
         longest_without_idle: steps after which idle work is done without idle time, 0.2 s.
         retry_every: steps between starts while there is no equilibrium. Looking for one in vain takes longer than a step.
         deviation_fraction: of tube 1's length: outputs with a larger deviation of the tip are invalid, where no parameter says otherwise.
@@ -59,6 +60,7 @@ class EstimatorOptions:
 
     stability_every: int = 33
     modes_every: int = 132
+    jacobian_every: int = 33
     longest_without_idle: int = 66
     retry_every: int = 33
     deviation_fraction: float = 0.05
@@ -129,6 +131,7 @@ class Estimator:
         self._stability = StabilityWatch(self.model)
         self._stability_due = False
         self._modes = ModeTracker(self.model, self.options.modes_every)
+        self._jacobian = JacobianTracker(self.model, self.options.jacobian_every)
         self._without_idle = 0  # steps since the last idle work
         self._driven_m = 0.0  # by which actuators may have moved the tip unknown to the last step
 
@@ -271,7 +274,7 @@ class Estimator:
             self.health.stability = self._stability.update(
                 seconds(self.k), now.beta, now.alpha, now.force, now.torque, guess=runs.fused.state.unknowns_at_base
             )  # fmt: skip
-        else:
+        elif not self._jacobian.refresh(runs.fused.state, runs.fused.simulator.parameters):
             self._modes.refresh(runs.fused.state, runs.fused.simulator.parameters)
 
     def prefetch(self) -> None:
@@ -324,6 +327,7 @@ class Estimator:
         """Take steps again that were taken with other inputs than are known now."""
         if self.late.correct(spare_s):
             self._modes.clear()
+            self._jacobian.clear()
 
     def _step(self, k: int) -> StepOutput:
         """Take step ``k`` and describe it."""
@@ -361,6 +365,7 @@ class Estimator:
             return self._invalid(k, reason)
         self.late.history.restart(k)
         self._modes.clear()
+        self._jacobian.clear()
         self._settling.start(self.timeline.stamp(k))
         self._watched = self.timeline.stamp(k), self.inputs.joints.at(self.timeline.stamp(k))[0]
         return self._output(k, StepResult(True, "at rest", 0, 0, 0))
@@ -369,7 +374,7 @@ class Estimator:
 
     def _output(self, k: int, result: StepResult) -> StepOutput:
         """The output of a step that both runs have taken; invalid where it says nothing of the robot."""
-        fused, health, options = self.runs.fused, self.health, self.options
+        fused, health, options, late = self.runs.fused, self.health, self.options, self.late
         assert fused.state is not None
         tip = fused.ekf.tip_estimate()
         predicted = self.runs.open_loop.tips.last.mean[:7].copy()
@@ -390,7 +395,9 @@ class Estimator:
                 f"{self._length:g} m; the filter is reinitialised from the open-loop run",
             )
         fused.inflate_covariance(tip, self.runs.open_loop)
-        self._driven_m = self._inflate(tip.covariance, tip.position, stamp)
+        self._driven_m = self.inputs.actuator_error.inflate(
+            tip.covariance, tip.position, self._length, stamp, late.lag * STEP_NS
+        )
         deviation = position_deviation(tip.covariance)
         since = fused.measured_ns if fused.measured_ns is not None else self.t0_ns
         health.tracker_age_s = max(0.0, (stamp - (since or stamp)) * 1e-9)
@@ -407,21 +414,12 @@ class Estimator:
             predicted[:3], predicted[3:], self._backbone.rows(fused.state), self._modes.measure(fused.state, k), fused.ekf.force,
             tip.force_sigma, innovations, SolverStats(result.iterations, result.sweeps, result.reason),
             fused.state.inputs.beta.tolist(),
+            self._jacobian.measure(fused.state),
         )  # fmt: skip
 
     def _invalid(self, k: int, reason: str) -> StepOutput:
         self.health.problem = reason
         return StepOutput.invalid(self.timeline.stamp(k), k, reason, self.innovations.take())
-
-    def _inflate(self, covariance: Floats, position: Floats, stamp: int) -> float:
-        """Add to the ``covariance`` (12, 12) of the tip, in place, what is not known of the actuators that drove it; returns that deviation, m."""
-        inputs = self.inputs
-        error = inputs.actuator_error.at(stamp)
-        if not error.any():
-            return 0.0
-        half = 0.5 * (self._length + float(inputs.joints.values[-1][self.model.n]))
-        duration = max(stamp - inputs.joints.stamps[-1], self.late.lag * STEP_NS) * 1e-9
-        return add_actuator_error(covariance, position, error, half, duration)
 
     def _problem(self, stamp: int, deviation: float) -> str:
         """Why the output of that stamp (ns) and ``deviation`` of the tip (m) cannot be trusted; empty when it can."""

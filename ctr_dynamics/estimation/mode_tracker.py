@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ctr_dynamics.estimation.step_output import Modes
 from ctr_dynamics.estimation.timeline import seconds
-from ctr_dynamics.estimation.vibration_modes import ModalBasis, lanes_of, modal_parts
+from ctr_dynamics.estimation.vibration_modes import ModalBasis, at_inputs, lanes_of, modal_parts
 from ctr_dynamics.kernels.structures import SweepBuffers
 from ctr_dynamics.model.mesh import Key
 from ctr_dynamics.model.mesh_interpolation import MeshInterpolation, mesh_interpolation
@@ -116,7 +116,7 @@ class ModeTracker:
             self._begin(state, parameters)
 
     def _begin(self, state: State, parameters: Floats) -> None:
-        now, layout = state.inputs, self.model.layout
+        now = state.inputs
         equilibrium = Statics(self.model, self.options.tolerance).solve(
             now.beta,
             now.alpha,
@@ -134,9 +134,7 @@ class ModeTracker:
             self._basis = replace(self._basis, rest=equilibrium.fields, inputs=inputs)
             self._reused += 1
             return
-        par = parameters.copy()
-        par[layout["alpha"]], par[layout["beta"]], par[layout["alpha_rate"]] = now.alpha, now.beta, 0.0
-        par[layout["force"]], par[layout["torque"]] = now.force, now.torque
+        par = at_inputs(self.model, parameters, now)
         on = equilibrium
         if self.coarse is not self.model:
             on = Statics(self.coarse, self.options.tolerance).solve(

@@ -94,6 +94,7 @@ class SolverStats(NamedTuple):
 
 
 NO_WORK = SolverStats(0, 0, "")
+NO_JACOBIAN = np.zeros((6, 0))
 
 
 class StepOutput(NamedTuple):
@@ -106,6 +107,7 @@ class StepOutput(NamedTuple):
         backbone: float32 (P, 15): s, x, y, z, qx, qy, qz, qw, vx, vy, vz, ux, uy, uz, sd.
         disturbance_force, disturbance_sigma (3,): N, base axes.
         beta: (n,) m, translations of the tubes; empty where they are not known.
+        jacobian: (6, 2N + 6) of the tip, position then rotation, by alpha, beta, force and torque at rest; (6, 0) before it is known.
     """
 
     stamp_ns: int
@@ -126,6 +128,7 @@ class StepOutput(NamedTuple):
     innovations: Sequence[Innovation] = ()
     solver: SolverStats = NO_WORK
     beta: Sequence[float] = ()
+    jacobian: Floats = NO_JACOBIAN
 
     @classmethod
     def invalid(cls, stamp_ns: int, k: int, reason: str, innovations: list[Innovation]) -> StepOutput:

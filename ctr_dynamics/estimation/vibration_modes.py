@@ -23,6 +23,7 @@ from ctr_dynamics.kernels.linearise import linearise
 from ctr_dynamics.kernels.output_rows import modal_coordinates
 from ctr_dynamics.kernels.rotations import matrix
 from ctr_dynamics.kernels.structures import Derivatives, FiniteDifferences, Solution, SweepBuffers
+from ctr_dynamics.kernels.tip_kinematics import tip_from_node
 from ctr_dynamics.model.model import Model
 from ctr_dynamics.model.simulator import Inputs
 from ctr_dynamics.model.statics import Equilibrium
@@ -142,12 +143,36 @@ def equilibrium_slope(
     model: Model, equilibrium: Equilibrium, par: Floats, buffers: SweepBuffers
 ) -> Floats | None:
     """d(equilibrium's fields)/d(alpha, beta, force, torque), (fields, 2N + 6); ``buffers``: of :func:`lanes_of` lanes."""
+    found = _static_response(model, equilibrium, par, buffers, _input_changes(model), np.zeros((0, 0)))
+    return None if found is None else found[0] / _input_scale(model.n)
+
+
+def tip_response(model: Model, equilibrium: Equilibrium, par: Floats, buffers: SweepBuffers) -> Floats | None:
+    """d(tip of the equilibrium)/d(alpha, beta, force, torque), (6, 2N + 6): position, then rotation about the base axes."""
+    found = _static_response(model, equilibrium, par, buffers, _input_changes(model), np.zeros((0, 0)))
+    if found is None:
+        return None
+    scale, size = _input_scale(model.n), equilibrium.nodes.shape[1]
+    columns = np.empty((12, len(scale)))
+    tip_from_node(equilibrium.nodes[-1], found[1][-size:], 0.0, np.empty(13), columns)
+    return np.asarray(columns[:6] / scale)
+
+
+def at_inputs(model: Model, parameters: Floats, now: Inputs) -> Floats:
+    """The parameter block (NP,) ``parameters`` with the actuators, standing, and the load of ``now``."""
+    par, layout = parameters.copy(), model.layout
+    par[layout["alpha"]], par[layout["beta"]], par[layout["alpha_rate"]] = now.alpha, now.beta, 0.0
+    par[layout["force"]], par[layout["torque"]] = now.force, now.torque
+    return par
+
+
+def _input_changes(model: Model) -> Floats:
+    """(NP, 2N + 6) changes of the parameter block by those of :func:`_input_scale`."""
     layout, scale = model.layout, _input_scale(model.n)
     rows = np.concatenate([layout.rows(name) for name in ("alpha", "beta", "force", "torque")])
     dpar = np.zeros((layout.size, len(rows)))
     dpar[rows, range(len(rows))] = scale
-    fields = _static_response(model, equilibrium, par, buffers, dpar, np.zeros((0, 0)))
-    return None if fields is None else fields / scale
+    return dpar
 
 
 def equilibrium_motion(
@@ -161,8 +186,8 @@ def equilibrium_motion(
     n, layout, scale = model.n, model.layout, _input_scale(model.n)
     dpar = np.zeros((layout.size, len(scale)))
     dpar[layout.rows("alpha_rate"), range(n)] = scale[:n]
-    fields = _static_response(model, equilibrium, par, buffers, dpar, slope * scale)
-    return None if fields is None else fields / scale
+    found = _static_response(model, equilibrium, par, buffers, dpar, slope * scale)
+    return None if found is None else found[0] / scale
 
 
 def _input_scale(n: int) -> Floats:
@@ -172,8 +197,9 @@ def _input_scale(n: int) -> Floats:
 
 def _static_response(
     model: Model, equilibrium: Equilibrium, par: Floats, buffers: SweepBuffers, dpar: Floats, rates: Floats
-) -> Floats | None:
-    """Fields (fields, k) by changes ``dpar`` (NP, k) of the parameters, where the fields' rates are ``rates`` (fields, k); empty for none."""
+) -> tuple[Floats, Floats] | None:
+    """Fields (fields, k) and node states (nodes * S, k) by changes ``dpar`` (NP, k) of the parameters, where the fields' rates are ``rates``
+    (fields, k); empty for none."""
     m, count = model.unknown_count, dpar.shape[1]
     lanes = lanes_of(model)
     main, base = len(buffers.history) // lanes.count, len(buffers.base_history) // lanes.count
@@ -183,7 +209,7 @@ def _static_response(
         rates if rates.size else np.zeros((main + base, count)), FiniteDifferences(1e-3, model.tangent_perturbation), buffers,
         Derivatives(np.zeros((m, m)), np.zeros((m, count)), fields, nodes),
     )  # fmt: skip
-    return fields if ok else None
+    return (fields, nodes) if ok else None
 
 
 class _InverseStep:

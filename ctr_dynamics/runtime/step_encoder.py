@@ -41,6 +41,14 @@ def mode_names(count: int) -> list[str]:
     return [*modes, *(f"{mode}.frequency_hz" for mode in modes), *(f"{mode}.damping_ratio" for mode in modes)]
 
 
+def jacobian_names(columns: int) -> list[str]:
+    """Names in the message of a Jacobian with that many columns, see the topic table."""
+    tubes = range(1, (columns - 6) // 2 + 1)
+    names = [f"tube{i}_{kind}" for kind in ("rotation", "translation") for i in tubes]
+    names += [f"{kind}_{axis}" for kind in ("force", "torque") for axis in "xyz"]
+    return [f"{row}.{column}" for row in topics.AXES for column in names]
+
+
 def innovation_entries(innovation: Innovation) -> dict[str, float]:
     """Named numbers of the innovation message; what is not finite is left out."""
     i = innovation
@@ -74,8 +82,8 @@ class StepEncoder:
         self.backbone_every = backbone_every
         self.hardware_id = hardware_id
         self._was: tuple[bool, bool] | None = None  # validity and alarm of the step before
-        # of a step: those that hold float64 numbers, filled together, by the number of modes; points by their number
-        self._numbers: dict[int, templates.Template] = {}
+        # of a step: those that hold float64 numbers, filled together, by the numbers of modes and of the Jacobian's columns; points by their number
+        self._numbers: dict[tuple[int, int], templates.Template] = {}
         self._clouds: dict[int, templates.Template] = {}
         self._paths: dict[int, templates.Template] = {}
         self._innovations: dict[tuple[str, ...], templates.Template] = {}
@@ -121,7 +129,7 @@ class StepEncoder:
         count = len(modes.frequency_hz)
         backbone = np.asarray(out.backbone)
         points = len(backbone)
-        template = self._template(count)
+        template = self._template(count, out.jacobian.shape[1])
         filled = template.fill(
             stamp,
             out.tip_position, out.tip_quaternion_wxyz[_XYZW], out.tip_covariance,
@@ -129,6 +137,7 @@ class StepEncoder:
             out.predicted_position, out.predicted_quaternion_wxyz[_XYZW],
             out.disturbance_force, _NO_TORQUE, out.disturbance_sigma,
             modes.amplitude, modes.frequency_hz, modes.damping, modes.rate, np.zeros(2 * count), modes.direction.T.ravel(),
+            out.jacobian,
         )  # fmt: skip
         messages = [Encoded(topic, stamp, data) for topic, data in zip(template.topics, filled, strict=True)]
         messages.append(Encoded(topics.BACKBONE_STATE, stamp, *self._cloud(points).fill(stamp, backbone)))
@@ -142,9 +151,10 @@ class StepEncoder:
                 messages.append(self._transforms.encode(out))
         return messages
 
-    def _template(self, count: int) -> templates.Template:
-        """Of the messages of numbers with ``count`` modes."""
-        if count not in self._numbers:
+    def _template(self, count: int, columns: int) -> templates.Template:
+        """Of the messages of numbers with ``count`` modes and a Jacobian of ``columns`` columns."""
+        key = count, columns
+        if key not in self._numbers:
             frame = self.frame_id
             layouts = [
                 templates.stamped_numbers(topics.TIP_POSE, frame, 43),
@@ -159,8 +169,14 @@ class StepEncoder:
                         topics.MODES, frame, mode_names(count), velocities=True, efforts=True
                     )
                 )
-            self._numbers[count] = templates.Template(*layouts)
-        return self._numbers[count]
+            if columns:
+                layouts.append(
+                    templates.joint_state(
+                        topics.TIP_JACOBIAN, frame, jacobian_names(columns), velocities=False
+                    )
+                )
+            self._numbers[key] = templates.Template(*layouts)
+        return self._numbers[key]
 
     def _cloud(self, points: int) -> templates.Template:
         if points not in self._clouds:

@@ -29,7 +29,6 @@ from ctr_dynamics.ros.topic_names import NAMESPACE, message_class
 
 sys.path.insert(0, str(Path(__file__).parent))
 from damper import DriveHistory, Estimate, Limits, ModalDamper, Tuning
-from offline import tip_jacobian
 
 COMMANDS = "/ctr/joint_commands"
 DEFAULTS = {
@@ -55,10 +54,13 @@ class ControllerNode(Node):
         self.values = values
         robot = load_robot(values["robot"])
         self._rest = np.array([robot.rest.alpha.value, robot.rest.beta.value])
-        self._jacobian = tip_jacobian(robot)
+        self._tubes = robot.n_tubes
+        self._turned: np.ndarray | None = (
+            None  # (3,) m/rad: motion of the static tip when all tubes turn together
+        )
         self._mode = int(values["mode"]) - 1
         self._damper = ModalDamper(
-            float(np.linalg.norm(self._jacobian)),  # until the first modes tell their directions
+            robot.tubes[0].length,  # no tip moves farther; each estimate brings its own authority
             1.0 / values["rate_hz"],
             Tuning(damping=values["damping"], latency_s=values["latency_s"], stale_s=values["stale_s"]),
             Limits(values["max_angle_rad"], values["max_rate_rad_s"], values["max_acceleration_rad_s2"]),
@@ -74,13 +76,12 @@ class ControllerNode(Node):
                 JointState, topics.JOINT_STATES, self._joints, qos.profile("best_effort", 50), raw=True
             ),
             self.create_subscription(twist, topics.TIP_TWIST, self._twist, profile),
+            self.create_subscription(JointState, topics.TIP_JACOBIAN, self._jacobian, profile, raw=True),
             self.create_subscription(JointState, topics.MODES, self._modes, profile, raw=True),
             self.create_subscription(Bool, topics.VALID, self._valid, profile),
         ]
         self._timer = self.create_timer(1.0 / values["rate_hz"], self._tick)
-        self.get_logger().info(
-            f"turning all tubes moves the tip by {np.round(1e3 * self._jacobian, 1)} mm/rad; damping mode {self._mode + 1}"
-        )
+        self.get_logger().info(f"damping mode {self._mode + 1} by turning all tubes")
 
     @property
     def counts(self) -> dict[str, int]:
@@ -100,6 +101,12 @@ class ControllerNode(Node):
         """Covariance of the tip's velocity; it comes before the modes of the same step."""
         self._rate_covariance = np.reshape(message.twist.covariance, (6, 6))[:3, :3]
 
+    def _jacobian(self, data: bytes) -> None:
+        """The tip's Jacobian, row by row: x, y and z by the rotations of all tubes, and more. It changes by little from step to step."""
+        message = decode_joint_state(data)
+        rows = np.reshape(message.positions, (6, -1))
+        self._turned = rows[:3, : self._tubes].sum(axis=1)
+
     def _modes(self, data: bytes) -> None:
         message = decode_modes(data)
         if message is None:
@@ -107,7 +114,7 @@ class ControllerNode(Node):
             return
         t, count, position, velocity, direction = message
         drive = self._drives.at(t)
-        if self._mode >= count or self._rate_covariance is None:
+        if self._mode >= count or self._rate_covariance is None or self._turned is None:
             self._reject("no mode")
             return
         if drive is None:
@@ -124,7 +131,7 @@ class ControllerNode(Node):
                 position[2 * count + m],
                 math.sqrt(max(float(along @ self._rate_covariance @ along), 0.0)),
                 *drive,
-                authority=float(along @ self._jacobian),
+                authority=float(along @ self._turned),
             )
         )
 

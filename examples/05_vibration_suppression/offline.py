@@ -1,6 +1,6 @@
 """The loop without ROS and without a clock: plant, estimator and damper in one thread, every delay as it would be.
 
-    python examples/05_vibration_suppression/offline.py
+    python examples/05_vibration_suppression/offline.py [ROBOT]
 
 prints the settling times with and without control. The nodes of this folder do the same over DDS.
 """
@@ -12,13 +12,10 @@ from collections import deque
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ctr_dynamics.estimation.estimator import Estimator
 from ctr_dynamics.io.messages import topics
 from ctr_dynamics.io.messages.cdr import decode_joint_state, decode_pose_stamped, decode_wrench_stamped
-from ctr_dynamics.model.model import Model
-from ctr_dynamics.model.statics import Statics
 from ctr_dynamics.parameters import Settings
 from ctr_dynamics.robot import Robot
 from ctr_dynamics.robot_files import load_robot
@@ -29,15 +26,6 @@ from simulated_robot import Hardware, SimulatedRobot, settling_time
 
 START_NS = 1_700_000_000_000_000_000
 ESTIMATOR_LATENCY_S = 0.006  # from a step's stamp to its message in the controller's hands
-
-
-def tip_jacobian(robot: Robot) -> NDArray[np.float64]:
-    """(3,) m/rad: motion of the static tip when all tubes are turned together from their rest position."""
-    statics = Statics(Model(robot, nodes=24))
-    beta, alpha = np.array(robot.rest.beta.value), np.array(robot.rest.alpha.value)
-    step = 1e-3
-    ahead, behind = (statics.solve(beta, alpha + sign * step).tip_position for sign in (1, -1))
-    return (ahead - behind) / (2 * step)
 
 
 def run(
@@ -54,8 +42,8 @@ def run(
     """Release the weight and let the loop run; returns the plant with its truth."""
     plant = SimulatedRobot(robot, START_NS, hardware)
     estimator = Estimator(robot, Settings({"output.policy": "predict"}))
-    jacobian = tip_jacobian(robot)
-    damper, drives = ModalDamper(float(np.linalg.norm(jacobian)), period_s, tuning, limits), DriveHistory()
+    # no tip moves farther than the robot is long; each estimate brings its own authority
+    damper, drives = ModalDamper(robot.tubes[0].length, period_s, tuning, limits), DriveHistory()
     on_the_way: deque[tuple[float, Estimate | None]] = deque()
     next_command = 0.0
     while plant.t < seconds:
@@ -76,13 +64,15 @@ def run(
             t = (out.stamp_ns - START_NS) * 1e-9
             drive = drives.at(t)
             estimate = None
-            if out.valid and drive is not None and len(out.modes.frequency_hz) > mode:
+            known = out.jacobian.size and len(out.modes.frequency_hz) > mode
+            if out.valid and drive is not None and known:
+                turned = out.jacobian[:3, : robot.n_tubes].sum(axis=1)  # m/rad, all tubes together
                 along = out.modes.direction[mode]
                 estimate = Estimate(
                     t, float(out.modes.amplitude[mode]), float(out.modes.rate[mode]),
                     2 * np.pi * float(out.modes.frequency_hz[mode]), float(out.modes.damping[mode]),
                     float(np.sqrt(along @ out.tip_velocity_covariance[:3, :3] @ along)), *drive,
-                    authority=float(along @ jacobian),
+                    authority=float(along @ turned),
                 )  # fmt: skip
             on_the_way.append((plant.t + ESTIMATOR_LATENCY_S, estimate))
             estimator.do_idle_work()  # as a node does between its steps; the modes are found there
@@ -98,7 +88,7 @@ def run(
 
 
 def main() -> None:
-    robot = load_robot("till2020_tissue")
+    robot = load_robot(sys.argv[1] if len(sys.argv) > 1 else "till2020_tissue")
     for label, control in (("without control", False), ("with control", True)):
         plant = run(robot, 6.0, control=control)
         settled = settling_time(plant.truth, plant.hardware.release_s, 0.003)

@@ -12,7 +12,7 @@ import pytest
 
 from ctr_dynamics.io.messages import topics
 from ctr_dynamics.io.messages.schemas import typestore
-from ctr_dynamics.runtime.step_encoder import innovation_entries, mode_names
+from ctr_dynamics.runtime.step_encoder import innovation_entries, jacobian_names, mode_names
 
 T0_NS = 1_700_000_000_000_000_000
 BAGS = Path(__file__).parents[1] / "data" / "bags"
@@ -68,6 +68,7 @@ def make_step(
         disturbance_sigma=rng.uniform(0.01, 0.1, 3),
         innovations=[make_innovation(rng, stamp_ns - 1_000_000)],
         solver=SimpleNamespace(iterations=5, sweeps=9, outcome="ok"),
+        jacobian=rng.normal(size=(6, 10)),
     )
     vars(out).update(changes)
     return out
@@ -197,6 +198,9 @@ class Reference:
                 [*out.modes.amplitude, *out.modes.frequency_hz, *out.modes.damping],
                 [*out.modes.rate, *[0.0] * (2 * count)],
                 efforts=out.modes.direction.T.ravel(),
+            ),
+            topics.TIP_JACOBIAN: self.joint_state(
+                t, jacobian_names(out.jacobian.shape[1]), out.jacobian.ravel()
             ),
             topics.INNOVATION: self.joint_state(innovation.stamp_ns, entries, list(entries.values())),
             topics.DISTURBANCE: self.wrench_stamped(t, out.disturbance_force, (0, 0, 0)),

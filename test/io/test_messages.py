@@ -112,6 +112,7 @@ def test_diagnostics_bytes(reference):
         ("disturbance_sigma", topics.DISTURBANCE_SIGMA),
         ("modes.rate", topics.MODES),
         ("modes.damping", topics.MODES),
+        ("jacobian", topics.TIP_JACOBIAN),
     ],
 )
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])

@@ -65,26 +65,29 @@ class ActuatorError:
             self._accelerations = stamps[-1], largest_acceleration(stamps, values)
         return np.hypot((0.5 * age**2) * self._accelerations[1], self._uncorrected)
 
+    def inflate(
+        self, covariance: Floats, position: Floats, length: float, time_ns: int, open_ns: int
+    ) -> float:
+        """Add to the ``covariance`` (12, 12) of the tip, in place, what is not known of the actuators; returns the 3-D deviation (m) of that.
 
-def add_actuator_error(
-    covariance: Floats, position: Floats, error: Floats, length: float, duration: float
-) -> float:
-    """Add to the ``covariance`` (12, 12) of the tip, in place, what the ``error`` (2 N,) of the actuators does to it; returns its 3-D deviation (m).
+        A rotation moves the tip at its distance from the axis, or half the robot's length where tubes turn against each other; a translation
+        moves it by as much.
 
-    A rotation moves the tip at its distance from the axis, or half the robot's length where tubes turn against each other; a translation moves it by
-    as much.
-
-    Args:
-        position: (3,) m, of the tip.
-        length: m, half of what stands out of the base.
-        duration: s, in which the error has come about.
-    """
-    n = len(error) // 2
-    arm = max(length, math.hypot(position[0], position[1]))
-    turned = float(error[:n] @ error[:n])
-    moved = arm**2 * turned + float(error[n:] @ error[n:])
-    for first, variance in ((0, moved), (3, turned)):
-        for i in range(first, first + 3):
-            covariance[i, i] += variance
-            covariance[6 + i, 6 + i] += variance * (2.0 / duration) ** 2
-    return math.sqrt(3.0 * moved)
+        Args:
+            position: (3,) m, of the tip.
+            length: m, of tube 1.
+            time_ns: of the step. open_ns: how long its input has been without correction.
+        """
+        error, joints = self.at(time_ns), self._joints
+        if not error.any():
+            return 0.0
+        n = joints.size // 2
+        arm = max(0.5 * (length + float(joints.values[-1][n])), math.hypot(position[0], position[1]))
+        turned = float(error[:n] @ error[:n])
+        moved = arm**2 * turned + float(error[n:] @ error[n:])
+        duration = max(time_ns - joints.stamps[-1], open_ns) * 1e-9
+        for first, variance in ((0, moved), (3, turned)):
+            for i in range(first, first + 3):
+                covariance[i, i] += variance
+                covariance[6 + i, 6 + i] += variance * (2.0 / duration) ** 2
+        return math.sqrt(3.0 * moved)

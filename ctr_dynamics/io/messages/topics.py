@@ -24,6 +24,7 @@ TIP_POSE_PREDICTED = "/ctr/estimator/tip_pose_predicted"
 BACKBONE = "/ctr/estimator/backbone"
 BACKBONE_STATE = "/ctr/estimator/backbone_state"
 MODES = "/ctr/estimator/modes"
+TIP_JACOBIAN = "/ctr/estimator/tip_jacobian"
 INNOVATION = "/ctr/estimator/innovation"
 DISTURBANCE = "/ctr/estimator/disturbance"
 DISTURBANCE_SIGMA = "/ctr/estimator/disturbance_sigma"
@@ -310,6 +311,38 @@ TOPICS: tuple[Topic, ...] = (
             "moves. With M = len(name) / 3 the controller's "
             "state is `position[:M]` and `velocity[:M]`.",
             "Not published before the first modes have been computed.",
+            _NOT_INVALID,
+        ),
+    ),
+    Topic(
+        TIP_JACOBIAN,
+        "sensor_msgs/msg/JointState",
+        "out",
+        OUTPUT_QOS,
+        PER_STEP,
+        "Static Jacobian of the tip against actuators, and its compliance, for a controller.",
+        (
+            _STAMP,
+            _FRAME,
+            Field(
+                "name",
+                "`ROW.COLUMN`, row by row. Rows: `x`, `y`, `z`, `rx`, `ry`, `rz` of the tip. Columns: `tube1_rotation`.., "
+                "`tube1_translation`.., then `force_x`.. and `torque_x`.. on the tip; 6 (2 N + 6) names for N tubes",
+            ),
+            Field(
+                "position",
+                "derivative of the row by the column: position in m and rotation in rad about the base axes, by rad, m, N and N m in base axes",
+                "m/rad, m/m, m/N, ...",
+            ),
+            Field("velocity", "empty"),
+            Field("effort", "empty"),
+        ),
+        (
+            "Read it with `numpy.reshape(msg.position, (6, -1))`: the first 2 N columns are the Jacobian at constant load, the last 6 the compliance "
+            "with the actuators held.",
+            "It belongs to the equilibrium of the fused model at the actuators and load of the stamp. It is computed every 0.1 s, and turns with "
+            "the mean of the tubes between two computations.",
+            "Not published before the first one has been computed.",
             _NOT_INVALID,
         ),
     ),
