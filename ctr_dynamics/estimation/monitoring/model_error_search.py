@@ -97,6 +97,7 @@ class ModelErrorSearch:
         """Forget all measurements."""
         self._evidence: deque[Evidence] = deque(maxlen=self.options.remembered)
         self._begin_ns = 0
+        self._compared: tuple[ModelErrorSize, Floats] | None = None
 
     def add(self, stamp_ns: int, residual: Floats, turn: Floats, foretold: tuple[float, float]) -> None:
         """Take in a measured tip that the filter has met; one of a stamp that is known takes its place.
@@ -108,6 +109,7 @@ class ModelErrorSearch:
         """
         while self._evidence and self._evidence[-1].stamp_ns >= stamp_ns:
             self._evidence.pop()  # its step is taken again
+        self._compared = None
         noise, square = self._noise**2, self.sizes**2
         angle = float(turn @ turn) / len(turn) if len(turn) else 0.0
         if not self._evidence:
@@ -149,7 +151,13 @@ class ModelErrorSearch:
         return float(self._weights(present).sum())
 
     def _weights(self, present: ModelErrorSize) -> Floats:
-        """(h,) probabilities of the hypotheses beside the filter: of those by which the tip departs farther, and at least as fast.
+        """(h,) probabilities of all hypotheses beside the filter that counts on ``present``."""
+        if self._compared is None or self._compared[0] is not present:
+            self._compared = present, self._compare(present)
+        return self._compared[1]
+
+    def _compare(self, present: ModelErrorSize) -> Floats:
+        """(h,) probabilities of the hypotheses by which the tip departs farther, and at least as fast; others have none.
 
         Only where their own correlation time has passed: how a vibration begins is no slow departure yet.
         """
@@ -182,5 +190,6 @@ class ModelErrorSearch:
     def begin_again(self) -> None:
         """The filter goes on from the open-loop run with the model error that was found, and foretells as well as that has done."""
         if self._evidence:
+            self._compared = None
             last = self._evidence.pop()
             self._evidence.append(last._replace(filter=float(max(last.filter, last.departures.max()))))
