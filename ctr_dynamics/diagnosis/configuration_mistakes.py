@@ -14,9 +14,11 @@ import numpy as np
 
 from ctr_dynamics.diagnosis.diagnosis_options import DiagnosisOptions, ForwardModelOptions
 from ctr_dynamics.diagnosis.forward_model import ForwardModel
+from ctr_dynamics.diagnosis.inference.step_choice import with_chosen_steps
 from ctr_dynamics.diagnosis.recording import Recording
 from ctr_dynamics.diagnosis.run_context import RunContext
-from ctr_dynamics.diagnosis.whitening import noise_floor
+from ctr_dynamics.diagnosis.time_steps import TimeSteps
+from ctr_dynamics.diagnosis.whitening import Whitener, noise_floor
 from ctr_dynamics.errors import InputError
 from ctr_dynamics.robot import Robot
 from ctr_dynamics.robot_files import robot_from_dict, robot_to_dict
@@ -115,13 +117,15 @@ MISTAKES: dict[str, Callable[[Recording, Robot], Pair]] = {
 }
 
 
-def misfit(recording: Recording, robot: Robot, resolution: ForwardModelOptions) -> float:
+def misfit(
+    recording: Recording, robot: Robot, resolution: ForwardModelOptions, steps: TimeSteps | None = None
+) -> float:
     """3-D rms in m of the measurement against the nominal model, infinity where it fails.
 
     Measured rotations count by the ratio of the noise of positions to theirs.
     """
     try:
-        forward_model = ForwardModel(recording, robot, resolution)
+        forward_model = ForwardModel(recording, robot, resolution, steps)
         prediction = forward_model.predict({})
     except InputError:
         return math.inf
@@ -145,10 +149,13 @@ def find_mistake(
     if before < o.gross * noise_floor(robot) * math.sqrt(2.0):
         return None
     context.report("gross misfit: trying mistakes of units, signs and orders")
+    used = np.isfinite(recording.position).all(axis=1)
+    whiten = Whitener(robot, recording.stamps, np.array(recording.axes), used)
+    steps = with_chosen_steps(ForwardModel(recording, robot, fine), whiten, {}, options.steps).steps
     after: dict[str, float] = {}
     for name, undo in MISTAKES.items():
         try:
-            after[name] = misfit(*undo(recording, robot), fine)
+            after[name] = misfit(*undo(recording, robot), fine, steps)
         except InputError:
             continue
     best = min(after, key=lambda name: after[name])

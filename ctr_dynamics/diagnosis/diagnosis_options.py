@@ -68,6 +68,18 @@ class ForwardModelOptions:
 
 
 @dataclass(frozen=True)
+class StepOptions:
+    """Steps in time: as long as the data can tell no difference."""
+
+    limit: float = option(
+        3.0,
+        "whitened",
+        "change of a prediction by longer steps; it is corrected where it is measured, and a tenth of it changes with the fit",
+    )
+    window: int = option(128, "shortest steps", "in which steps are even, and the longest of them")
+
+
+@dataclass(frozen=True)
 class ConfigurationOptions:
     """Configuration mistakes: units, signs and orders."""
 
@@ -86,6 +98,9 @@ class CalibrationOptions:
     )
     inflation: float = option(1.5, "of posterior deviations", "errors of tuning cases were that much larger")
     iterations: int = option(10, COUNT, "steps of a fit")
+    first_iterations: int = option(
+        2, COUNT, "of the first fit; what these leave beyond noise may be a matter of phases"
+    )
     renewals: int = option(2, COUNT, "exact Jacobians of a fit; Broyden's updates serve between them")
     settled: float = option(0.05, "cost", "what gains less is not worth a simulation")
     surprise: tuple[float, ...] = option(
@@ -327,6 +342,7 @@ class DiagnosisOptions:
 
     recording: RecordingOptions = RecordingOptions()
     forward_model: ForwardModelOptions = ForwardModelOptions()
+    steps: StepOptions = StepOptions()
     configuration: ConfigurationOptions = ConfigurationOptions()
     calibration: CalibrationOptions = CalibrationOptions()
     discretisation: DiscretisationOptions = DiscretisationOptions()

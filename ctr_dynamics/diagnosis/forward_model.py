@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from ctr_dynamics.diagnosis.diagnosis_options import ForwardModelOptions
 from ctr_dynamics.diagnosis.recording import Recording
+from ctr_dynamics.diagnosis.time_steps import TimeSteps
 from ctr_dynamics.effects import EFFECTS, EffectQuantity, Plant, apply_effects, make_plant
 from ctr_dynamics.errors import InputError
 from ctr_dynamics.kernels.kinds import SIMD_WIDTH
@@ -55,14 +56,19 @@ class ForwardModel:
 
     Args:
         options: resolution of the model.
+        steps: in time; None where all are those of the options.
     Attributes:
         models: without extended physics and with it. nominal: plant of the robot file.
     """
 
     def __init__(
-        self, recording: Recording, robot: Robot, options: ForwardModelOptions | None = None
+        self,
+        recording: Recording,
+        robot: Robot,
+        options: ForwardModelOptions | None = None,
+        steps: TimeSteps | None = None,
     ) -> None:
-        self.recording, self.robot = recording, robot
+        self.recording, self.robot, self.steps = recording, robot, steps
         self.options = options or ForwardModelOptions()
         nodes, dt = self.options.nodes, self.options.dt_s
         self.nodes = nodes
@@ -79,13 +85,36 @@ class ForwardModel:
         self._load_events = 1e-9 * np.array(discontinuities, dtype=float)
 
     def resolved(self, nodes: int, dt: float) -> ForwardModel:
-        """The same at another resolution."""
+        """The same at another resolution; longer steps change as ``dt`` (s), the shortest."""
         options = replace(self.options, nodes=nodes, dt_s=dt)
-        return self if options == self.options else ForwardModel(self.recording, self.robot, options)
+        if options == self.options:
+            return self
+        steps = None if self.steps is None else self.steps.scaled(dt / self.options.dt_s)
+        return ForwardModel(self.recording, self.robot, options, steps)
+
+    def with_steps(self, steps: TimeSteps | None) -> ForwardModel:
+        """The same with other steps in time."""
+        return self if steps == self.steps else ForwardModel(self.recording, self.robot, self.options, steps)
+
+    def with_least_step(self, dt: float) -> ForwardModel:
+        """The same with steps of ``dt`` (s) where they are shorter."""
+        if self.steps is None:
+            return self.resolved(self.nodes, max(dt, self.scheme.dt))
+        return self.with_steps(self.steps.at_least(dt))
+
+    @property
+    def shortest_step(self) -> float:
+        """s"""
+        return self.scheme.dt if self.steps is None else self.steps.shortest
+
+    @property
+    def longest_step(self) -> float:
+        """s"""
+        return self.scheme.dt if self.steps is None else self.steps.longest
 
     def until(self, end: float) -> ForwardModel:
         """The same up to ``end`` (s)."""
-        return ForwardModel(self.recording.until(end), self.robot, self.options)
+        return ForwardModel(self.recording.until(end), self.robot, self.options, self.steps)
 
     # -- the chain --
 
@@ -153,11 +182,12 @@ class ForwardModel:
         """The estimator's steps; where these cannot be taken to the end, as with friction of tens of times the usual, steps of one stage after the
         other, each with its own Jacobian."""
         rows, events = self.inputs(plant, extended), (self._load_events + plant.load_delay).tolist()
-        given = (plant.block, rows, self.recording.duration)
-        model = self.models[extended]
-        found = run_collocation(model, self.scheme, *given, events=events, **columns)
+        model, duration = self.models[extended], self.recording.duration
+        steps = duration if self.steps is None else self.steps.lengths(duration)
+        found = run_collocation(model, self.scheme, plant.block, rows, steps, events=events, **columns)
         if found.failure:
-            other = run(model, make_scheme(RESCUE, self.scheme.dt), *given, events=events, **columns)
+            scheme = make_scheme(RESCUE, self.shortest_step)
+            other = run(model, scheme, plant.block, rows, duration, events=events, **columns)
             if not other.failure:
                 return other
         return found
@@ -261,23 +291,18 @@ def moved(point: Point, quantity: EffectQuantity, fraction: float) -> dict[Key, 
 
 
 def at_times(values: Floats, t: Floats, times: Floats) -> Floats:
-    """Rows of ``values`` (K, c) on the even grid ``t`` at ``times``, by cubics through four neighbours; held outside."""
+    """Rows of ``values`` (K, c) at the rising ``t`` (K,) at ``times``, by cubics through four neighbours; held outside."""
     if len(t) < 4:  # a simulation that failed at once
         return np.repeat(values[-1:], len(times), axis=0)
-    dt = t[1] - t[0]
-    x = np.clip((times - t[0]) / dt, 0.0, len(t) - 1.0)
-    i = np.clip(np.floor(x).astype(int), 1, max(len(t) - 3, 1))
-    x = (x - i)[:, None]
-    weights = (
-        -x * (x - 1.0) * (x - 2.0) / 6.0,
-        (x + 1.0) * (x - 1.0) * (x - 2.0) / 2.0,
-        -(x + 1.0) * x * (x - 2.0) / 2.0,
-        (x + 1.0) * x * (x - 1.0) / 6.0,
-    )
-    last = len(t) - 1
+    x = np.clip(times, t[0], t[-1])
+    first = np.clip(np.searchsorted(t, x, side="right") - 2, 0, len(t) - 4)
+    knots = [t[first + k] for k in range(4)]
     out = np.zeros((len(times), values.shape[1]))
-    for k, w in enumerate(weights):
-        out += w * values[np.minimum(i + k - 1, last)]
+    for k, knot in enumerate(knots):
+        weight = np.ones(len(times))
+        for other in (knots[j] for j in range(4) if j != k):
+            weight *= (x - other) / (knot - other)
+        out += weight[:, None] * values[first + k]
     return out
 
 

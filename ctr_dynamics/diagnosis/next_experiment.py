@@ -19,6 +19,7 @@ from ctr_dynamics.diagnosis.inference.gaussian_posterior import prior_variance
 from ctr_dynamics.diagnosis.inference.map_fit import Fit
 from ctr_dynamics.diagnosis.inference.sensitivities import Sensitivities
 from ctr_dynamics.diagnosis.inference.separation import left_over, separation
+from ctr_dynamics.diagnosis.inference.step_choice import with_chosen_steps
 from ctr_dynamics.diagnosis.recording import Recording
 from ctr_dynamics.diagnosis.whitening import Whitener
 from ctr_dynamics.errors import InputError
@@ -103,14 +104,15 @@ def _separation_with(
     """Separation of a cause from its rival (``pair``) with the bags of ``problem`` and one of ``scenario`` together."""
     own, rival = pair
     recording = recording_of(scenario, problem.robot, problem.options.forward_model.fine_nodes)
+    mask = problem.whiteners[0].mask
+    whiten = Whitener(problem.robot, recording.stamps, mask, np.ones(len(recording.stamps), bool))
     forward_model = ForwardModel(recording, problem.robot, problem.forward_models[0].options)
+    forward_model = with_chosen_steps(forward_model, whiten, fit.point, problem.options.steps)
     rivals = [q for q in rival.quantities if q.key not in {x.key for x in fit.active}]
     point = {**fit.point, **dict(rival.start)}
     prediction, jacobian = forward_model.jacobian(point, (*fit.active, *rivals))
     if prediction.failure:
         return None
-    mask = problem.whiteners[0].mask
-    whiten = Whitener(problem.robot, recording.stamps, mask, np.ones(len(recording.stamps), bool))
     columns = whiten(jacobian)
     a = len(fit.active)
     old = fit.columns * [q.scale for q in fit.active]

@@ -21,6 +21,7 @@ from ctr_dynamics.diagnosis.inference.evidence import weigh_by_prediction, weigh
 from ctr_dynamics.diagnosis.inference.fit_problem import make_problem
 from ctr_dynamics.diagnosis.inference.fit_quality import is_wrong
 from ctr_dynamics.diagnosis.inference.hypothesis_search import search_hypotheses
+from ctr_dynamics.diagnosis.inference.step_choice import choose_steps
 from ctr_dynamics.diagnosis.inference.tolerance_evidence import tolerance_evidence
 from ctr_dynamics.diagnosis.recording import Recording, measured_axes
 from ctr_dynamics.diagnosis.run_context import RunContext
@@ -82,6 +83,8 @@ def diagnose_recordings(
             do="check the robot, the joints and the load with `ctr-dynamics info`",
         )
 
+    choose_steps(problem, {}, context)
+
     # calibration: nuisances inside tolerance, and the solver's own error
     recalibrated, result.numerics = calibrate(problem, context)
     result.recalibrated = result.extended = recalibrated
@@ -109,6 +112,7 @@ def diagnose_recordings(
     held_out = None
     if validation:
         held_out = problem.on(validation)
+        choose_steps(held_out, found.no_cause.fit.point, context)
         if any(not is_wrong(problem, e) for e in found.hypotheses):
             context.report("evidence of the validation bags")
             weigh_by_prediction(found, problem, held_out, context)

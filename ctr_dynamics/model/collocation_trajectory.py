@@ -288,7 +288,7 @@ def run_collocation(
     scheme: Collocation,
     parameters: Floats,
     inputs: InputRows,
-    duration: float,
+    duration: float | Floats,
     *,
     effect: Floats | None = None,
     input_effect: Callable[[Floats], Floats] | None = None,
@@ -296,9 +296,19 @@ def run_collocation(
     guess: Floats | None = None,
     events: Sequence[float] = (),
 ) -> Trajectory:
-    """Simulate from rest, as :func:`ctr_dynamics.model.trajectory.run` does with other schemes; arguments and errors are those."""
-    dt, stages = scheme.dt, scheme.stages
-    steps = int(np.floor(duration / dt + 1e-9))
+    """Simulate from rest, as :func:`ctr_dynamics.model.trajectory.run` does with other schemes; arguments and errors are those.
+
+    Args:
+        duration: s, or the lengths (K,) s of all steps where these are not that of the scheme.
+    """
+    if isinstance(duration, np.ndarray):
+        steps, lengths, t = len(duration), duration, np.concatenate([[0.0], np.cumsum(duration)])
+    else:
+        steps = int(np.floor(duration / scheme.dt + 1e-9))
+        lengths, t = np.full(steps, scheme.dt), scheme.dt * np.arange(steps + 1.0)
+    schemes = {float(h): scheme if h == scheme.dt else scheme.parted(float(h)) for h in np.unique(lengths)}
+    other = np.append(np.flatnonzero(np.diff(lengths)) + 1, steps)  # first step of another length
+    stages = scheme.stages
     columns: _Columns | None = None
     out: Floats | None = None
     if effect is not None:
@@ -309,18 +319,21 @@ def run_collocation(
     tip[0] = this.tip
     if out is not None and this.columns is not None:
         out[0] = this.columns.tip
-    divided = sorted({int(np.floor(event / dt)) for event in events})
+    divided = sorted({int(np.searchsorted(t, event, side="right")) - 1 for event in events})
     k, failure, hard = 0, "", 0
     while k < steps:
+        dt = float(lengths[k])
+        used = schemes[dt]
+        this.state.usable &= not k or lengths[k - 1] == dt  # a Jacobian is of one step length
         plain = min((step - k for step in divided if step >= k), default=CHUNK)  # steps that are not divided
-        count = min(CHUNK, steps - k)
-        at = (np.arange(k, k + count)[:, None] + scheme.times) * dt
+        count = min(CHUNK, int(other[np.searchsorted(other, k, side="right")]) - k)
+        at = t[k : k + count, None] + scheme.times * dt
         rows = inputs(at.ravel()).reshape(count, stages, -1)
         usable = min(plain, this.serving(rows))
         taken = 0
         if usable:
             dtips = None if out is None else out[k + 1 : k + 1 + usable]
-            taken = this.fast(scheme, at[:usable], rows[:usable], tip[k + 1 : k + 1 + usable], dtips)
+            taken = this.fast(used, at[:usable], rows[:usable], tip[k + 1 : k + 1 + usable], dtips)
             if out is not None and this.columns is not None:
                 lost = steps_with_meaning(out[k + 1 : k + 1 + taken])
                 if lost < taken:
@@ -330,15 +343,16 @@ def run_collocation(
         if taken == count:
             continue
         hard += taken < usable
+        begin_of_step = float(t[k])
         if hard > PATIENCE:
-            failure = f"step at {k * dt:.4f} s: more than {PATIENCE} steps did not converge at once"
+            failure = f"step at {begin_of_step:.4f} s: more than {PATIENCE} steps did not converge at once"
             break
-        times = this.simulator.divisions(k * dt, events)
+        times = this.simulator.divisions(begin_of_step, events, dt)
         whole = len(times) == 2
         for begin, end in pairwise(times):
-            this.state.usable &= whole  # the Jacobian is of another step length
-            if not this.piece(begin, scheme if whole else scheme.parted(end - begin), HALVINGS):
-                failure = f"step at {k * dt:.4f} s failed: {this.reason}"
+            this.state.usable &= whole
+            if not this.piece(begin, used if whole else scheme.parted(end - begin), HALVINGS):
+                failure = f"step at {begin_of_step:.4f} s failed: {this.reason}"
                 break
             if not whole:
                 this.state.forget_history()  # the inputs jump or bend here
@@ -349,4 +363,4 @@ def run_collocation(
         if out is not None and this.columns is not None:
             out[k + 1] = this.columns.tip
         k += 1
-    return Trajectory.of_steps(k, dt, tip, out, failure, this.sweeps)
+    return Trajectory.of_steps(k, t, tip, out, failure, this.sweeps)

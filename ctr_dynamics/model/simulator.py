@@ -165,9 +165,10 @@ class Simulator:
                 return StepResult(True, how, totals[0], totals[1], totals[2], count, tuple(records))
         return StepResult(False, result.reason, totals[0], totals[1], totals[2])
 
-    def divisions(self, t: float, events: Sequence[float]) -> list[float]:
-        """Where the step from t (s) begins, those of the ``events`` (s) at which it is divided, and where it ends."""
-        dt = self.scheme.dt
+    def divisions(self, t: float, events: Sequence[float], dt: float | None = None) -> list[float]:
+        """Where the step of ``dt`` (s; None for that of the scheme) from t (s) begins, those of the ``events`` (s) at which it is divided, and where
+        it ends."""
+        dt = self.scheme.dt if dt is None else dt
         least = SHORTEST_PART * dt
         times = [t]
         for event in sorted(events) if self.scheme.one_step else ():

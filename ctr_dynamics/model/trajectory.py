@@ -63,12 +63,11 @@ class Trajectory:
 
     @classmethod
     def of_steps(
-        cls, taken: int, dt: float, tip: Floats, columns: Floats | None, failure: str, sweeps: int
+        cls, taken: int, t: Floats, tip: Floats, columns: Floats | None, failure: str, sweeps: int
     ) -> Trajectory:
-        """The first ``taken`` steps of ``dt`` (s), of which the arrays have room for more."""
+        """The first ``taken`` steps between the times ``t`` (s); the arrays have room for more."""
         done = taken + 1
-        t = dt * np.arange(done, dtype=np.float64)
-        return cls(t, tip[:done], None if columns is None else columns[:done], failure, sweeps)
+        return cls(t[:done], tip[:done], None if columns is None else columns[:done], failure, sweeps)
 
 
 class ColumnEffects:
@@ -303,7 +302,7 @@ def run(
                     out[k + 1] = columns.tip
             tip[k + 1] = state.nodes[-1, :TIP_ROWS]
             k += 1
-    return Trajectory.of_steps(k, dt, tip, out, failure, sweeps)
+    return Trajectory.of_steps(k, dt * np.arange(steps + 1.0), tip, out, failure, sweeps)
 
 
 def steps_with_meaning(columns: Floats) -> int:

@@ -25,7 +25,7 @@ class Vibration:
         self.truth, self.nuisances, self.numerics = truth, nuisances, np.zeros((500, 0))
         self.steps = []
 
-    def with_step(self, dt):
+    def with_least_step(self, dt):
         self.steps.append(dt)
         return self
 

@@ -65,7 +65,7 @@ def test_what_impacts_leave_is_measured_against_the_error_in_time(hit, known):
     contact = tuple(q for q in known.values() if q.effect == "contact")
     candidate = Candidate("contact", contact)
     residual = problem.residual(point)
-    finer = problem.with_step(0.5 * problem.forward_models[0].scheme.dt).residual(point)
+    finer = problem.finer.residual(point)
     error = float((finer - residual) @ (finer - residual))
     some = fit(problem, (), {}, iterations=1)
     assert some is not None

@@ -93,7 +93,7 @@ def test_nuisances_stay_near_their_tolerances_unless_they_may_go_far(recording, 
 
 
 def test_a_frequency_is_found_by_growing_parts(recording, robot, known, monkeypatch):
-    """A first fit that has stopped at a wrong minimum is replaced, and one to noise is left as it is."""
+    """A first fit that has stopped at a wrong minimum is replaced, and one to noise is left as it is. What grows no further goes on from the first."""
     mass = known["payload_mass", "added_kg"]
     problem = make_problem(robot, [recording], [replace(mass, tolerance=mass.scale)], np.ones(6, bool))
     stopped, right = fit(problem, (), {}, iterations=0), fit(problem, (), {})
@@ -102,4 +102,7 @@ def test_a_frequency_is_found_by_growing_parts(recording, robot, known, monkeypa
     assert found.cost == pytest.approx(right.cost, abs=0.5)
     assert _from_growing_spans(problem, right, RunContext(workers=1)) is right
     monkeypatch.setattr(calibration, "is_acceptable", lambda *_: False)
-    assert _from_growing_spans(problem, stopped, RunContext(workers=1)) is stopped
+    monkeypatch.setattr(problem.__class__, "until", lambda *_: problem.on([recording]))
+    on = _from_growing_spans(problem, stopped, RunContext(workers=1))
+    straight = fit(problem, (), stopped.point, polish=False)
+    np.testing.assert_array_equal(on.values, straight.values)

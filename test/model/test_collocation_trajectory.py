@@ -22,10 +22,12 @@ PARTS = {
 }
 
 
-def follow(model, slide=0.0, parameters=None, shift=None, events=EVENTS, tolerance=1e-8, **columns):
+def follow(
+    model, slide=0.0, parameters=None, shift=None, events=EVENTS, tolerance=1e-8, duration=DURATION, **columns
+):
     parameters = model.parameters if parameters is None else parameters
     found = run_collocation(
-        model, collocation(DT), parameters, inputs_of(model, slide, shift), DURATION, tolerance=tolerance, events=events, **columns
+        model, collocation(DT), parameters, inputs_of(model, slide, shift), duration, tolerance=tolerance, events=events, **columns
     )  # fmt: skip
     assert not found.failure
     return found
@@ -129,6 +131,23 @@ def test_steps_are_divided_at_events():
     }
     assert error[EVENTS] < 1e-6
     assert error[EVENTS] < 0.2 * error[()]
+
+
+def test_steps_of_several_lengths_keep_the_tip_and_its_columns():
+    """Twice the length before the load falls off and half of it behind, in steps that the load divides or not."""
+    model = Model(ROBOT, nodes=12)
+    unit = 0.02 * model.parameters[model.layout["bending_stiffness"]][0]
+    effect = np.zeros((model.layout.size, 1))
+    effect[model.layout["bending_stiffness"].start] = unit
+    even = follow(model, slide=0.03, effect=effect)
+    lengths = np.concatenate([np.full(15, 2.0 * DT), np.full(140, 0.5 * DT)])
+    found = follow(model, slide=0.03, effect=effect, duration=lengths)
+    np.testing.assert_allclose(found.t, np.concatenate([[0.0], np.cumsum(lengths)]), atol=1e-12)
+    assert found.t[-1] == pytest.approx(DURATION)
+    for one, other in ((slice(None, 16), slice(0, 31, 2)), (slice(15, None, 2), slice(30, None))):
+        assert np.abs(found.tip[one, :3] - even.tip[other, :3]).max() < 1e-5
+        error = np.abs(found.columns[one, :3] - even.columns[other, :3])
+        assert error.max() < 0.01 * np.abs(even.columns[:, :3]).max()
 
 
 @pytest.mark.parametrize("refused", [1, 1000], ids=["a step is halved", "a step is rescued"])

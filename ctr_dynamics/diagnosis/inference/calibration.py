@@ -10,6 +10,7 @@ from ctr_dynamics.diagnosis.inference.discretisation_error import correct_discre
 from ctr_dynamics.diagnosis.inference.fit_problem import Local, Problem
 from ctr_dynamics.diagnosis.inference.fit_quality import excess, is_acceptable
 from ctr_dynamics.diagnosis.inference.map_fit import Fit, fit
+from ctr_dynamics.diagnosis.inference.step_choice import choose_steps
 from ctr_dynamics.diagnosis.run_context import RunContext
 from ctr_dynamics.effects import EFFECTS, EffectQuantity, effect_quantities
 from ctr_dynamics.errors import InputError
@@ -29,7 +30,7 @@ def calibrate(problem: Problem, context: RunContext) -> tuple[Fit, dict[str, flo
         InputError: no simulation succeeds.
     """
     context.report("re-calibration inside tolerance")
-    first = fit(problem, (), {}, polish=False)
+    first = fit(problem, (), {}, iterations=problem.options.calibration.first_iterations, polish=False)
     if first is not None:
         first = _from_growing_spans(problem, first, context)
     if first is None:
@@ -37,6 +38,7 @@ def calibrate(problem: Problem, context: RunContext) -> tuple[Fit, dict[str, flo
             "the model cannot be simulated near the nominal robot", do="check the robot file and the bag"
         )
     context.report("discretisation error")
+    choose_steps(problem, first.point, context)
     before = problem.forward_models[0].options
     numerics = correct_discretisation(problem, first.point, context)
     here = problem.residual(first.point)
@@ -51,8 +53,9 @@ def calibrate(problem: Problem, context: RunContext) -> tuple[Fit, dict[str, flo
     return again, numerics
 
 
-def _from_growing_spans(problem: Problem, first: Fit, context: RunContext) -> Fit:
-    """``first``, or a better fit that begins with the first part of the recordings and goes on to more and more of them.
+def _from_growing_spans(problem: Problem, first: Fit, context: RunContext) -> Fit | None:
+    """The fit to which the first steps of ``first`` lead, or a better one that begins with the first part of the recordings and goes on to more and
+    more of them.
 
     A frequency that is a little off is out of phase by turns after seconds, and a fit to all of them at once may stop at any of the minima between.
     """
@@ -61,14 +64,18 @@ def _from_growing_spans(problem: Problem, first: Fit, context: RunContext) -> Fi
         return first
     context.report("re-calibration of growing parts")
     point: dict[Key, float] = {}
+    found: Fit | None
     for part in o.parts_of_recording:
-        models = problem.forward_models
-        shorter = problem.on([m.recording.until(part * m.recording.duration) for m in models])
+        shorter = problem.until([part * m.recording.duration for m in problem.forward_models])
         if shorter.size == 0:
             continue
         found = fit(shorter, (), point, polish=False)
         if found is None or not is_acceptable(shorter, found):  # what is left is no matter of phases
-            return first
+            break
         point = found.point
-    other = fit(problem, (), point, polish=False, limit=first.cost)
-    return first if other is None or other.cost > first.cost else other
+    else:
+        found = fit(problem, (), point, polish=False, limit=first.cost)
+        if found is not None and is_acceptable(problem, found):
+            return found
+        first = first if found is None or found.cost > first.cost else found
+    return fit(problem, (), first.point, polish=False) or first

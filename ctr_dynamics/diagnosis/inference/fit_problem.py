@@ -54,14 +54,26 @@ class Problem:
         """Number of whitened values."""
         return sum(w.size for w in self.whiteners)
 
-    def with_step(self, dt: float) -> Problem:
-        """The same with another time step (s)."""
-        return replace(self, forward_models=[e.resolved(e.nodes, dt) for e in self.forward_models])
+    def with_least_step(self, dt: float) -> Problem:
+        """The same with time steps of ``dt`` (s) where they are shorter."""
+        return replace(self, forward_models=[e.with_least_step(dt) for e in self.forward_models])
 
     @property
     def finer(self) -> Problem:
-        """The same with half the time step."""
-        return self.with_step(0.5 * self.forward_models[0].scheme.dt)
+        """The same with half of every time step."""
+        models = [e.resolved(e.nodes, 0.5 * e.scheme.dt) for e in self.forward_models]
+        return replace(self, forward_models=models)
+
+    @property
+    def even(self) -> Problem:
+        """The same with the shortest time step all the time."""
+        return replace(self, forward_models=[e.with_steps(None) for e in self.forward_models])
+
+    def until(self, ends: Sequence[float]) -> Problem:
+        """The same up to the time (s) in ``ends`` of each recording, with its time steps and before any correction."""
+        shorter = self.on([e.recording.until(end) for e, end in zip(self.forward_models, ends, strict=True)])
+        pairs = zip(shorter.forward_models, self.forward_models, strict=True)
+        return replace(shorter, forward_models=[e.with_steps(whole.steps) for e, whole in pairs])
 
     def on(self, recordings: Sequence[Recording]) -> Problem:
         """The same robot, nuisances, axes and resolution on other recordings, before any correction."""

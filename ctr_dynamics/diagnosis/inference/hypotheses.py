@@ -66,7 +66,9 @@ class Hypothesis:
 
 
 def with_form(problem: Problem, members: Sequence[Candidate]) -> Problem:
-    """``problem`` with the nuisances of the model's form that are free beside ``members``."""
+    """``problem`` as ``members`` need it: with the nuisances of the model's form that are free beside them, and short steps for impacts."""
+    if any(EFFECTS[c.effect].impacts for c in members):
+        problem = problem.even
     names = {name for c in members for name in EFFECTS[c.effect].form}
     if not names:
         return problem
@@ -141,7 +143,7 @@ def best_size_nearby(problem: Problem, point: Mapping[Key, float], q: EffectQuan
     them would settle in the wrong place.
     """
     o = problem.options.search
-    coarse = problem.with_step(problem.options.screening.finite_size_dt_s)
+    coarse = problem.with_least_step(problem.options.screening.finite_size_dt_s)
     departure = point[q.key] - q.off
 
     def left(factor: float) -> float:

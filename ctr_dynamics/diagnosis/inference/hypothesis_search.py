@@ -7,7 +7,6 @@ the search in ten sentences; :mod:`~ctr_dynamics.diagnosis.inference.search_move
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import replace
 
 from ctr_dynamics.diagnosis.inference.candidates import Candidate
@@ -83,7 +82,9 @@ def search_once(
     no_cause = Hypothesis((), recalibrated)
     state = SearchState(problem, pool, recalibrated, context, [no_cause])
     context.report("sensitivities of all candidates")
-    here = sensitivities_at(problem, recalibrated.point, pool, context)
+    near = recalibrated.travelled <= problem.options.calibration.travelled
+    known = recalibrated.by_key if near else {}
+    here = sensitivities_at(problem, recalibrated.point, pool, context, known=known)
     if here is None:
         return None
     screened = screen(problem, here, recalibrated, (), pool)
@@ -117,7 +118,7 @@ def search_early(problem: Problem, pool: list[Candidate], context: RunContext) -
     begins = [begin for begin in times if begin is not None]
     if len(begins) < len(times):
         return []
-    short = _until(problem, begins, o.early_s)
+    short = problem.even.until([begin + o.early_s for begin in begins])
     start = fit(short, (), {}, polish=False)
     if start is None:
         return []
@@ -130,19 +131,13 @@ def search_early(problem: Problem, pool: list[Candidate], context: RunContext) -
             continue
         context.report(f"longer spans with {', '.join(e.effects)}")
         result: Fit | None = e.fit
-        for whole in (*(_until(problem, begins, span) for span in o.early_spans_s), problem):
+        longer = [problem.even.until([begin + span for begin in begins]) for span in o.early_spans_s]
+        for whole in (*longer, problem):
             if result is not None:
                 result = fit(with_form(whole, e.members), e.fit.causes, result.point)
         if result is not None:
             out.append(Hypothesis(e.members, result, exact=True))
     return out
-
-
-def _until(problem: Problem, begins: Sequence[float], span: float) -> Problem:
-    """``problem`` up to ``span`` (s) after the time ``begins`` of each recording."""
-    return problem.on(
-        [e.recording.until(begin + span) for e, begin in zip(problem.forward_models, begins, strict=True)]
-    )
 
 
 def _with_hypotheses(

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,6 +43,7 @@ class Fit:
         columns: (m, a) derivatives of the prediction by the coordinates.
         cost: twice the negative log posterior density, tolerances limited.
         inflation: of the posterior deviations, for what no model has (docs/diagnosis.md).
+        travelled: sum of the whitened errors of predictions since ``columns`` were computed exactly.
     """
 
     causes: tuple[EffectQuantity, ...]
@@ -56,6 +57,7 @@ class Fit:
     columns: Floats
     cost: float
     inflation: float
+    travelled: float = 0.0
 
     @property
     def sigma(self) -> Floats:
@@ -277,7 +279,8 @@ class GaussNewton:
 
     def result(self) -> Fit:
         """The fit that was reached."""
-        return fit_at(self.problem, self.causes, self.active, self.values, self.residual, self.columns)
+        found = fit_at(self.problem, self.causes, self.active, self.values, self.residual, self.columns)
+        return replace(found, travelled=self.travelled)
 
 
 def fit_at(
@@ -317,6 +320,7 @@ def fit_at(
 
 def corrected(problem: Problem, result: Fit, change: Floats) -> Fit:
     """``result`` after ``problem.offset`` has changed by ``change`` (m,), where it stood."""
-    return fit_at(
+    found = fit_at(
         problem, result.causes, result.active, result.values, result.residual - change, result.columns
     )
+    return replace(found, travelled=result.travelled)

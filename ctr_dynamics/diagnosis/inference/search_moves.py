@@ -132,7 +132,7 @@ def try_large_sizes(
     problem = state.problem
     state.context.report("large sizes, and a contact plane")
     if not any(c.sizes for c in state.pool):
-        plane = find_contact_plane(problem, effect_quantities(problem.robot), state.context)
+        plane = find_contact_plane(problem.even, effect_quantities(problem.robot), state.context)
         state.pool = [*state.pool, *([plane] if plane else [])]
     here = with_large_sizes(problem, here, state.pool, state.context)
     again = screen(problem, here, state.recalibrated, (), state.pool)

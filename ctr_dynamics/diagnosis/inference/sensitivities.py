@@ -81,18 +81,20 @@ def sensitivities_at(
     pool: Sequence[Candidate],
     context: RunContext,
     *,
+    known: Mapping[Key, Floats] | None = None,
     again: Fit | None = None,
 ) -> Sensitivities | None:
     """Columns of nuisances and all candidates at ``point``.
 
     Args:
+        known: columns of nuisances there, where they have been computed already.
         again: the fit whose ``point`` it is, when sensitivities are only compared with it: its columns serve, and one finite size of
             each candidate that needs such.
     Returns:
         None where the model cannot be simulated at ``point``.
     """
     plain, shaped, finite = _by_kind(problem, pool)
-    known = again.by_key if again else {}
+    known = again.by_key if again else dict(known or {})
     wanted = tuple(q for key, q in plain.items() if key not in known)
     groups = _compatible(shaped)
     at, members = groups[0] if groups else ({}, [])
@@ -111,7 +113,7 @@ def sensitivities_at(
         sizes = [Size(c, _finite_sizes(c)[0], {}) for c in finite]
         jobs += _residual_jobs(problem, point, sizes)
     else:
-        coarse = problem.with_step(problem.options.screening.finite_size_dt_s)
+        coarse = problem.with_least_step(problem.options.screening.finite_size_dt_s)
         places = _nuisance_places(problem, point)
         sizes = [Size(c, size, beside) for beside in places for c in finite for size in _finite_sizes(c)]
         jobs += [*_residual_jobs(coarse, point, sizes), delayed(coarse.residual)(point)]
@@ -150,7 +152,7 @@ def with_large_sizes(
         for c in pool
         for size in (_finite_sizes(c) if c in new else EFFECTS[c.effect].large_sizes)
     ]
-    coarse = problem.with_step(problem.options.screening.finite_size_dt_s)
+    coarse = problem.with_least_step(problem.options.screening.finite_size_dt_s)
     found = _trials(known, sizes, context.run(_residual_jobs(coarse, known.point, sizes)))
     trials = {c: known.trials.get(c, []) + found.get(c, []) for c in (*known.trials, *found)}
     result = replace(known, by_candidate=dict(known.by_candidate), trials=trials)

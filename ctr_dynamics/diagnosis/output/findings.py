@@ -126,7 +126,8 @@ def findings(diagnosis: Diagnosis, command: str, experiment: dict[str, Any] | No
             ],
             "parameters": {
                 "nodes": problem.forward_models[0].nodes,
-                "dt_s": problem.forward_models[0].scheme.dt,
+                "dt_s": min(e.shortest_step for e in problem.forward_models),
+                "longest_dt_s": max(e.longest_step for e in problem.forward_models),
             }
             if problem
             else {},
