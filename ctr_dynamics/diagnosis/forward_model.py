@@ -12,10 +12,12 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from joblib import delayed
 from numpy.typing import NDArray
 
 from ctr_dynamics.diagnosis.diagnosis_options import ForwardModelOptions
 from ctr_dynamics.diagnosis.recording import Recording
+from ctr_dynamics.diagnosis.run_context import count_workers, run_jobs
 from ctr_dynamics.diagnosis.time_steps import TimeSteps
 from ctr_dynamics.effects import EFFECTS, EffectQuantity, Plant, apply_effects, make_plant
 from ctr_dynamics.errors import InputError
@@ -31,6 +33,7 @@ from ctr_dynamics.sensing.interpolation import Signal
 from ctr_dynamics.sensing.tracker import free_axis, pose_differences
 
 Floats = NDArray[np.float64]
+MANY = 8  # columns from which two simulations are worth the second one's run
 Key = tuple[str, str]
 """Effect and name of a quantity."""
 Point = Mapping[Key, float]
@@ -208,8 +211,13 @@ class ForwardModel:
             return None
         return None if prediction.failure else self.residual(prediction)
 
-    def jacobian(self, point: Point, wanted: Sequence[EffectQuantity]) -> tuple[Prediction, Floats]:
-        """Prediction at ``point`` and its derivatives (s, 6, len(wanted)) by the coordinates of ``wanted``, each times its ``scale``."""
+    def jacobian(
+        self, point: Point, wanted: Sequence[EffectQuantity], workers: int = 1
+    ) -> tuple[Prediction, Floats]:
+        """Prediction at ``point`` and its derivatives (s, 6, len(wanted)) by the coordinates of ``wanted``, each times its ``scale``.
+
+        With several ``workers`` many columns are computed in two simulations at once, which changes them by no more than their accuracy.
+        """
         plant = self.plant(point)
         changed = [self.plant(moved(point, q, self.options.difference)) for q in wanted]
         kinds: list[str] = []
@@ -224,11 +232,22 @@ class ForwardModel:
             numbers["plain"] = []
         columns = np.zeros((len(self.recording.stamps), 6, len(wanted)))
         prediction: Prediction | None = None
-        for kind, chosen in numbers.items():
-            if not chosen and not (kind == "extended" and prediction is None):
-                continue
-            extended = kind == "extended" and (bool(chosen) or plant.extended)
-            trajectory = self._columns(plant, [changed[i] for i in chosen], extended)
+        several = count_workers(workers) > 1
+        parts = [(kind, part) for kind, chosen in numbers.items() for part in _parts(chosen, several)]
+        if not parts:
+            parts = [("extended", [])]
+        trajectories = run_jobs(
+            (
+                delayed(self._columns)(
+                    plant,
+                    [changed[i] for i in chosen],
+                    kind == "extended" and (bool(chosen) or plant.extended),
+                )
+                for kind, chosen in parts
+            ),
+            workers,
+        )
+        for (_, chosen), trajectory in zip(parts, trajectories, strict=True):
             position, quaternion = self._observe(plant, trajectory)
             if trajectory.failure:
                 position[self.recording.stamps > trajectory.t[-1]] = np.nan
@@ -281,6 +300,14 @@ class ForwardModel:
             lambda times: at_times(tip, trajectory.t, times),
             lambda times: at_times(flat, trajectory.t, times),
         )
+
+
+def _parts(numbers: list[int], several: bool) -> list[list[int]]:
+    """``numbers`` of columns, in two halves of whole pairs where there are many and ``several`` workers; none where there are none."""
+    if len(numbers) < MANY or not several:
+        return [numbers] if numbers else []
+    middle = (len(numbers) + 2) // 4 * 2
+    return [numbers[:middle], numbers[middle:]]
 
 
 def moved(point: Point, quantity: EffectQuantity, fraction: float) -> dict[Key, float]:

@@ -76,6 +76,7 @@ def diagnose_recordings(
 
     # forward model: the nominal robot on every recording
     problem = result.problem = make_problem(robot, recordings, nuisances_of(robot), mask, options)
+    problem.workers = context.workers
     result.nominal_rms = rms(np.concatenate(problem.residuals({}))[:, :3])
     if not math.isfinite(result.nominal_rms):
         raise InputError(

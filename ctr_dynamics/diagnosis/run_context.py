@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import math
+import threading
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from joblib import Parallel
+from joblib import Parallel, delayed
+
+_here = threading.local()  # whether this thread is one of several at work
 
 
 def _silent(stage: str) -> None:
@@ -51,4 +54,25 @@ class RunContext:
 
     def run(self, jobs: Iterable[Any]) -> list[Any]:
         """Results of ``jobs`` (`joblib.delayed` calls), in their order."""
-        return list(Parallel(self.workers, prefer="threads")(jobs))
+        return run_jobs(jobs, self.workers)
+
+
+def run_jobs(jobs: Iterable[Any], workers: int) -> list[Any]:
+    """Results of ``jobs`` (`joblib.delayed` calls), in their order, by as many threads as ``workers``; by this one where it is one of several."""
+    todo = list(jobs)
+    if len(todo) == 1 or count_workers(workers) == 1:
+        return [function(*given, **named) for function, given, named in todo]
+    return list(Parallel(workers, prefer="threads")(delayed(_at_work)(*job) for job in todo))
+
+
+def count_workers(workers: int) -> int:
+    """``workers``, or 1 where this thread is one of several at work."""
+    return 1 if getattr(_here, "at_work", False) else workers
+
+
+def _at_work(function: Callable[..., Any], given: tuple[Any, ...], named: dict[str, Any]) -> Any:
+    _here.at_work = True
+    try:
+        return function(*given, **named)
+    finally:
+        _here.at_work = False

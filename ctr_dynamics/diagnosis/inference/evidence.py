@@ -71,9 +71,8 @@ class WeighedHypotheses:
 
     def probability_of(self, effect: str) -> float:
         """Sum of the probabilities of all hypotheses that hold ``effect``."""
-        return float(
-            sum(p for e, p in zip(self.hypotheses, self.probabilities, strict=True) if effect in e.effects)
-        )
+        every = zip(self.hypotheses, self.probabilities, strict=True)
+        return min(float(sum(p for e, p in every if effect in e.effects)), 1.0)
 
 
 def weigh(found: list[Hypothesis], pool: Sequence[Candidate], options: DiagnosisOptions) -> None:
@@ -118,12 +117,12 @@ class WithDiscrepancy:
 
     def of(self, effects: tuple[str, ...]) -> float:
         """Sum for all sets that hold ``effects``, with a discrepancy or without."""
-        return sum(p for names, p in (*self.alone, *self.beside) if set(effects) <= set(names))
+        return min(sum(p for names, p in (*self.alone, *self.beside) if set(effects) <= set(names)), 1.0)
 
     @property
     def discrepancy(self) -> float:
         """Of a discrepancy, whatever is beside it."""
-        return sum(p for _, p in self.beside)
+        return min(sum(p for _, p in self.beside), 1.0)
 
 
 def weigh_discrepancy(found: WeighedHypotheses, problem: Problem, context: RunContext) -> WithDiscrepancy:

@@ -37,7 +37,7 @@ class Problem:
         numerics: (m, d) whitened directions of the discretisation error.
         offset: (m,) whitened correction of the residual towards the finer solution.
         reach: tolerances by which fits move a nuisance at most.
-        options: numbers of all stages.
+        options: numbers of all stages. workers: simulations at once, where nothing else runs.
     """
 
     robot: Robot
@@ -48,6 +48,7 @@ class Problem:
     offset: Floats
     reach: float
     options: DiagnosisOptions
+    workers: int = 1
 
     @property
     def size(self) -> int:
@@ -77,14 +78,9 @@ class Problem:
 
     def on(self, recordings: Sequence[Recording]) -> Problem:
         """The same robot, nuisances, axes and resolution on other recordings, before any correction."""
-        resolution = self.forward_models[0].options
-        return make_problem(
-            self.robot,
-            recordings,
-            self.nuisances,
-            self.whiteners[0].mask,
-            replace(self.options, forward_model=resolution),
-        )
+        options = replace(self.options, forward_model=self.forward_models[0].options)
+        other = make_problem(self.robot, recordings, self.nuisances, self.whiteners[0].mask, options)
+        return replace(other, workers=self.workers)
 
     def residual(self, point: Mapping[Key, float]) -> Floats | None:
         """(m,) whitened residual at ``point``; None where a simulation fails."""
@@ -103,7 +99,7 @@ class Problem:
         residuals, columns = [], []
         for forward_model, whiten in zip(self.forward_models, self.whiteners, strict=True):
             try:
-                prediction, jacobian = forward_model.jacobian(point, wanted)
+                prediction, jacobian = forward_model.jacobian(point, wanted, self.workers)
             except InputError:
                 return None
             if prediction.failure:

@@ -32,7 +32,10 @@ def choose_steps(problem: Problem, point: Mapping[Key, float], context: RunConte
 def with_chosen_steps(
     model: ForwardModel, whiten: Whitener, point: Mapping[Key, float], options: StepOptions
 ) -> ForwardModel:
-    """``model`` with the steps that it needs at ``point``: the shortest everywhere, where these fail or longer ones are of no use."""
+    """``model`` with the steps that it needs at ``point``: the shortest everywhere, where these fail or longer ones are of no use.
+
+    Steps that have been chosen elsewhere stay where they make no more than twice the difference that is allowed.
+    """
     even = model.with_steps(None)
     fine = even.residual_at(point)
     if fine is None or not whiten.size:
@@ -50,6 +53,10 @@ def with_chosen_steps(
         difference = whiten(found - fine).reshape(-1, len(window))
         return np.bincount(window, np.sum(difference**2, axis=0), minlength=count)
 
+    if model.steps is not None:
+        known = model.residual_at(point)
+        if known is not None and float(np.linalg.norm(whiten(known - fine))) <= 2.0 * options.limit:
+            return model
     level = np.zeros(count, np.int64)
     for doubled in range(1, int(np.log2(options.window)) + 1):
         longer = _doubled_where_allowed(level, doubled, squares, options)
