@@ -93,7 +93,7 @@ def test_nuisances_stay_near_their_tolerances_unless_they_may_go_far(recording, 
 
 
 def test_a_frequency_is_found_by_growing_parts(recording, robot, known, monkeypatch):
-    """A first fit that has stopped at a wrong minimum is replaced, and one to noise is left as it is. What grows no further goes on from the first."""
+    """A first fit that has stopped at a wrong minimum is replaced, and one to noise is left. What grows no further goes on from the first."""
     mass = known["payload_mass", "added_kg"]
     problem = make_problem(robot, [recording], [replace(mass, tolerance=mass.scale)], np.ones(6, bool))
     stopped, right = fit(problem, (), {}, iterations=0), fit(problem, (), {})
