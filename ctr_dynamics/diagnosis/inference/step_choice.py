@@ -51,7 +51,7 @@ def with_chosen_steps(
         if found is None:
             return np.full(count, np.inf)
         difference = whiten(found - fine).reshape(-1, len(window))
-        return np.bincount(window, np.sum(difference**2, axis=0), minlength=count)
+        return np.bincount(window, np.sum(difference**2, axis=0), minlength=count).astype(float)
 
     if model.steps is not None:
         known = model.residual_at(point)
