@@ -149,7 +149,7 @@ def find_mistake(
     if before < o.gross * noise_floor(robot) * math.sqrt(2.0):
         return None
     context.report("gross misfit: trying mistakes of units, signs and orders")
-    used = np.isfinite(recording.position).all(axis=1, keepdims=True)[:, 0]
+    used = np.asarray(np.isfinite(recording.position).all(axis=1))
     whiten = Whitener(robot, recording.stamps, np.array(recording.axes), used)
     steps = with_chosen_steps(ForwardModel(recording, robot, fine), whiten, {}, options.steps).steps
     after: dict[str, float] = {}
