@@ -14,9 +14,9 @@ import numpy as np
 
 from ctr_dynamics.diagnosis.diagnosis_options import DiagnosisOptions, ForwardModelOptions
 from ctr_dynamics.diagnosis.forward_model import ForwardModel
-from ctr_dynamics.diagnosis.inference.step_choice import with_chosen_steps
 from ctr_dynamics.diagnosis.recording import Recording
 from ctr_dynamics.diagnosis.run_context import RunContext
+from ctr_dynamics.diagnosis.step_choice import with_chosen_steps
 from ctr_dynamics.diagnosis.time_steps import TimeSteps
 from ctr_dynamics.diagnosis.whitening import Whitener, noise_floor
 from ctr_dynamics.errors import InputError

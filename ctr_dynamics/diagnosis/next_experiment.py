@@ -19,8 +19,8 @@ from ctr_dynamics.diagnosis.inference.gaussian_posterior import prior_variance
 from ctr_dynamics.diagnosis.inference.map_fit import Fit
 from ctr_dynamics.diagnosis.inference.sensitivities import Sensitivities
 from ctr_dynamics.diagnosis.inference.separation import left_over, separation
-from ctr_dynamics.diagnosis.inference.step_choice import with_chosen_steps
 from ctr_dynamics.diagnosis.recording import Recording
+from ctr_dynamics.diagnosis.step_choice import with_chosen_steps
 from ctr_dynamics.diagnosis.whitening import Whitener
 from ctr_dynamics.errors import InputError
 from ctr_dynamics.model.model import Model

@@ -18,10 +18,9 @@ from ctr_dynamics.diagnosis.diagnosis_result import Diagnosis
 from ctr_dynamics.diagnosis.inference.calibration import calibrate, nuisances_of
 from ctr_dynamics.diagnosis.inference.candidates import candidates
 from ctr_dynamics.diagnosis.inference.evidence import weigh_by_prediction, weigh_discrepancy
-from ctr_dynamics.diagnosis.inference.fit_problem import make_problem
+from ctr_dynamics.diagnosis.inference.fit_problem import choose_steps, make_problem
 from ctr_dynamics.diagnosis.inference.fit_quality import is_wrong
 from ctr_dynamics.diagnosis.inference.hypothesis_search import search_hypotheses
-from ctr_dynamics.diagnosis.inference.step_choice import choose_steps
 from ctr_dynamics.diagnosis.inference.tolerance_evidence import tolerance_evidence
 from ctr_dynamics.diagnosis.recording import Recording, measured_axes
 from ctr_dynamics.diagnosis.run_context import RunContext

@@ -7,9 +7,9 @@ import pytest
 
 from ctr_dynamics.diagnosis.diagnosis_options import DiagnosisOptions
 from ctr_dynamics.diagnosis.forward_model import ForwardModel
-from ctr_dynamics.diagnosis.inference.fit_problem import make_problem
-from ctr_dynamics.diagnosis.inference.step_choice import choose_steps, with_chosen_steps
+from ctr_dynamics.diagnosis.inference.fit_problem import choose_steps, make_problem
 from ctr_dynamics.diagnosis.run_context import RunContext
+from ctr_dynamics.diagnosis.step_choice import with_chosen_steps
 from ctr_dynamics.diagnosis.time_steps import TimeSteps
 from ctr_dynamics.diagnosis.whitening import Whitener
 

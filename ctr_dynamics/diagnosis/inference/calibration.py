@@ -7,10 +7,9 @@ from __future__ import annotations
 
 from ctr_dynamics.diagnosis.forward_model import Key
 from ctr_dynamics.diagnosis.inference.discretisation_error import correct_discretisation
-from ctr_dynamics.diagnosis.inference.fit_problem import Local, Problem
+from ctr_dynamics.diagnosis.inference.fit_problem import Local, Problem, choose_steps
 from ctr_dynamics.diagnosis.inference.fit_quality import excess, is_acceptable
 from ctr_dynamics.diagnosis.inference.map_fit import Fit, fit
-from ctr_dynamics.diagnosis.inference.step_choice import choose_steps
 from ctr_dynamics.diagnosis.run_context import RunContext
 from ctr_dynamics.effects import EFFECTS, EffectQuantity, effect_quantities
 from ctr_dynamics.errors import InputError

@@ -6,11 +6,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from joblib import delayed
 from numpy.typing import NDArray
 
 from ctr_dynamics.diagnosis.diagnosis_options import DiagnosisOptions
 from ctr_dynamics.diagnosis.forward_model import ForwardModel, Key
 from ctr_dynamics.diagnosis.recording import Recording
+from ctr_dynamics.diagnosis.run_context import RunContext
+from ctr_dynamics.diagnosis.step_choice import with_chosen_steps
 from ctr_dynamics.diagnosis.whitening import Whitener
 from ctr_dynamics.effects import EffectQuantity
 from ctr_dynamics.errors import InputError
@@ -144,3 +147,10 @@ def make_problem(
         options.calibration.reach,
         options,
     )
+
+
+def choose_steps(problem: Problem, point: Mapping[Key, float], context: RunContext) -> None:
+    """Give every recording of ``problem`` the steps in time that it needs at ``point``."""
+    pairs = zip(problem.forward_models, problem.whiteners, strict=True)
+    o = problem.options.steps
+    problem.forward_models = context.run(delayed(with_chosen_steps)(e, w, point, o) for e, w in pairs)

@@ -1,7 +1,7 @@
 """Choice of the steps in time: as long as the data can tell no difference.
 
-In: a problem and a point. Out: its forward models with steps of their own. Steps are doubled, and doubled again, in as many windows of time as the
-data allow: first in those in which longer steps throughout make least difference.
+In: a forward model, its whitener and a point. Out: the model with steps of its own. Steps are doubled, and doubled again, in as many windows of time
+as the data allow: first in those in which longer steps throughout make least difference.
 """
 
 from __future__ import annotations
@@ -9,24 +9,14 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 
 import numpy as np
-from joblib import delayed
 from numpy.typing import NDArray
 
 from ctr_dynamics.diagnosis.diagnosis_options import StepOptions
 from ctr_dynamics.diagnosis.forward_model import ForwardModel, Key
-from ctr_dynamics.diagnosis.inference.fit_problem import Problem
-from ctr_dynamics.diagnosis.run_context import RunContext
 from ctr_dynamics.diagnosis.time_steps import TimeSteps
 from ctr_dynamics.diagnosis.whitening import Whitener
 
 Floats = NDArray[np.float64]
-
-
-def choose_steps(problem: Problem, point: Mapping[Key, float], context: RunContext) -> None:
-    """Give every recording of ``problem`` the steps that it needs at ``point``."""
-    pairs = zip(problem.forward_models, problem.whiteners, strict=True)
-    o = problem.options.steps
-    problem.forward_models = context.run(delayed(with_chosen_steps)(e, w, point, o) for e, w in pairs)
 
 
 def with_chosen_steps(
