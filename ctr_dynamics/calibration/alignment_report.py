@@ -16,6 +16,7 @@ from ctr_dynamics.parameters import PARAMETERS, Settings, parameter
 Floats = NDArray[np.float64]
 UNMEASURED_RAD = 1.0  # posterior deviation of an angle of which the tips say nothing
 SIGNIFICANT = 3.0  # deviations; a smaller mount is as good as none, and would only add its noise
+MOST_LEFT = 0.1  # of the robot's length. Published models of real robots, not calibrated, are within it; another robot is not
 IMPORTED_START_S = 1_000_000_000  # `import` adds it to logs on a clock that begins near zero
 
 
@@ -33,6 +34,18 @@ def lines(found: Alignment) -> list[str]:
     if seen.any():
         out.append(f"mount of the sensor  {_vector(found.mount, found.mount_sigma, 1.0, 4)} rad")
     return [*out, f"what is left         {found.errors.text()}"]
+
+
+def mismatch(found: Alignment) -> str:
+    """Why the alignment says nothing, in one line; empty where the robot file can be that of the recorded robot."""
+    errors = found.errors
+    if errors.rms <= MOST_LEFT * errors.length:
+        return ""
+    return (
+        f"nothing is written: the tips stay {1e3 * errors.rms:.1f} mm rms off the static model, limit {1e3 * MOST_LEFT * errors.length:.1f} mm "
+        f"({100 * MOST_LEFT:g} % of the robot's length): is it another robot's file, are the joints' zeros, units and order right, is the "
+        "registration unknown (--unknown-registration)?"
+    )
 
 
 def _vector(value: Floats, sigma: Floats, factor: float, digits: int) -> str:

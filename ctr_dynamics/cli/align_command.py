@@ -37,10 +37,11 @@ def align(
     """Find clock offset and latency between tracker and joints, registration and mount of the sensor.
 
     The bag must show every actuator in slow motion. Deviations count what the robot file leaves open and what
-    the static model cannot say. The file holds the given parameters too, so it takes their place.
+    the static model cannot say. The file holds the given parameters too, so it takes their place. Exit code 1,
+    and no file, when what is left is more than a tenth of the robot's length.
     """
     from ctr_dynamics.calibration import alignment
-    from ctr_dynamics.calibration.alignment_report import file_text, lines
+    from ctr_dynamics.calibration.alignment_report import file_text, lines, mismatch
     from ctr_dynamics.calibration.reading import mount_of
 
     check_targets({"output": output}, {"bag": bag, "robot file": robot})
@@ -54,6 +55,9 @@ def align(
         most_lag=most_lag,
     )
     print("\n".join(lines(found)))
+    if shortfall := mismatch(found):
+        print(f"ctr-dynamics: {shortfall}", file=sys.stderr)
+        return 1
     text, warning = file_text(found, tips.settings, f"ctr-dynamics align {bag.name} --robot {robot}")
     with atomic_file(output) as temporary:
         temporary.write_text(text, encoding="utf-8")

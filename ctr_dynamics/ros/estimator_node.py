@@ -239,6 +239,8 @@ class EstimatorNode(Node):
                 self._take_load(value, arrival_ns)
 
     def _take_joints(self, message: JointStateIn, arrival_ns: int) -> None:
+        if surplus := self._decoder.joints.surplus:
+            self._estimator.health.note("joints", "more tubes than the robot", surplus)
         given = self._gate.joint_state(message, arrival_ns)
         if given is None:
             return

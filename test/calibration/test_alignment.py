@@ -6,7 +6,7 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 from ctr_dynamics.calibration.alignment import align
-from ctr_dynamics.calibration.alignment_report import file_text, lines
+from ctr_dynamics.calibration.alignment_report import file_text, lines, mismatch
 from ctr_dynamics.errors import InputError
 from ctr_dynamics.parameters import Settings, read_parameter_file
 from ctr_dynamics.robot_files import load_robot, robot_with
@@ -90,6 +90,22 @@ def test_a_clock_that_is_too_far_off_is_no_delay(robot):
     assert "delay_s" not in parameters
     assert f"by {-found.clock:.4f} s" in warning
     assert "start_s" in warning
+
+
+def test_another_robots_tips_are_no_alignment(robot):
+    """Tips of a robot whose tubes are bent the other way lie on the other side of the base: no tolerance explains that."""
+    last = [
+        f"tubes[{i}].precurvature[{len(tube.precurvature) - 1}].curvature"
+        for i, tube in enumerate(robot.tubes)
+    ]
+    bent = [tube.precurvature[-1].curvature.value for tube in robot.tubes]
+    other = robot_with(
+        robot, {path: tuple(-x for x in value) for path, value in zip(last, bent, strict=True)}
+    )
+    assert mismatch(align(robot, tips_of(robot, noise=NOISE))) == ""
+    text = mismatch(align(robot, tips_of(other, noise=NOISE)))
+    assert "another robot's file" in text
+    assert "10 % of the robot's length" in text
 
 
 def test_too_few_tips_are_refused(robot):

@@ -14,7 +14,8 @@ from ctr_dynamics.errors import InputError
 from ctr_dynamics.io.bag_info import inspect
 from ctr_dynamics.io.bag_reader import open_bag
 from ctr_dynamics.io.inputs.input_mapping import InputMapping, parse_remap
-from ctr_dynamics.io.messages.cdr import CdrWriter
+from ctr_dynamics.io.inputs.joint_readings import JointConverter, JointReadings
+from ctr_dynamics.io.messages.cdr import CdrWriter, JointStateIn
 from ctr_dynamics.io.messages.encode import encode_joint_state, encode_pose_stamped
 from ctr_dynamics.io.messages.topics import JOINT_STATES, TRACKER_TIP
 from ctr_dynamics.parameters import Settings, input_mapping, pose_frame
@@ -418,3 +419,13 @@ def test_standard_messages_are_those_of_the_bag_or_the_same_in_the_usual_types(t
     path = with_poses(tmp_path, lambda k: transform(k, "coil"), "geometry_msgs/msg/TransformStamped")
     given = [m.data for m in open_bag(path, InputMapping()).standard_messages() if m.topic == TRACKER_TIP]
     assert given == [pose(k) for k in range(20)]
+
+
+def test_a_bag_of_more_tubes_than_the_robot_has_is_said():
+    names = tuple(f"tube{i}_{kind}" for i in (1, 2, 3) for kind in ("rotation", "translation"))
+    whole = JointStateIn(1, "", names, tuple(float(i) for i in range(6)))
+    for n, said in ((2, True), (3, False), (0, False)):
+        converter = JointConverter(JointReadings(), n)
+        assert converter.convert(whole)
+        assert ("3 tubes, the robot has 2" in converter.surplus) is said
+        assert ([converter.surplus] == converter.notes) is said

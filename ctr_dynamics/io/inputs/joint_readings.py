@@ -116,6 +116,7 @@ class JointConverter:
 
     Attributes:
         notes: what was taken for what, one line each.
+        surplus: that the messages name more tubes than there are, in words; empty where they do not.
     """
 
     def __init__(self, readings: JointReadings, n: int = 0) -> None:
@@ -130,6 +131,7 @@ class JointConverter:
         if self.n:
             readings.matrices(self.n)  # so many numbers as there are tubes
         self.notes: list[str] = []
+        self.surplus = ""
         self._plans: dict[tuple[tuple[str, ...], int], dict[str, int]] = {}
         self._from_zero = False
         self._waiting: dict[int, dict[str, float]] = {}
@@ -225,6 +227,13 @@ class JointConverter:
             found.setdefault(f"tube{tube + self._from_zero}_{kind}", place)
         if len(found) < len(tubes):
             return {}
+        most = max((tube + self._from_zero for tube, _, _ in tubes), default=0)
+        if 0 < self.n < most:
+            self.surplus = (
+                f"joint states name {most} tubes, the robot has {self.n}: what belongs to tube{self.n + 1} and beyond is left out; "
+                "give the robot file of the robot that was recorded"
+            )
+            self._note(self.surplus)
         for name, place in list(found.items())[:1]:
             if names[place] != name:
                 self._note(f"joint '{names[place]}' is taken for {name}, and so on")
