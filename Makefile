@@ -1,12 +1,16 @@
 # make demo   the estimator live on a shipped bag, over DDS
+# make test-ros  the nodes' tests alone; DISTRO=jazzy runs them on another ROS 2, in an environment of its own
 # make test   format, lint, layers, types and tests; PYTEST_ARGS="-k robot" passes options on, WORKERS=4 uses more cores
 # make lint   format, lint, layers and types alone
 # make coverage lines of the package that the quick tests reach
 # make format writes the format
 # make clean  removes the environment and what was built
-# Needs Python 3.10 to 3.12 with venv; PYTHON=/path/to/python chooses one.
+# Needs Python 3.10 to 3.14 with venv; PYTHON=/path/to/python chooses one.
+# DISTRO=kilted (the default), jazzy, or none: without ROS 2 the demo replays its bag, and the nodes' tests are skipped.
 
-VENV ?= .venv
+DISTRO ?= kilted
+VENV ?= .venv$(if $(filter-out kilted,$(DISTRO)),-$(DISTRO))
+REQUIREMENTS := requirements.txt $(if $(filter-out none,$(DISTRO)),requirements-ros-$(DISTRO).txt)
 PYTEST_ARGS ?=
 WORKERS ?= 2
 BIN := $(VENV)/bin
@@ -21,11 +25,15 @@ ifdef ROS_DISTRO
 unexport LD_LIBRARY_PATH
 endif
 
-.PHONY: demo test lint coverage format clean install
+.PHONY: demo test test-ros lint coverage format clean install
 .DELETE_ON_ERROR:
 
 demo: install
 	$(BIN)/ctr-dynamics demo
+
+test-ros: install
+	$(BIN)/ctr-dynamics warmup --robot till2020_tissue
+	$(BIN)/python -m pytest $(PYTEST_ARGS) test/ros
 
 test: lint
 	$(BIN)/ctr-dynamics warmup --robot till2020_tissue
@@ -54,23 +62,23 @@ $(VENV)/.package: $(VENV)/.requirements setup.py setup.cfg pyproject.toml ctr_dy
 	$(BIN)/python -m pip install --quiet --no-deps --no-build-isolation --editable .
 	@touch $@
 
-$(VENV)/.requirements: requirements.txt
+$(VENV)/.requirements: $(REQUIREMENTS)
 	@set -e; \
-	ok='import sys, venv, ensurepip; sys.exit(not (3, 10) <= sys.version_info[:2] <= (3, 12))'; \
+	ok='import sys, venv, ensurepip; sys.exit(not (3, 10) <= sys.version_info[:2] <= (3, 14))'; \
 	if ! $(BIN)/python -c "$$ok" >/dev/null 2>&1; then \
 	  found=; \
-	  for candidate in $(PYTHON) python3.11 python3.12 python3.10 python3 python; do \
+	  for candidate in $(PYTHON) python3.11 python3.12 python3.10 python3.13 python3.14 python3 python; do \
 	    if "$$candidate" -c "$$ok" >/dev/null 2>&1; then found="$$candidate"; break; fi; \
 	  done; \
 	  if [ -z "$$found" ]; then \
-	    echo "make: error: no Python 3.10 to 3.12 with venv was found; install one, or give PYTHON=/path/to/python" >&2; \
+	    echo "make: error: no Python 3.10 to 3.14 with venv was found; install one, or give PYTHON=/path/to/python" >&2; \
 	    exit 1; \
 	  fi; \
 	  echo "creating $(VENV) with $$("$$found" --version)"; \
 	  "$$found" -m venv --clear $(VENV); \
 	fi; \
-	echo "installing requirements.txt into $(VENV) (some minutes the first time)"; \
-	$(BIN)/python -m pip install --quiet --requirement requirements.txt
+	echo "installing $(REQUIREMENTS) into $(VENV) (some minutes the first time)"; \
+	$(BIN)/python -m pip install --quiet $(addprefix --requirement=,$(REQUIREMENTS))
 	@touch $@
 
 clean:

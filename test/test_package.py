@@ -36,7 +36,7 @@ def source(tmp_path_factory):
     target = tmp_path_factory.mktemp("workspace") / "src" / "ctr_dynamics"
     leave = shutil.ignore_patterns(
         ".git",
-        ".venv",
+        ".venv*",
         "__pycache__",
         "*.egg-info",
         ".*_cache",
@@ -81,16 +81,30 @@ def test_ros_stays_in_the_nodes():
             assert found is None, f"{file.relative_to(ROOT)}: {found[0]}"
 
 
-def test_requirements_pin_every_package_for_every_python():
-    pinned = set()
-    for line in (ROOT / "requirements.txt").read_text().splitlines():
+def pins(name):
+    """Packages that a file of requirements pins."""
+    found = set()
+    for line in (ROOT / name).read_text().splitlines():
         if line and not line.startswith("#"):
             assert re.fullmatch(r"[a-z0-9-]+==[\w.]+( ; [^;]+)?", line), line
-            pinned.add(line.split("==")[0])
+            found.add(line.split("==")[0])
+    return found
+
+
+def test_requirements_pin_every_package_for_every_python():
+    pinned = pins("requirements.txt") | pins("requirements-ros-kilted.txt")
     setup = (ROOT / "setup.py").read_text()
     wanted = {name.lower() for name in re.findall(r'"([A-Za-z][\w-]*)[>=]=[\d.]+"', setup)}
     assert {"numpy", "numba", "rosbags", "ros-kilted-rclpy"} <= wanted
     assert wanted <= pinned
+
+
+def test_every_distribution_has_the_same_messages():
+    kilted, jazzy = pins("requirements-ros-kilted.txt"), pins("requirements-ros-jazzy.txt")
+    wanted = {name.replace("kilted", "jazzy") for name in kilted if name.startswith("ros-kilted-")}
+    assert "ros-jazzy-rclpy" in wanted
+    assert wanted <= jazzy
+    assert not any(name.startswith("ros-") for name in pins("requirements.txt"))
 
 
 def test_sdist_and_wheel_are_complete_and_the_wheel_works(source, tmp_path):
