@@ -32,7 +32,8 @@ demo: install
 	$(BIN)/ctr-dynamics demo
 
 test-ros: install
-	$(BIN)/ctr-dynamics warmup --robot till2020_tissue
+	@# compiles what the node needs, so that the tests do not wait for it
+	$(BIN)/ctr-dynamics replay ctr_dynamics/data/bags/clean_release.mcap --robot till2020_tissue
 	$(BIN)/python -m pytest $(PYTEST_ARGS) test/ros
 
 test: lint

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 import threading
 from collections.abc import Callable
+from typing import Any
 
 from rclpy.lifecycle import LifecycleState, TransitionCallbackReturn
 from rclpy.lifecycle.node import LifecycleNodeMixin
@@ -32,6 +33,17 @@ class ManagedEstimatorNode(LifecycleNodeMixin, EstimatorNode):
 
     def start_up(self) -> None:
         LifecycleNodeMixin.__init__(self)
+        change = self._service_change_state.callback
+
+        def change_state(request: Any, response: Any) -> Any:
+            try:
+                return change(request, response)
+            except RCLError as error:  # before ROS 2 Kilted, of a transition that the state does not allow
+                self.get_logger().error(" ".join(str(error).split()))
+                response.success = False
+                return response
+
+        self._service_change_state.callback = change_state
         self.get_logger().info("waiting to be configured")
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
