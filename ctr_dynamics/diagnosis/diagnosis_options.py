@@ -329,6 +329,35 @@ class UnexplainedForceOptions:
 
 
 @dataclass(frozen=True)
+class LearnedForceOptions:
+    """Learned force: what is learned from what no cause explains."""
+
+    fitted: float = option(0.6, FRACTION, "of each bag that is fitted where there are none for validation")
+    memory_s: tuple[float, ...] = option(
+        (0.05, 0.2, 0.8), "s", "delays to begin with: a fit reaches from one to the next"
+    )
+    sizes: tuple[float, ...] = option(
+        (0.0, 0.1, 0.15, 0.25, 0.4, 0.6, 1.0, 1.5, 2.5, 4.0, 6.0, 10.0, 15.0, 25.0, 40.0),
+        "of the position noise",
+        "of what stays unexplained; coarser steps leave noise to terms",
+    )
+    widths_N: tuple[float, ...] = option(
+        (0.001, 0.003, 0.01, 0.03, 0.1, 0.3, 1.0),
+        "N",
+        "priors of coefficients, of which the evidence chooses",
+    )
+    longest_s: float = option(
+        20.0, "s", "of each bag from which terms are chosen; all of it is fitted afterwards"
+    )
+    dt_s: float = option(0.005, "s", "shortest step on the measured path, where errors in time do not add up")
+    guidance: tuple[float, ...] = option(
+        (1.0, 1.0, 0.3), "of the tip's stiffness", "spring to the measured path, round after round"
+    )
+    renewals: int = option(3, COUNT, "exact Jacobians of the fit to free simulations")
+    slide_m: float = option(1e-3, "m", "of a translation that counts as moving; less looks like a constant")
+
+
+@dataclass(frozen=True)
 class ReportOptions:
     """Output: what is said and shown."""
 
@@ -357,6 +386,7 @@ class DiagnosisOptions:
     verdict: VerdictOptions = VerdictOptions()
     tolerances: ToleranceOptions = ToleranceOptions()
     unexplained_force: UnexplainedForceOptions = UnexplainedForceOptions()
+    learned_force: LearnedForceOptions = LearnedForceOptions()
     report: ReportOptions = ReportOptions()
 
 

@@ -16,6 +16,7 @@ from ctr_dynamics.diagnosis.inference.fit_problem import Problem
 from ctr_dynamics.diagnosis.inference.map_fit import Fit
 from ctr_dynamics.diagnosis.inference.sensitivities import Sensitivities
 from ctr_dynamics.diagnosis.inference.tolerance_evidence import ToleranceEvidence
+from ctr_dynamics.diagnosis.learned.learn import Learning
 from ctr_dynamics.diagnosis.recording import Recording
 from ctr_dynamics.diagnosis.verdict.residual_tests import Whiteness, rms
 from ctr_dynamics.diagnosis.verdict.separability import Cause
@@ -45,6 +46,7 @@ class Diagnosis:
         sensitivities: at the extended fit, where causes are named.
         discrepancy: what remains beside the causes of the verdict, or beside none, where it is more than noise.
         seconds: of the diagnosis.
+        learning: what was learned from what no cause explains; None where it was not asked for.
         tolerances: evidence that those of the robot file are too tight; None where it was not asked for. Verdict `tolerances` rests on it.
     """
 
@@ -74,6 +76,7 @@ class Diagnosis:
     sensitivities: Sensitivities | None = None
     unexplained_force: UnexplainedForce | None = None
     discrepancy: Discrepancy | None = None
+    learning: Learning | None = None
 
     @property
     def fraction_of_misfit(self) -> float | None:

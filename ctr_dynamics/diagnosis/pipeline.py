@@ -18,10 +18,12 @@ from ctr_dynamics.diagnosis.diagnosis_result import Diagnosis
 from ctr_dynamics.diagnosis.inference.calibration import calibrate, nuisances_of
 from ctr_dynamics.diagnosis.inference.candidates import candidates
 from ctr_dynamics.diagnosis.inference.evidence import weigh_by_prediction, weigh_discrepancy
-from ctr_dynamics.diagnosis.inference.fit_problem import choose_steps, make_problem
+from ctr_dynamics.diagnosis.inference.fit_problem import Problem, choose_steps, make_problem
 from ctr_dynamics.diagnosis.inference.fit_quality import is_wrong
 from ctr_dynamics.diagnosis.inference.hypothesis_search import search_hypotheses
+from ctr_dynamics.diagnosis.inference.map_fit import Fit
 from ctr_dynamics.diagnosis.inference.tolerance_evidence import tolerance_evidence
+from ctr_dynamics.diagnosis.learned.learn import learn_force, on_robot
 from ctr_dynamics.diagnosis.recording import Recording, measured_axes
 from ctr_dynamics.diagnosis.run_context import RunContext
 from ctr_dynamics.diagnosis.verdict.decision import (
@@ -155,6 +157,12 @@ def diagnose_recordings(
     result.residual_recalibrated = problem.residuals(recalibrated.point)
     result.residual_extended = problem.residuals(best.fit.point)
 
+    # learned force: what no cause explains, where it predicts bags that were not fitted
+    measured = all(map(math.isfinite, result.numerics.values()))
+    if verdict.word in ("unknown", "named_with_remainder") and measured and not context.out_of_time:
+        base = found.no_cause.fit if verdict.word == "unknown" else best.fit
+        _learn(result, problem, base, found.no_cause.fit, validation, context)
+
     # tolerances: without a cause, whether the robot's values scatter more than the robot file says
     if result.verdict == "clean":
         result.tolerances = tolerance_evidence(found.no_cause.fit, problem.numerics, options.tolerances)
@@ -172,6 +180,27 @@ def _mistaken(result: Diagnosis, misfit: float, seconds: float) -> Diagnosis:
     result.cause_sets = [(("config_mistake",), None)]
     result.nominal_rms, result.seconds = misfit, seconds
     return result
+
+
+def _learn(
+    result: Diagnosis,
+    problem: Problem,
+    base: Fit,
+    no_cause: Fit,
+    validation: Sequence[Recording],
+    context: RunContext,
+) -> None:
+    """Extend ``base`` by a learned force, if there is one that predicts."""
+    result.learning = learn_force(problem, base, validation, context)
+    force = result.learning.force
+    if force is None:
+        result.notes.append(f"nothing was learned: {result.learning.reason}")
+        return
+    own = on_robot(problem, force.robot)
+    result.extended, result.whiteness_extended = force.fit, whiteness(own, force.fit)
+    result.residual_extended = own.residuals(force.fit.point)
+    if validation:
+        result.validation = validate(on_robot(problem, force.robot, validation), no_cause, force.fit)
 
 
 def _take(result: Diagnosis, verdict: Verdict) -> None:

@@ -2,7 +2,15 @@
 
 from __future__ import annotations
 
-from ctr_dynamics.effects import drivetrain, environment, friction, kinematics, structure, tracking
+from ctr_dynamics.effects import (
+    drivetrain,
+    environment,
+    friction,
+    kinematics,
+    learned_force,
+    structure,
+    tracking,
+)
 
 CATALOGUE = (
     drivetrain.exposed_length,
@@ -37,6 +45,7 @@ CATALOGUE = (
     environment.tip_force,
     environment.tip_spring,
     environment.contact,
+    learned_force.learned_force,
     tracking.registration_rotation,
     tracking.registration_translation,
     tracking.tracker_lever_arm,

@@ -158,4 +158,5 @@ def plain_block(robot: Robot, layout: RowNumbers) -> Floats:
         base_viscous=robot.friction.base.viscous.value,
         clearance_moment=CLEARANCE_MOMENT,
         clearance_kinematics=1.0,
+        learned_dry_speed=1.0,
     )

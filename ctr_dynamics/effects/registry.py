@@ -85,6 +85,7 @@ class Effect:
         presets: values of the shape parameters from which a search starts, by name; several are tried.
         nuisance: not a cause by itself: it adds to the uncertainty of others, and is not in the catalogue of findings.
         impacts: whether it strikes the robot: steps in time follow that to a limited degree only.
+        searched: whether diagnosis looks for it among the causes; what is learned from the rest only is not.
         form: nuisances that are free only beside this effect, for what is uncertain in its form; presets may name their parameters.
     """
 
@@ -100,6 +101,7 @@ class Effect:
     presets: tuple[Mapping[str, float], ...] = ({},)
     nuisance: bool = False
     impacts: bool = False
+    searched: bool = True
     form: tuple[str, ...] = ()
 
     def accepts(self, name: str) -> bool:

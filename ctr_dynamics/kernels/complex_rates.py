@@ -167,6 +167,18 @@ def _damped_twice(c0, number, inertia, load):
     return damped_twice
 
 
+def delayed(c0, number, time, load):
+    """The x of x + ``time`` c0 x = ``load``."""
+    return damped(c0, number, 1.0, time, load)
+
+
+@overload(delayed, jit_options=INLINED)
+def _delayed(c0, number, time, load):
+    if isinstance(c0, Coupling):  # whether the tubes are damped or not
+        return lambda c0, number, time, load: inverse_of(c0, number) * load
+    return delayed
+
+
 def plane_curvature(c0, number, stiffness, damping, turning, mx, my):
     """(u_x, u_y) of (``stiffness`` + ``damping`` c0) (u_x, u_y) + ``turning`` (u_y, -u_x) = (``mx``, ``my``)."""
     a = stiffness + c0 * damping

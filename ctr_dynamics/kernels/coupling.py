@@ -107,12 +107,8 @@ def _mix(context, builder, signature, args):
     return total
 
 
-TORSION, BENDING, DRIVE, GROUPS = (
-    0,
-    1,
-    2,
-    3,
-)  # groups of inverses in the table, of one matrix a tube each, behind C
+# groups of inverses in the table, of one matrix a tube each, behind C; of the last group only the first tube's is in use
+TORSION, BENDING, DRIVE, MEMORY, GROUPS = 0, 1, 2, 3, 4
 
 
 @njit(nogil=True)
@@ -123,7 +119,7 @@ def _number(n, group, tube):
 
 def table_size(n: int, width: int) -> int:
     """Numbers in the table of a coupling for ``n`` tubes: C, and the inverses: those with torsion of every tube, with bending of the first one, two
-    .. tubes together, and with every drive."""
+    .. tubes together, with every drive, and with the memory of the learned force."""
     return _number(n, GROUPS, 0) * STAGES * width
 
 
@@ -178,3 +174,5 @@ def fill_coupling(kind, C, parameters, table, width, first):
             _set(table, _number(n, DRIVE, i), width, first, np.linalg.inv(np.eye(STAGES) + (C @ C) * inertia))
         else:
             _set_inverse(table, _number(n, DRIVE, i), width, first, C, 1.0, 0.0, work)
+    memory = parameters[rows.learned_memory_time]
+    _set_inverse(table, _number(n, MEMORY, 0), width, first, C, 1.0, memory, work)

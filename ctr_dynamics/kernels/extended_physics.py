@@ -1,8 +1,8 @@
 """Physics beyond the plain equations, for robots whose files name such effects: what the kernels do differently then.
 
 Equations and sources stand in docs/model.md: oval and softening tubes, drag, friction along the overlap and with a Stribeck peak, elastic drives
-with inertia, clearance where a tube ends, springs and contact at the tip, and the terms of moving tubes that the plain equations leave out. Every
-function has a sister of the same name and arguments in :mod:`ctr_dynamics.kernels.plain_physics`.
+with inertia, clearance where a tube ends, springs, contact and a learned force at the tip, and the terms of moving tubes that the plain equations
+leave out. Every function has a sister of the same name and arguments in :mod:`ctr_dynamics.kernels.plain_physics`.
 
 With moving tubes the fields q, omega and gamma are the velocities of the *grid*: p_t, R_t and theta_t at a fixed place of a section. The grid
 follows the breakpoints; s_t is its speed, and w_i = beta_i,t - s_t that of tube i against it. The parameter ``insertion_velocity`` multiplies all
@@ -12,8 +12,8 @@ rates of beta, so that 0 is the plain model and 1 the full one.
 import math
 
 from ctr_dynamics.kernels.compiler import njit
-from ctr_dynamics.kernels.complex_rates import damped, damped_twice, oval_curvature
-from ctr_dynamics.kernels.layout import base_end_rows, field_rows, state_rows, workspace_rows
+from ctr_dynamics.kernels.complex_rates import damped, damped_twice, delayed, oval_curvature
+from ctr_dynamics.kernels.layout import LEARNED_DEGREE, base_end_rows, field_rows, state_rows, workspace_rows
 from ctr_dynamics.kernels.plain_physics import keep_fields, weight
 from ctr_dynamics.kernels.simd import largest, where_above
 from ctr_dynamics.kernels.sincos import sincos
@@ -331,8 +331,8 @@ def tilt(kind, W, c0, i, base_history, base_fields):
 
 
 @njit(nogil=True, error_model="numpy")
-def tip_forces(kind, W, force):
-    """Add the spring's, the damper's and the contact's force on the tip (base axes) to the rows ``force``."""
+def tip_forces(kind, W, force, c0, base_history, base_fields):
+    """Add the forces of spring, damper and contact, and the learned one, on the tip (base axes) to the rows ``force``."""
     n = kind.tubes
     at, state = workspace_rows(n), state_rows(n)
     KS, CS, F0 = at.spring_stiffness, at.spring_damping, at.spring_force
@@ -351,3 +351,62 @@ def tip_forces(kind, W, force):
     W[F] += W[F0] - W[KS] * px - W[CS] * vx + push * W[NO]
     W[F + 1] += W[F0 + 1] - W[KS] * py - W[CS] * vy + push * W[NO + 1]
     W[F + 2] += W[F0 + 2] - W[KS] * pz - W[CS] * vz + push * W[NO + 2]
+    learned_force(kind, W, force, vx, vy, vz, c0, base_history, base_fields)
+
+
+@njit(nogil=True, error_model="numpy")
+def learned_force(kind, W, force, vx, vy, vz, c0, base_history, base_fields):
+    """Add the learned force at the tip velocity ``vx``, ``vy``, ``vz`` (m/s, base axes) to the rows ``force``.
+
+    The part of the position is minus the gradient of a polynomial, so that it makes no energy; beyond the length it stays what it is there, for
+    polynomials grow without limit where nothing was learned. The memory is z_t = (p - z) / time, implicit in the step as all fields are.
+    """
+    n = kind.tubes
+    at, state, end = workspace_rows(n), state_rows(n), base_end_rows(n)
+    F, X, D = force, at.powers, at.learned_damping
+    scale, orders = W[at.learned_inverse_length], LEARNED_DEGREE + 1
+    row = len(base_history) - end.size + end.memory
+    for axis in range(3):
+        p = W[at.state + state.position + axis]
+        x = (p - W[at.learned_origin + axis]) * scale
+        x = where_above(x, 1.0, 1.0, x)
+        x = where_above(-1.0, x, -1.0, x)
+        W[X + axis * orders] = 1.0
+        for power in range(1, orders):
+            W[X + axis * orders + power] = x * W[X + axis * orders + power - 1]
+        time, before = W[at.learned_memory_time], base_history[row + axis]
+        z = delayed(c0, 3 * n, time, p - time * before)
+        base_fields[row + axis] = z
+        W[F + axis] -= W[at.learned_memory + axis] * ((p - z) * scale)
+    term = at.learned_potential
+    for a in range(orders):
+        for b in range(orders - a):
+            for c in range(orders - a - b):
+                if a + b + c > 1:
+                    x, y, z = W[X + a], W[X + orders + b], W[X + 2 * orders + c]
+                    k = W[term]
+                    if a > 0:
+                        W[F] -= (1.0 * a) * k * W[X + a - 1] * y * z
+                    if b > 0:
+                        W[F + 1] -= (1.0 * b) * k * x * W[X + orders + b - 1] * z
+                    if c > 0:
+                        W[F + 2] -= (1.0 * c) * k * x * y * W[X + 2 * orders + c - 1]
+                    term += 1
+    scale, dry = W[at.learned_inverse_speed], W[at.learned_dry_speed]
+    ux, uy, uz = scale * vx, scale * vy, scale * vz
+    speed = math.sqrt(ux * ux + uy * uy + uz * uz)
+    share = 1.0 / math.sqrt(vx * vx + vy * vy + vz * vz + dry * dry)
+    W[F] -= W[D] * ux + W[D + 3] * uy + W[D + 4] * uz
+    W[F + 1] -= W[D + 3] * ux + W[D + 1] * uy + W[D + 5] * uz
+    W[F + 2] -= W[D + 4] * ux + W[D + 5] * uy + W[D + 2] * uz
+    DR, DY = at.learned_drag, at.learned_dry
+    W[F] -= W[DR] * speed * ux + W[DY] * share * vx
+    W[F + 1] -= W[DR + 1] * speed * uy + W[DY + 1] * share * vy
+    W[F + 2] -= W[DR + 2] * speed * uz + W[DY + 2] * share * vz
+    for i in range(n):
+        s, c = sincos(W[at.alpha + i])
+        slide = W[at.beta + i] * W[at.learned_inverse_length]
+        for axis in range(3):
+            k = 3 * i + axis
+            W[F + axis] += W[at.learned_sine + k] * s + W[at.learned_cosine + k] * c
+            W[F + axis] += W[at.learned_slide + k] * slide

@@ -77,6 +77,7 @@ BASE_ENDS = (
     Group("drive_angle", 0, 1),  # by which each drive gives way, rad
     Group("tilt", 0, 2),  # (x, y) at each tube's end, rad
     Group("beta_rate", 0, 1),  # m/s
+    Group("memory", 3),  # low-pass of the tip's position, m
 )
 
 # Unknowns of the shooting problem: torque of each tube at its actuator, force and moment at s = 0+.
@@ -84,6 +85,14 @@ UNKNOWNS = (Group("torque", 0, 1), Group("force", 3), Group("moment_xy", 2))
 
 # Its residual: balance of force and moment at the tip and of the moment m_z at each tube's end.
 RESIDUAL = (Group("force", 3), Group("moment_xy", 2), Group("moment_z", 0, 1))
+
+LEARNED_DEGREE = 4  # of the polynomial potential of a learned force
+
+
+def potential_terms(degree: int) -> int:
+    """Number of monomials in three variables from degree two up to ``degree``."""
+    return (degree + 1) * (degree + 2) * (degree + 3) // 6 - 4
+
 
 # Parameters, SI units. ``precurvature`` is a factor on u*; ``gravity``, ``force`` and ``torque`` are in ``ctr_base``.
 PLAIN_PARAMETERS = (
@@ -132,6 +141,20 @@ EXTENDED_PARAMETERS = (  # read by the extended physics only
     Group("drive_compliance", 0, 1),
     Group("drive_inertia", 0, 1),
     Group("beta_rate", 0, 1),
+    # learned force on the tip: in N, of position over a length and velocity over a speed
+    Group("learned_origin", 3),
+    Group("learned_inverse_length", 1),
+    Group("learned_inverse_speed", 1),
+    Group("learned_dry_speed", 1),
+    Group("learned_memory_time", 1),
+    Group("learned_potential", potential_terms(LEARNED_DEGREE)),
+    Group("learned_damping", 6),  # xx, yy, zz, xy, xz, yz
+    Group("learned_drag", 3),
+    Group("learned_dry", 3),
+    Group("learned_memory", 3),
+    Group("learned_sine", 0, 3),
+    Group("learned_cosine", 0, 3),
+    Group("learned_slide", 0, 3),
 )
 PARAMETERS = (*PLAIN_PARAMETERS, *EXTENDED_PARAMETERS)
 
@@ -162,6 +185,7 @@ WORKSPACE = (
     *PARAMETERS,
     Group("near_moments", 0, 2),  # bending moment (x, y) of every tube on the near side of a transition
     Group("far_moments", 0, 2),  # on its far side
+    Group("powers", 3 * (LEARNED_DEGREE + 1)),  # of the tip's position, for the learned force
     # motion of the grid in the extended physics
     Group("tube_speed", 0, 1),  # beta_t, times the insertion factor
     Group("tube_acceleration", 0, 1),

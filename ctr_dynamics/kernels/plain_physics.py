@@ -215,5 +215,5 @@ def tilt(kind, W, c0, i, base_history, base_fields):
 
 
 @njit(forceinline=True)
-def tip_forces(kind, W, force):
-    """No spring and no contact at the tip."""
+def tip_forces(kind, W, force, c0, base_history, base_fields):
+    """No spring, no contact and nothing learned at the tip."""

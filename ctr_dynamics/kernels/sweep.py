@@ -200,7 +200,7 @@ def sweep_batch(kind, W, c0, mesh, v):
             if i > 0:
                 carry_end_body(kind, W, i)
                 tilt(kind, W, c0, i, v.base_history, v.base_fields)
-    tip_residual(kind, W, v.residual)
+    tip_residual(kind, W, v.residual, c0, v.base_history, v.base_fields)
 
 
 @njit(nogil=True, error_model="numpy")

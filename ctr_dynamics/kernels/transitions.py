@@ -89,7 +89,7 @@ def carry_end_body(kind, W, i):
 
 
 @njit(forceinline=True, error_model="numpy")
-def tip_residual(kind, W, residual):
+def tip_residual(kind, W, residual, c0, base_history, base_fields):
     """Balance at the tip of tube 1, (21): the external wrench (base axes) against the internal one and that of :func:`end_body`."""
     n = kind.tubes
     at, state, given = workspace_rows(n), state_rows(n), residual_rows(n)
@@ -102,7 +102,7 @@ def tip_residual(kind, W, residual):
     F, T = at.sums, at.torque  # the force on the tip takes the rows of the sums
     for r in range(3):
         W[F + r] = W[at.force + r]
-    tip_forces(kind, W, F)
+    tip_forces(kind, W, F, c0, base_history, base_fields)
     H = at.state + state.quaternion
     a, b, c, d = W[H], W[H + 1], W[H + 2], W[H + 3]
     k2 = 2.0 / (a * a + b * b + c * c + d * d)

@@ -94,7 +94,7 @@ def test_summary_says_which_tolerance_and_by_how_much():
     }
     content = {
         "verdict": "tolerances", "causes": [], "residual": residual, "validation": None,
-        "next_experiment": None, "tolerances": [entry], "discrepancy": None,
+        "next_experiment": None, "tolerances": [entry], "discrepancy": None, "learned": None,
     }  # fmt: skip
     lines = summary(content)
     assert lines[0].startswith("verdict: tolerances.")

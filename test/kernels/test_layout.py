@@ -90,7 +90,7 @@ def test_what_the_kernels_take_for_granted_of_the_order(n):
 
 
 def test_base_fields_are_two_a_point_and_what_stands_at_the_ends():
-    assert base_field_count(3, 4) == base_field_count.py_func(3, 4) == 3 * (4 * 4 + 1) * 2 + 4 * 3
+    assert base_field_count(3, 4) == base_field_count.py_func(3, 4) == 3 * (4 * 4 + 1) * 2 + 4 * 3 + 3
 
 
 def literals(text):

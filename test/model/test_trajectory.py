@@ -202,6 +202,26 @@ def test_sensitivities_of_an_extended_run():
     )
 
 
+def test_sensitivities_of_a_learned_force():
+    values = {
+        "origin_z_m": 0.2,
+        "potential_xyy_N": 0.01,
+        "drag_y_N": 0.01,
+        "memory_y_N": 0.02,
+        "memory_s": 0.05,
+        "tube1.sine_x_N": 0.01,
+    }
+    model = Model(extended_robot({"learned_force": values}), nodes=12)
+    quantities = [
+        ("learned_potential", 3, 0.005),
+        ("learned_drag", 1, 5e-3),
+        ("learned_memory", 1, 0.02),
+        ("learned_memory_time", 0, 0.02),
+        ("learned_cosine", 1, 5e-3),
+    ]
+    compare(model, 0.03, quantities, [(1, 0.01)], 5e-3)
+
+
 @pytest.mark.parametrize("slide", [0.0, 0.03], ids=["in the compiled loop", "in single steps"])
 def test_sensitivities_end_where_they_tell_nothing(monkeypatch, slide):
     """The simulation goes on without them."""

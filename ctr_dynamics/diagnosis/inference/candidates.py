@@ -69,7 +69,7 @@ def candidates(
             )
     found: list[Candidate] = []
     for name, effect in EFFECTS.items():
-        if effect.nuisance:
+        if effect.nuisance or not effect.searched:
             continue
         own = [q for q in known if q.effect == name]
         amplitudes = [q for q in own if not q.parameter.shape]

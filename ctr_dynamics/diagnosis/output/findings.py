@@ -15,6 +15,7 @@ from ctr_dynamics.diagnosis.diagnosis_result import Diagnosis
 from ctr_dynamics.diagnosis.inference.candidates import Candidate
 from ctr_dynamics.diagnosis.inference.map_fit import Fit
 from ctr_dynamics.diagnosis.inference.tolerance_evidence import WiderTolerance
+from ctr_dynamics.diagnosis.learned.dictionary import EFFECT
 from ctr_dynamics.diagnosis.output.robot_export import robot_with
 from ctr_dynamics.diagnosis.verdict.residual_tests import rms
 from ctr_dynamics.diagnosis.verdict.separability import Cause
@@ -109,6 +110,7 @@ def findings(diagnosis: Diagnosis, command: str, experiment: dict[str, Any] | No
                 "nis_before": v.nis_before,
                 "nis_after": v.nis_after,
             },
+            "learned": _learned(d),
             "next_experiment": experiment,
             "tolerances": [_tolerance(w) for w in d.tolerances.wider]
             if d.tolerances is not None and d.verdict == "tolerances"
@@ -168,6 +170,31 @@ def _tolerance(wider: WiderTolerance) -> dict[str, Any]:
     }
 
 
+def _learned(d: Diagnosis) -> dict[str, Any] | None:
+    """The learned force as the contract has it; None where there is none that predicts."""
+    force = None if d.learning is None else d.learning.force
+    if force is None:
+        return None
+    sigma = {q.key: float(s) for q, s in zip(force.fit.active, force.fit.sigma, strict=True)}
+    return {
+        "kind": "force on the tip",
+        "terms": [
+            {
+                "parameter": q.name,
+                "value": force.fit.point[q.key],
+                "ci90": interval(q, force.fit.point[q.key], sigma[q.key], 1.6449),
+                "unit": q.parameter.unit,
+                "text": q.parameter.text,
+            }
+            for q in force.terms
+        ],
+        "extension": EFFECT,
+        "gain": force.validation.gain,
+        "ci95": list(force.validation.interval),
+        "held_out": force.held_out,
+    }
+
+
 def _rms(residuals: list[Floats]) -> float | None:
     return rms(np.concatenate(residuals)[:, :3]) if residuals else None
 
@@ -181,7 +208,10 @@ def write(directory: Path, diagnosis: Diagnosis, content: dict[str, Any]) -> Non
         recalibrated = robot_with(robot, diagnosis.recalibrated, f"{name}_recalibrated", note)
         _text(directory / RECALIBRATED, robot_to_yaml(recalibrated))
     if diagnosis.extended is not None:
-        effects = ", ".join(c.effect for c in diagnosis.causes if c.effect in EFFECTS) or "no cause"
+        names = [c.effect for c in diagnosis.causes if c.effect in EFFECTS]
+        if diagnosis.learning is not None and diagnosis.learning.force is not None:
+            robot, names = diagnosis.learning.force.robot, [*names, "a learned force"]
+        effects = ", ".join(names) or "no cause"
         extended = robot_with(robot, diagnosis.extended, f"{name}_extended", f"extended by {effects}")
         _text(directory / EXTENDED, robot_to_yaml(extended))
     _text(directory / FINDINGS, json.dumps(content, indent=1, allow_nan=False, ensure_ascii=False) + "\n")

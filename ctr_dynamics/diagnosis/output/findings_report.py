@@ -48,6 +48,7 @@ def write_report(path: Path, diagnosis: Diagnosis, content: dict[str, Any]) -> N
         _validation(page, diagnosis)
         _whiteness(page, diagnosis, diagnosis.recalibrated, diagnosis.extended)
         _values(page, diagnosis.extended)
+    _learned(page, content)
     _scope(page, content)
     with atomic_file(path) as part:
         part.write_text(page.text(), encoding="utf-8", errors="backslashreplace")
@@ -97,6 +98,20 @@ def _unexplained(page: Page, d: Diagnosis) -> None:
         for i, axis in enumerate(AXES)
     ]
     page.figure(figure_svg(panels), f"In the first bag, {d.unexplained_force.text}.")
+
+
+def _learned(page: Page, content: dict[str, Any]) -> None:
+    force = content["learned"]
+    if force is None:
+        return
+    page.heading("The learned force")
+    rows = [(t["parameter"], t["text"], t["value"], *t["ci90"], t["unit"]) for t in force["terms"]]
+    page.table(rows, ("parameter", "what it is", "value", "from", "to (90 % interval)", "unit"))
+    low, high = force["ci95"]
+    page.paragraph(
+        f"Gain on {force['held_out']}: {force['gain']:.3f} of the squared error, 95 % interval {low:.3f} to {high:.3f}. "
+        f"The extended robot file has this force as extension {force['extension']}."
+    )
 
 
 def _loops(joints: Floats, t: Floats, left: Floats, rest: Floats):  # type: ignore[no-untyped-def]

@@ -85,6 +85,17 @@ def summary(content: dict[str, Any]) -> list[str]:
             f"On bags that were not fitted: {_mm(v['rms_recalibrated_m'])} -> {_mm(v['rms_extended_m'])}, "
             f"gain {v['gain']:.3f} [{v['ci95'][0]:.3f}, {v['ci95'][1]:.3f}]."
         )
+    force = content["learned"]
+    if force is not None:
+        terms = "; ".join(
+            f"{t['text']} {shown(t['value'], t['unit'])} [{shown(t['ci90'][0], t['unit'])}, {shown(t['ci90'][1], t['unit'])}]"
+            for t in force["terms"]
+        )
+        low, high = (100 * x for x in force["ci95"])
+        lines.append(
+            f"Learned from what is left, a {force['kind']} of {len(force['terms'])} terms: {terms}. On {force['held_out']} it removes "
+            f"{100 * force['gain']:.0f} % of the squared error (95 % interval {low:.0f} to {high:.0f} %); extension {force['extension']}."
+        )
     for w in content["tolerances"]:
         stated, suggested = shown(w["stated"], w["unit"]), shown(w["suggested"], w["unit"])
         lines.append(f"Tolerance of {w['parameter']}: {suggested} instead of {stated}.")

@@ -281,9 +281,16 @@ def stage_times(duration_s: float, step_s: float) -> np.ndarray:
 
 
 def run(
-    plant: Plant, c: np.ndarray, inputs: np.ndarray, step_s: float, statistics: np.ndarray | None = None
+    plant: Plant,
+    c: np.ndarray,
+    inputs: np.ndarray,
+    step_s: float,
+    statistics: np.ndarray | None = None,
+    start: tuple[np.ndarray, np.ndarray] | None = None,
 ) -> np.ndarray:
     """Tip states (steps + 1, TIP) from rest at coordinates c under the inputs (steps, 3, N + 16) at the stage times.
+
+    `start`: coordinates and their rates instead, which are moved on to the end.
 
     Raises:
         NoMotionError: Newton's method failed.
@@ -291,7 +298,9 @@ def run(
     tips = np.empty((len(inputs) + 1, TIP))
     tips[0] = tip_at(plant, c, inputs[0, 0])
     counts = np.zeros(2, dtype=np.int64) if statistics is None else statistics
-    c, v = c.copy(), np.zeros(len(c))
+    c, v = (c.copy(), np.zeros(len(c))) if start is None else start
+    if start is not None:
+        residual(plant, c, v, np.zeros(len(c)), inputs[0, 0], np.empty(len(c)), tips[0])
     done = 0
     while done < len(inputs):
         done += integrate(plant, RADAU, c, v, inputs[done:], step_s, TOLERANCE, tips[done:], counts, NO_PATH)

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
+from scipy.optimize import root
 from scipy.spatial.transform import Rotation
 
 from ctr_dynamics.robot.schema import Robot
@@ -57,6 +58,16 @@ class Sensing:
     glitch: Callable[[np.random.Generator, Floats], Floats] | None = None
 
 
+@dataclass(frozen=True)
+class Law:
+    """A force on the tip that follows from its state: `force` takes position, velocity and remembered position (k, 3) in base axes, m and m/s, and
+    the tubes' angles (k, N), and gives (k, 3) N. What is remembered follows the position with the delay `memory_s`.
+    """
+
+    force: Callable[[Floats, Floats, Floats, Floats], Floats]
+    memory_s: float = 1.0
+
+
 @dataclass
 class Disturbance:
     """What acts beside the known load, as functions of time."""
@@ -65,6 +76,7 @@ class Disturbance:
     force: Callable[[Floats], Floats] | None = None  # t (...) to (..., 3) N on the tip
     base: Callable[[Floats], Floats] | None = None  # t (...) to (..., 9): m, m/s, m/s^2 of the plate
     stiffening: Callable[[Floats], Floats] | None = None  # t (...) to the factor of all moduli
+    law: Law | None = None
 
 
 @dataclass
@@ -151,9 +163,11 @@ def carry_out(world: World, motion: Motion, step_s: float = STEP_S, refine: int 
     plant, count = mechanics.plant_of(world.machine, refine)
     wrench = np.zeros(6)
     wrench[1] = -GRAVITY * motion.hung_kg
-    c = None
+    c, law, n = None, world.disturbance.law, world.machine.n
     for _ in range(60 if motion.hung_kg else 1):
         start = _inputs(world, motion, np.zeros(1), wrench)[0]
+        if law is not None:
+            start[n : n + 3] += _force_at_rest(plant, count, start, law)
         c = mechanics.equilibrium(plant, count, start, c)
         if not motion.hung_kg:
             break
@@ -164,7 +178,59 @@ def carry_out(world: World, motion: Motion, step_s: float = STEP_S, refine: int 
         if np.abs(change).max() < 1e-10:
             break
     t = mechanics.stage_times(motion.duration_s, step_s)
-    tips = mechanics.run(plant, c, _inputs(world, motion, t, wrench), step_s)
+    inputs = _inputs(world, motion, t, wrench)
+    tips = mechanics.run(plant, c, inputs, step_s) if law is None else _follow(plant, c, inputs, step_s, law)
     return Run(
         motion, step_s, tips[:, :3], tips[:, 3:12].reshape(-1, 3, 3), tips[:, 12:15], tips[:, 15:], wrench
     )
+
+
+def _force_at_rest(plant: mechanics.Plant, count: int, inputs: Floats, law: Law) -> Floats:
+    """Force (3,) of `law` in the equilibrium that it makes itself."""
+    n = len(plant.GJ)
+    begin = mechanics.equilibrium(plant, count, inputs)
+
+    def missed(force: Floats) -> Floats:
+        loaded = inputs.copy()
+        loaded[n : n + 3] += force
+        p = mechanics.tip_at(plant, mechanics.equilibrium(plant, count, loaded, begin), loaded)[None, :3]
+        return law.force(p, np.zeros((1, 3)), p, inputs[None, :n])[0] - force
+
+    return root(missed, np.zeros(3), tol=1e-10).x
+
+
+WINDOW = 16  # steps over which force and motion are iterated
+
+
+def _follow(plant: mechanics.Plant, c: Floats, inputs: Floats, step_s: float, law: Law) -> Floats:
+    """Tip states of a run with the force of `law` at the stages: window after window, the force of the last motion until both agree."""
+    n, nodes = len(plant.GJ), mechanics.RADAU.nodes
+    c, v = c.copy(), np.zeros(len(c))
+    tips = [mechanics.tip_at(plant, c, inputs[0, 0])]
+    memory = tips[0][:3].copy()
+    ends = [law.force(tips[0][None, :3], np.zeros((1, 3)), memory[None], inputs[0, :1, :n])[0]]
+    for begin in range(0, len(inputs), WINDOW):
+        now = inputs[begin : begin + WINDOW].copy()
+        count = len(now)
+        force = np.tile(ends[-1], (count + 1, 1))
+        for _ in range(12):
+            share = (np.arange(count)[:, None] + nodes).ravel()
+            at_stages = np.stack([np.interp(share, np.arange(count + 1), f) for f in force.T], axis=1)
+            given = now.copy()
+            given[..., n : n + 3] += at_stages.reshape(count, 3, 3)
+            cc, vv = c.copy(), v.copy()
+            found = mechanics.run(plant, cc, given, step_s, start=(cc, vv))
+            z = [memory]
+            for a, b in zip(found[:-1, :3], found[1:, :3], strict=True):
+                z.append(z[-1] + (1.0 - np.exp(-step_s / law.memory_s)) * (0.5 * (a + b) - z[-1]))
+            angles = np.concatenate([now[:1, 0, :n], now[:, -1, :n]])
+            new = law.force(found[:, :3], found[:, 12:15], np.array(z), angles)
+            new[0] = ends[-1]
+            change = np.abs(new - force).max()
+            force = new
+            if change < 1e-6:
+                break
+        c, v, memory = cc, vv, z[-1]
+        ends.append(force[-1])
+        tips.extend(found[1:])
+    return np.array(tips)
