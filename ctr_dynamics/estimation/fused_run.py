@@ -26,8 +26,9 @@ from ctr_dynamics.kernels.tracker_measurement import pose_difference
 from ctr_dynamics.model.simulator import State
 
 Floats = NDArray[np.float64]
-NEGLIGIBLE = (
-    1e-4  # probability of another delay or model error, below which it is no matter of the covariance
+NEGLIGIBLE = 1e-4  # probability of another delay or model error; less is no matter of the covariance
+CONFIRMED = (
+    8  # measurements without a shift, 0.2 s at 40 Hz, after which the registration is known to be right
 )
 
 
@@ -51,6 +52,7 @@ class FusedRun:
     Attributes:
         state: after the last step; None before the start and after what cannot be gone on from.
         measured_ns: stamp of the newest measurement that reached the gate.
+        confirmed: measurements since the start that were fused and show no shift of the tracker.
         late: whether the tracker is late by a time that is not known yet. Measurements are then compared and not fused.
     """
 
@@ -73,7 +75,7 @@ class FusedRun:
         )
         self.state: State | None = None
         self.measured_ns: int | None = None
-        self.late = False
+        self.confirmed, self.late = 0, False
         self._apart = np.zeros(3)  # m, the last measurement from the open-loop run
 
     def clear(self) -> None:
@@ -81,7 +83,7 @@ class FusedRun:
         self.ekf.forget_parameters()
         self.delay_search.clear()
         self.model_error_search.clear()
-        self.state, self.measured_ns, self.late = None, None, False
+        self.state, self.measured_ns, self.confirmed, self.late = None, None, 0, False
 
     def start(self, state: State, t: float) -> None:
         """Begin at the static equilibrium ``state`` at the time ``t`` (s)."""
@@ -119,6 +121,9 @@ class FusedRun:
                     self._turn(quaternion, motion.quaternion),
                     update.foretold,
                 )
+            newer = self.measured_ns is None or measurement.stamp_ns > self.measured_ns
+            if update.accepted and newer and not self.ekf.tracker_fault()[0]:
+                self.confirmed += 1
             if update.dof:
                 self.measured_ns = max(self.measured_ns or 0, measurement.stamp_ns)
             else:
@@ -210,7 +215,11 @@ class FusedRun:
 
     def inflate_covariance(self, tip: TipEstimate, open_loop: OpenLoopRun) -> None:
         """Have the covariance of ``tip`` hold what else may be right: the open-loop run where the tracker may be late or the model may err more
-        than the filter counts on, the tracker where it is thought to be late."""
+        than the filter counts on, the tracker where it is thought to be late or has been shifted since the start."""
+        if self.confirmed < CONFIRMED:
+            # a shift that has been there since the start may be one of the registration, which belongs to the pose
+            shift = self.ekf.shift_in_base()
+            tip.covariance[:3, :3] += np.multiply.outer(shift, shift)
         belief = self.delay_search.belief(self.ekf.delay)
         other = max(belief.late, self.model_error_search.probability(self.ekf.model_error))
         if not self._health.fusing or other < NEGLIGIBLE:

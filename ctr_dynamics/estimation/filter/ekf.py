@@ -31,6 +31,7 @@ from ctr_dynamics.estimation.filter.rational_step import ColumnStrides, exposed
 from ctr_dynamics.estimation.filter.tip_window import TipWindow, insertion_fraction
 from ctr_dynamics.estimation.step_output import FUSION_OFF
 from ctr_dynamics.kernels.factor_operations import move_unknowns
+from ctr_dynamics.kernels.rotations import matrix
 from ctr_dynamics.kernels.tracker_measurement import fused_tip
 from ctr_dynamics.kernels.variance_likelihood import position_density, pull_to_zero
 from ctr_dynamics.model.model import Model
@@ -397,6 +398,11 @@ class RodEkf:
             pose, covariance, sigma,
         )  # fmt: skip
         return TipEstimate(pose[:3], pose[3:], tip.mean[7:13].copy(), covariance, sigma, finite)
+
+    def shift_in_base(self) -> Floats:
+        """(3,) m, the estimated shift of measured positions in base axes."""
+        shift: Floats = matrix(self.tracker.rotation).T @ self.bias[SHIFT]
+        return shift
 
     def tracker_fault(self) -> tuple[float, float]:
         """By how much measured positions are shifted (m; 0 where that is within three deviations of their noise), and the tracker's noise by the
