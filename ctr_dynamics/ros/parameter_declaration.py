@@ -81,13 +81,20 @@ def watch(
 ) -> Callable[[], None]:
     """Check parameters that are set while the node runs, then apply them. The function that is returned ends that.
 
+    `use_sim_time` stays as it is: steps, stamps and deadlines go by the clock of the start.
+
     Args:
         current: the settings in use.
         prepare: called with the new settings and the names that change; raises InputError to reject them.
         apply: called once the change is accepted.
     """
 
+    simulated = bool(node.get_parameter("use_sim_time").value)
+
     def check(parameters: Sequence[RosParameter]) -> SetParametersResult:
+        if any(p.name == "use_sim_time" and p.value != simulated for p in parameters):
+            reason = "use_sim_time: the clock of a running estimator is that of its start; start it again with the other one"
+            return SetParametersResult(successful=False, reason=reason)
         changes = {p.name: _plain(p.value) for p in parameters if p.name in _TABLE}
         if not changes:
             return SetParametersResult(successful=True)

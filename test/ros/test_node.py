@@ -139,6 +139,16 @@ def test_parameters_are_checked_when_set(start):
         live.wait_for_more(topics.TIP_POSE, 10)
 
 
+def test_the_clock_is_that_of_the_start(start):
+    with start() as live:
+        answer = live.set_parameter("use_sim_time", True)
+        assert not answer.successful
+        assert "start it again" in answer.reason
+        assert live.set_parameter("use_sim_time", False).successful
+        live.resting_robot()
+        live.wait_for_more(topics.TIP_POSE, 20)
+
+
 @pytest.mark.parametrize(
     ("yaml", "wanted"),
     [
