@@ -37,6 +37,7 @@ from ctr_dynamics.io.messages.cdr import (
 from ctr_dynamics.parameters import Settings, input_mapping
 from ctr_dynamics.robot_files import load_robot
 from ctr_dynamics.ros import qos, transform_topics
+from ctr_dynamics.ros.input_subscriptions import InputSubscriptions
 from ctr_dynamics.ros.node_runner import Stopped, run_in_thread, run_node
 from ctr_dynamics.ros.parameter_declaration import declare, watch
 from ctr_dynamics.ros.publishers import Outputs
@@ -132,9 +133,9 @@ class EstimatorNode(Node):
             self.create_service(Trigger, "~/save_snapshot", self._on_save_snapshot),
             self.create_service(SetBool, "~/enable_fusion", self._on_enable_fusion),
         ]
+        self._inputs = InputSubscriptions(self, self._subscribe)
+        self._transforms = transform_topics.subscribe(self, self._taker)
         self.loop.start()
-        self._inputs = [self._subscribe(topic) for topic in topics.INPUTS]
-        self._inputs += transform_topics.subscribe(self, self._taker)
         self.get_logger().info(
             f"robot '{self._robot.name}', policy '{self.timing.policy}', waiting for {topics.JOINT_STATES}"
         )
@@ -314,6 +315,7 @@ class EstimatorNode(Node):
                 self.timing.input_timeout_ns if self.timing.policy == "predict" else None,
             ),
             node_diagnostics.topics_status(self._qos_faults.by_topic, self._undecodable, self.loop.rejected),
+            self._inputs.status,
         ]
 
     # In the executor.
@@ -422,7 +424,8 @@ class EstimatorNode(Node):
         """Stop what `begin` has started."""
         self.loop.stop()
         self.loop.join()
-        for subscription in self._inputs:
+        self._inputs.close()
+        for subscription in self._transforms:
             self.destroy_subscription(subscription)
         for service in self._offered:
             self.destroy_service(service)
