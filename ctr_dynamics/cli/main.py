@@ -33,7 +33,7 @@ COMMANDS = {
     "statics": "Solve the static model for a table of actuator positions.",
     "snap": "Snap-through by the finite-difference solver.",
     "import": "Write CSV logs of actuators and tracker as a bag.",
-    "robot": "Write a robot file from data sheets, or check one.",
+    "robot": "Write a robot file from data sheets, check one, or write its URDF.",
     "view": "Serve a bag or the live topics to Foxglove.",
     "bench": "Measure cost per step, real-time ratios and tick times.",
     "info": "Say what is in a bag: topics, rates, gaps, clock and unit problems.",

@@ -1,4 +1,4 @@
-"""`ctr-dynamics robot`: `new` writes a robot file from data sheets, `check` says what a file holds."""
+"""`ctr-dynamics robot`: `new` writes a robot file from data sheets, `check` says what a file holds, `urdf` writes it for RViz."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Annotated, Any
 import typer
 
 from ctr_dynamics.errors import InputError
-from ctr_dynamics.io.atomic_files import atomic_file
+from ctr_dynamics.io.atomic_files import atomic_file, check_targets
 from ctr_dynamics.robot import Robot
 from ctr_dynamics.robot_files import datasheet as sheets
 from ctr_dynamics.robot_files import load_robot, robot_names
@@ -163,7 +163,26 @@ def check(
     return 0 if found else 1
 
 
-robot = {"new": new, "check": check}
+def urdf(
+    robot: Annotated[
+        str,
+        typer.Argument(metavar="NAME_OR_FILE", help=f"A robot file, or one of {', '.join(robot_names())}."),
+    ],
+    output: Annotated[Path, typer.Option("--output", metavar="FILE.urdf", help="URDF file to write.")],
+    frame: Annotated[str, typer.Option("--frame", metavar="NAME", help="Its base link.")] = "ctr_base",
+) -> int:
+    """Write the robot as a URDF, for RViz and robot_state_publisher: drives as joints, ends of the tubes as frames."""
+    from ctr_dynamics.view.urdf import robot_urdf
+
+    loaded = load_robot(robot)
+    check_targets({"output": output}, {"robot file": loaded.source})
+    with atomic_file(output) as part:
+        part.write_text(robot_urdf(loaded, frame), encoding="utf-8")
+    print(f"output  {output}")
+    return 0
+
+
+robot = {"new": new, "check": check, "urdf": urdf}
 
 
 def _show(robot: Robot) -> None:
