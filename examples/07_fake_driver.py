@@ -43,7 +43,7 @@ class Drives:
         }
 
     def command(self, names: list[str], positions: list[float]) -> str:
-        """Take new goals; returns why they are refused, or nothing."""
+        """Take new goals; returns why they are rejected, or nothing."""
         goal = {**self.goal, **dict(zip(names, positions, strict=False))}
         unknown = set(goal) - set(self.position)
         if unknown or len(names) != len(positions):
@@ -89,9 +89,9 @@ class FakeDriver(Node):
         self._timer = self.create_timer(1.0 / values["rate_hz"], self._tick)
 
     def _command(self, message: JointState) -> None:
-        refused = self.drives.command(list(message.name), list(message.position))
-        if refused:
-            self.get_logger().error(f"command refused: {refused}")
+        rejection = self.drives.command(list(message.name), list(message.position))
+        if rejection:
+            self.get_logger().error(f"command rejected: {rejection}")
 
     def _tick(self) -> None:
         now = self.get_clock().now()

@@ -36,7 +36,7 @@ def test_drives_go_no_faster_than_they_can_and_stop_at_the_goal(drives):
     assert drives.position == {**before, "tube1_rotation": pytest.approx(before["tube1_rotation"] - 1.0)}
 
 
-def test_a_command_that_no_robot_can_follow_is_refused(drives):
+def test_a_command_that_no_robot_can_follow_is_rejected(drives):
     goal = dict(drives.goal)
     assert "above 0 m" in drives.command(["tube1_translation", "tube2_translation"], [0.1, 0.1])
     assert "unknown joints elbow" in drives.command(["elbow"], [0.0])
