@@ -31,6 +31,9 @@ class ModelErrorSearchOptions:
         times_s: correlation times that are tried: of slow motion, not of a vibration.
         prior: probability that a robot departs from its file beyond the tolerances. The file is trusted until evidence of a hundred to one.
         believed: probability from which on the estimate begins again with the model error.
+        learning_s: s after a start that do not count: the filter learns the sizes of force, shift and noise by a factor of ten at each measurement.
+        least_s: s of evidence before a model error is believed, ten of the shortest times and one of the longest. A deflection at rest or the
+            begin of a vibration is no slow departure yet.
         memory_s: s, for which evidence counts.
         remembered: measurements that may be taken again.
     """
@@ -41,6 +44,8 @@ class ModelErrorSearchOptions:
     times_s: tuple[float, ...] = (0.3, 1.0, 3.0)
     prior: float = 0.01
     believed: float = 0.99
+    learning_s: float = 0.5
+    least_s: float = 3.0
     memory_s: float = 10.0
     remembered: int = 200
 
@@ -131,8 +136,11 @@ class ModelErrorSearch:
         known, changed = foretold
         likely = -math.expm1(-elapsed / self._change_s)
         own = float(np.logaddexp(known + math.log1p(-likely), changed + math.log(likely)))
-        # 3. What is known of the past counts less and less.
+        # 3. What is known of the past counts less and less, and what the filter foretold while it learned does not count.
         decay, gain = math.exp(-elapsed / options.memory_s), before / total
+        if self._span(stamp_ns) < options.learning_s:
+            decay = own = 0.0
+            density[:] = 0.0
         weight = decay * last.weight + 1.0
         self._evidence.append(
             Evidence(
@@ -146,6 +154,10 @@ class ModelErrorSearch:
             )
         )
 
+    def _span(self, stamp_ns: int) -> float:
+        """s from the first measurement."""
+        return (stamp_ns - self._begin_ns) * 1e-9
+
     def probability(self, present: ModelErrorSize) -> float:
         """That the model errs by more than ``present``, which the filter counts on."""
         return float(self._weights(present).sum())
@@ -157,18 +169,14 @@ class ModelErrorSearch:
         return self._compared[1]
 
     def _compare(self, present: ModelErrorSize) -> Floats:
-        """(h,) probabilities of the hypotheses by which the tip departs farther, and at least as fast; others have none.
-
-        Only where their own correlation time has passed: how a vibration begins is no slow departure yet.
-        """
+        """(h,) probabilities of the hypotheses by which the tip departs farther, and at least as fast; others have none."""
         none = np.zeros(len(self.sizes))
         if not self._evidence:
             return none
         last, options = self._evidence[-1], self.options
         farther = self.sizes > math.sqrt(options.steps) * present.position
         faster = self.sizes**2 / self.times >= present.position**2 / present.time
-        seen = self.times <= (last.stamp_ns - self._begin_ns) * 1e-9
-        tried = farther & faster & seen
+        tried = farther & faster
         if not tried.any():
             return none
         prior = math.log(options.prior / len(self.sizes))
@@ -181,6 +189,8 @@ class ModelErrorSearch:
         """The model error that is believed instead of ``present``, which the filter counts on; None where there is none."""
         weights = self._weights(present)
         if weights.sum() <= self.options.believed:
+            return None
+        if self._span(self._evidence[-1].stamp_ns) < self.options.least_s:
             return None
         best = int(weights.argmax())
         turned = self._evidence[-1].turned - self._rotation_noise**2
