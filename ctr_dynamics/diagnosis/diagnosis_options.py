@@ -218,6 +218,9 @@ class SearchOptions:
     much_left: float = option(4.0, NOISE, "from which more hypotheses are tried")
     poor_fit: float = option(0.3, "of the misfit", "two causes that leave more are not made right by a third")
     acceptable: float = option(1.5, "times the noise", "squares; a hypothesis that leaves more is not right")
+    far_from_noise: float = option(
+        10.0, "times the noise", "squares; a poor fit that leaves more is not searched for again"
+    )
     further_gain: float = option(5.0, LOG, "that a further cause must add")
     further_slack: float = option(2.0, LOG, "by which the linear estimate of that may be wrong")
     further: int = option(4, COUNT, "further causes that are fitted beside a leader")
@@ -263,7 +266,7 @@ class DiscrepancyOptions:
     """Discrepancy: what models leave as a correlated process."""
 
     times_s: tuple[float, ...] = option(
-        (0.03, 0.1, 0.3, 1.0), "s", "correlation times; slower is the drift of the tracker"
+        (0.03, 0.1, 0.3, 1.0, 3.0), "s", "correlation times; slower is the drift of the tracker"
     )
     smallest: float = option(0.1, "of the position noise", "size that no bag of usual length shows")
     largest: float = option(100.0, "of the position noise", "larger is a configuration mistake")

@@ -17,6 +17,7 @@ from ctr_dynamics.diagnosis.diagnosis_options import DiagnosisOptions
 from ctr_dynamics.diagnosis.diagnosis_result import Diagnosis
 from ctr_dynamics.diagnosis.inference.calibration import calibrate, nuisances_of
 from ctr_dynamics.diagnosis.inference.candidates import candidates
+from ctr_dynamics.diagnosis.inference.discrepancy import fit_beside
 from ctr_dynamics.diagnosis.inference.evidence import weigh_by_prediction, weigh_discrepancy
 from ctr_dynamics.diagnosis.inference.fit_problem import Problem, choose_steps, make_problem
 from ctr_dynamics.diagnosis.inference.fit_quality import is_wrong
@@ -147,15 +148,18 @@ def diagnose_recordings(
     evidence = Evidence(result.whiteness_extended, result.validation, seen.excited, weighed, result.numerics)
     verdict = decide(problem, found, best, evidence, context)
     _take(result, verdict)
-    if verdict.word == "named_with_remainder" and verdict.discrepancy is not None:
-        # intervals with the remainder as a correlated process instead of larger noise
+    if verdict.causes and verdict.causes[0].candidate is not None and verdict.discrepancy is not None:
+        # values and intervals with the remainder as a correlated process instead of larger noise
+        beside = fit_beside(problem, best.fit, verdict.discrepancy) or best.fit
         result.extended = replace(
-            best.fit, covariance=verdict.discrepancy.covariance, chi2=min(best.fit.chi2, float(problem.size))
+            beside, covariance=verdict.discrepancy.covariance, chi2=min(beside.chi2, float(problem.size))
         )
+        if held_out is not None:
+            result.validation = validate(held_out, found.no_cause.fit, result.extended)
 
     # output: residuals for findings and report
     result.residual_recalibrated = problem.residuals(recalibrated.point)
-    result.residual_extended = problem.residuals(best.fit.point)
+    result.residual_extended = problem.residuals(result.extended.point)
 
     # learned force: what no cause explains, where it predicts bags that were not fitted
     measured = all(map(math.isfinite, result.numerics.values()))

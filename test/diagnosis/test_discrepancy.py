@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ctr_dynamics.diagnosis.inference.discrepancy import CorrelatedNoise, discrepancy_of
+from ctr_dynamics.diagnosis.forward_model import ForwardModel
+from ctr_dynamics.diagnosis.inference.discrepancy import CorrelatedNoise, discrepancy_of, fit_beside
 from ctr_dynamics.diagnosis.inference.fit_problem import make_problem
 from ctr_dynamics.diagnosis.inference.map_fit import fit
 
@@ -30,12 +31,15 @@ def plain(problem):
     return found
 
 
-def _noise(problem, rng, size, time):
-    """Whitened unit noise, and a process of ``size`` (m) with ``time`` (s) on every axis, made without the module under test."""
+def _noise(problem, rng, size, time, turn=None):
+    """Whitened unit noise, and a process of ``size`` (m) and ``turn`` (rad) with ``time`` (s) on every axis, made without the module under test.
+
+    Rotations turn with positions as the tip of a cantilever does, where ``turn`` is None.
+    """
     whiten, t = problem.whiteners[0], problem.forward_models[0].recording.stamps
     root = np.linalg.cholesky(np.exp(-np.abs(t[:, None] - t) / time) + 1e-10 * np.eye(len(t)))
     values = size * root @ rng.normal(size=(len(t), 6))
-    values[:, 3:] *= 1.5 / problem.robot.exposed_length
+    values[:, 3:] *= 1.5 / problem.robot.exposed_length if turn is None else turn / size
     return rng.normal(size=problem.size) + whiten(values)
 
 
@@ -63,3 +67,38 @@ def test_a_discrepancy_widens_what_it_can_imitate(problem, processes, plain):
     residual = _noise(problem, np.random.default_rng(0), size, 1.0)
     with_it = discrepancy_of(problem, replace(plain, residual=residual), processes).covariance
     assert with_it[0, 0] > 1.5 * plain.covariance[0, 0]
+
+
+def test_rotations_have_a_size_of_their_own(problem, processes, plain):
+    noise = problem.robot.tracker.noise
+    size, turn = 2.0 * noise.position.value, 20.0 * noise.rotation.value
+    found = []
+    for seed in SEEDS:
+        residual = _noise(problem, np.random.default_rng(seed), size, 0.1, turn)
+        found.append(discrepancy_of(problem, replace(plain, residual=residual), processes).sizes)
+    assert np.median([s[0] for s in found]) == pytest.approx(size, rel=0.4)
+    assert np.median([s[1] for s in found]) == pytest.approx(turn, rel=0.4)
+
+
+def test_a_fit_beside_a_discrepancy_follows_what_varies_fast(recording, robot, known):
+    """A slow error looks like a lag of the tracker where the noise is white. Beside a process that has it, the lag is found."""
+    lag = known["tracker_latency", "delay_s"]
+    late = ForwardModel(recording, robot).predict({lag.key: 0.02})
+    t, errors, expected = recording.stamps, [], []
+    root = np.linalg.cholesky(np.exp(-np.abs(t[:, None] - t) / 1.0) + 1e-10 * np.eye(len(t)))
+    for seed in SEEDS[:6]:
+        wander = 5e-3 * root @ np.random.default_rng(seed).normal(size=(len(t), 3))
+        seen = replace(recording, position=late.position + wander, quaternion=late.quaternion)
+        mask = np.array([True] * 3 + [False] * 3)
+        problem = make_problem(robot, [seen], [known["payload_mass", "added_kg"]], mask)
+        white = fit(problem, (lag,), {})
+        assert white is not None
+        found = discrepancy_of(problem, white, [CorrelatedNoise(problem, 1.0)])
+        beside = fit_beside(problem, white, found)
+        assert beside is not None
+        errors.append([white.point[lag.key] - 0.02, beside.point[lag.key] - 0.02])
+        place = [q.key for q in beside.active].index(lag.key)
+        expected.append(np.sqrt(found.covariance[place, place]))
+    of_white, of_beside = np.sqrt(np.mean(np.square(errors), axis=0))
+    assert of_beside < 0.4 * of_white
+    assert of_beside < 2.0 * np.sqrt(np.mean(np.square(expected)))

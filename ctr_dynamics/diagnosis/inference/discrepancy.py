@@ -1,25 +1,31 @@
 """Discrepancy: what a model leaves as a correlated process of unknown size, whose evidence competes with that of causes.
 
-In: fits of a problem. Out: for each, the log evidence with a discrepancy over that without, its size and its correlation time. The
-discrepancy is an Ornstein-Uhlenbeck process on every axis; Kennedy and O'Hagan (2001) argue for such a term. Positions have one size, and
-rotations turn with them as the tip of a cantilever does.
+In: fits of a problem. Out: for each, the log evidence with a discrepancy, its sizes and its correlation time. The discrepancy is an
+Ornstein-Uhlenbeck process on every axis; Kennedy and O'Hagan (2001) argue for such a term. Positions have one size, and rotations another.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 from scipy.special import log_ndtr, logsumexp
 
+from ctr_dynamics.diagnosis.forward_model import Key
 from ctr_dynamics.diagnosis.inference.fit_problem import Problem
 from ctr_dynamics.diagnosis.inference.gaussian_posterior import posterior, variances, within_tolerance
-from ctr_dynamics.diagnosis.inference.map_fit import Fit
+from ctr_dynamics.diagnosis.inference.map_fit import Fit, fit, fit_at
+from ctr_dynamics.effects import EffectQuantity
 
 Floats = NDArray[np.float64]
+Sizes = tuple[float, float]
+"""Of positions in m, and of rotations in rad."""
+ROUNDS = 4  # over both sizes
+SETTLED = 0.05  # log evidence, which decides nothing
 
 
 @dataclass(frozen=True)
@@ -27,38 +33,42 @@ class Discrepancy:
     """Posterior of a discrepancy beside one fit.
 
     Attributes:
-        log_bayes: log evidence with it over that without, averaged over its size and correlation time.
+        log_evidence: with it, averaged over its sizes and correlation time. log_bayes: that over the one without.
         rms_m: 3-D, of its positions. correlation_time_s: at which it has fallen to 1/e.
         covariance: (a, a) of the fit's coordinates, with it.
+        process, sizes: the likeliest correlation time, and the sizes in m and rad there.
     """
 
+    log_evidence: float
     log_bayes: float
     rms_m: float
     correlation_time_s: float
     covariance: Floats
+    process: CorrelatedNoise
+    sizes: Sizes
 
 
 class CorrelatedNoise:
-    """Eigenvectors of the whitened covariance of a process of unit size (m) with one correlation time, where it is diagonal.
+    """Eigenvectors of the whitened covariance of a process of unit size (m, rad) with one correlation time, where it is diagonal.
 
     Args:
         time: correlation time in s.
     """
 
     def __init__(self, problem: Problem, time: float) -> None:
-        # rad at the tip of a cantilever for each m of its deflection
-        turn = 1.5 / problem.robot.exposed_length
         self.time = time
         self._axes: list[tuple[Floats, Floats]] = []
+        of_position: list[NDArray[np.bool_]] = []
         for forward_model, whiten in zip(problem.forward_models, problem.whiteners, strict=True):
             t = forward_model.recording.stamps[whiten.used]
             process = np.exp(-np.abs(t[:, None] - t[None]) / time)
-            kinds = {True: whiten.covariance(process, position=True)}
-            if whiten.mask[3:].any():
-                kinds[False] = turn**2 * whiten.covariance(process, position=False)
-            turned = {kind: np.linalg.eigh(matrix) for kind, matrix in kinds.items()}
-            self._axes += [turned[bool(axis < 3)] for axis in np.flatnonzero(whiten.mask)]
+            axes = np.flatnonzero(whiten.mask)
+            kinds = dict.fromkeys((axes < 3).tolist())
+            turned = {kind: np.linalg.eigh(whiten.covariance(process, position=kind)) for kind in kinds}
+            self._axes += [turned[bool(axis < 3)] for axis in axes]
+            of_position += [np.full(len(t), axis < 3) for axis in axes]
         self.variance = np.maximum(np.concatenate([size for size, _ in self._axes]), 0.0)
+        self.of_position = np.concatenate(of_position)
 
     def __call__(self, whitened: Floats) -> Floats:
         """(m, ...) in the axes of the eigenvectors."""
@@ -68,36 +78,124 @@ class CorrelatedNoise:
             start += len(size)
         return np.concatenate(parts)
 
+    def scale(self, sizes: Sizes) -> Floats:
+        """(m,) factors that whiten values in the axes of the eigenvectors beside a process of these sizes."""
+        squares = np.where(self.of_position, sizes[0] ** 2, sizes[1] ** 2)
+        return np.asarray(1.0 / np.sqrt(1.0 + squares * self.variance))
 
-def discrepancy_of(problem: Problem, fit: Fit, processes: list[CorrelatedNoise]) -> Discrepancy:
-    """Evidence of a discrepancy beside ``fit``, with its size and one of the correlation times of ``processes``."""
+
+@dataclass
+class CorrelatedProblem(Problem):
+    """A problem whose noise has a correlated process beside it: residuals and derivatives are white with both."""
+
+    process: CorrelatedNoise | None = None
+    scale: Floats | None = None
+
+    @classmethod
+    def of(cls, problem: Problem, process: CorrelatedNoise, sizes: Sizes) -> CorrelatedProblem:
+        """``problem`` beside a process of ``sizes``."""
+        given = {f.name: getattr(problem, f.name) for f in fields(Problem)}
+        other = cls(**given, process=process, scale=process.scale(sizes))
+        other.numerics = other._white(problem.numerics)
+        return other
+
+    def _white(self, values: Floats) -> Floats:
+        assert self.process is not None
+        assert self.scale is not None
+        return (self.scale * self.process(values).T).T
+
+    def residual(self, point: Mapping[Key, float]) -> Floats | None:
+        """As that of a problem."""
+        found = super().residual(point)
+        return None if found is None else self._white(found)
+
+    def linearise(
+        self, point: Mapping[Key, float], wanted: Sequence[EffectQuantity]
+    ) -> tuple[Floats, Floats] | None:
+        """As that of a problem."""
+        found = super().linearise(point, wanted)
+        return None if found is None else (self._white(found[0]), self._white(found[1]))
+
+
+def fit_beside(problem: Problem, fit_before: Fit, discrepancy: Discrepancy) -> Fit | None:
+    """``fit_before`` again, with ``discrepancy`` as a part of the noise; as a fit of ``problem``. None where it cannot be simulated.
+
+    White noise makes a fit follow what varies slowly, where a correlated discrepancy leaves that open and trusts what varies fast.
+    """
+    keys = {q.key for q in fit_before.causes}
+    beside = CorrelatedProblem.of(problem, discrepancy.process, discrepancy.sizes)
+    beside.nuisances = tuple(q for q in fit_before.active if q.key not in keys or q.tolerance > 0.0)
+    found = fit(beside, fit_before.causes, fit_before.point, polish=False)
+    local = None if found is None else problem.linearise(found.point, found.active)
+    if found is None or local is None:
+        return None
+    return fit_at(problem, found.causes, found.active, found.values, *local)
+
+
+def discrepancy_of(problem: Problem, found_fit: Fit, processes: list[CorrelatedNoise]) -> Discrepancy:
+    """Evidence of a discrepancy beside ``found_fit``, with its sizes and one of the correlation times of ``processes``."""
+    noise = problem.robot.tracker.noise
     o = problem.options.discrepancy
-    noise = max(problem.robot.tracker.noise.position.value, 1e-6)
-    low, high = math.log(o.smallest * noise), math.log(o.largest * noise)
+    floors = np.array([max(noise.position.value, 1e-6), max(noise.rotation.value, 1e-6)])
     found = []
     plain = None
     for process in processes:
-        model = _Linear(problem, fit, process)
+        model = _Linear(problem, found_fit, process)
         if plain is None:
-            plain = model.log_evidence(0.0)[0]
-
-        def worse(log_size: float, model: _Linear = model) -> float:
-            return -model.log_evidence(math.exp(log_size))[0]
-
-        best = minimize_scalar(worse, bounds=(low, high), method="bounded", options={"xatol": 0.02})
-        at, h = float(best.x), 0.05
-        curvature = (worse(at + h) + worse(at - h) - 2.0 * float(best.fun)) / h**2
-        width = min(math.sqrt(2.0 * math.pi / max(curvature, 1e-6)), high - low)
-        found.append((-float(best.fun) + math.log(width / (high - low)), at, model))
+            plain = model.log_evidence((0.0, 0.0))[0]
+        found.append((*_best_sizes(model, np.log(o.smallest * floors), np.log(o.largest * floors)), model))
     assert plain is not None
     logs = np.array([log for log, _, _ in found])
     weights = np.exp(logs - logsumexp(logs))
-    size = math.exp(float(weights @ [at for _, at, _ in found]))
+    size = math.exp(float(weights @ [at[0] for _, at, _ in found]))
     time = math.exp(float(weights @ np.log([p.time for p in processes])))
     _, at, model = found[int(np.argmax(logs))]
-    covariance = model.log_evidence(math.exp(at))[1]
+    sizes = math.exp(at[0]), math.exp(at[1])
     average = float(logsumexp(logs)) - math.log(len(processes))
-    return Discrepancy(average - plain, math.sqrt(3.0) * size, time, covariance)
+    return Discrepancy(
+        average,
+        average - plain,
+        math.sqrt(3.0) * size,
+        time,
+        model.log_evidence(sizes)[1],
+        model.process,
+        sizes,
+    )
+
+
+def _best_sizes(model: _Linear, low: Floats, high: Floats) -> tuple[float, Floats]:
+    """Log evidence averaged over the sizes between exp ``low`` (2,) and exp ``high`` (2,), and the logarithms of the likeliest.
+
+    One after the other, until they stand: noise of positions and noise of rotations are apart but for the causes that move both.
+    """
+    kinds = [
+        kind
+        for kind, there in ((0, model.process.of_position.any()), (1, not model.process.of_position.all()))
+        if there
+    ]
+    at, h, best = low.copy(), 0.05, -math.inf
+
+    def worse(log_size: float, kind: int) -> float:
+        trial = at.copy()
+        trial[kind] = log_size
+        return -model.log_evidence((math.exp(trial[0]), math.exp(trial[1])))[0]
+
+    for _ in range(ROUNDS):
+        before = best
+        for kind in kinds:
+            found = minimize_scalar(
+                worse, args=(kind,), bounds=(low[kind], high[kind]), method="bounded", options={"xatol": 0.02}
+            )
+            at[kind], best = float(found.x), -float(found.fun)
+        if len(kinds) == 1 or best - before < SETTLED:
+            break
+    average = best
+    for kind in kinds:
+        here = float(at[kind])
+        curvature = (worse(here + h, kind) + worse(here - h, kind) + 2.0 * best) / h**2
+        span = float(high[kind] - low[kind])
+        average += math.log(min(math.sqrt(2.0 * math.pi / max(curvature, 1e-6)), span) / span)
+    return average, at
 
 
 class _Linear:
@@ -114,9 +212,9 @@ class _Linear:
         self.variance = np.array([by_key[q.key] for q in fit.active])
         self.departure = fit.values - np.array([q.off for q in fit.active])
 
-    def log_evidence(self, size: float) -> tuple[float, Floats]:
-        """Log evidence up to a constant, and covariance (a, a) of the coordinates, with a discrepancy of ``size`` (m)."""
-        scale = 1.0 / np.sqrt(1.0 + size**2 * self.process.variance)
+    def log_evidence(self, sizes: Sizes) -> tuple[float, Floats]:
+        """Log evidence up to a constant, and covariance (a, a) of the coordinates, with a discrepancy of ``sizes`` (m, rad)."""
+        scale = self.process.scale(sizes)
         departure, covariance, evidence = posterior(
             self.residual * scale,
             self.columns * scale[:, None],

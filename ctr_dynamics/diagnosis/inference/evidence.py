@@ -149,11 +149,11 @@ def weigh_discrepancy(found: WeighedHypotheses, problem: Problem, context: RunCo
     priors = np.array([log_prior(e.members, found.pool, o.prior) for e in asked])
     outside, temperature = o.prior.discrepancy, o.evidence.temperature
     plain = np.array([e.fitted_score for e in asked]) - priors
-    more = np.array([0.0 if e.discrepancy is None else e.discrepancy.log_bayes for e in asked])
+    beside = np.array([-np.inf if e.discrepancy is None else e.discrepancy.log_evidence for e in asked])
     scores = np.concatenate(
         [
             plain / temperature + priors + np.log(1.0 - outside),
-            (plain + more) / temperature + priors + np.log(outside),
+            beside / temperature + priors + np.log(outside),
         ]
     )
     weights = np.exp(scores - scores.max())
@@ -163,8 +163,8 @@ def weigh_discrepancy(found: WeighedHypotheses, problem: Problem, context: RunCo
     for i, p in enumerate(weights):
         part, effects = pooled[i // count], asked[i % count].effects
         part[effects] = part.get(effects, 0.0) + float(p)
-    alone, beside = (sorted(part.items(), key=lambda item: -item[1]) for part in pooled)
-    return WithDiscrepancy(alone, beside, asked[int(np.argmax(weights)) % count])
+    alone, with_it = (sorted(part.items(), key=lambda item: -item[1]) for part in pooled)
+    return WithDiscrepancy(alone, with_it, asked[int(np.argmax(weights)) % count])
 
 
 def weigh_by_prediction(

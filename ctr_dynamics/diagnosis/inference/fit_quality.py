@@ -30,6 +30,13 @@ def is_wrong(problem: Problem, hypothesis: Hypothesis) -> bool:
     return hypothesis.resolved and not is_acceptable(problem, hypothesis.fit)
 
 
+def is_far_from_noise(problem: Problem, hypothesis: Hypothesis, recalibrated: Fit) -> bool:
+    """Whether the likeliest ``hypothesis`` is so far from the noise, and explains so little, that nuisances beyond their tolerances would only follow
+    the error of the model."""
+    far = hypothesis.fit.chi2 > problem.options.search.far_from_noise * problem.size
+    return far and hypothesis.fit.cost > poor_fit_cost(problem, recalibrated)
+
+
 def poor_fit_cost(problem: Problem, recalibrated: Fit) -> float:
     """Cost that two causes must reach for a third, or for more care, to be worth it."""
     misfit = max(recalibrated.cost - problem.size, problem.size)

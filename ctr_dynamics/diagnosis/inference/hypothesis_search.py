@@ -14,7 +14,7 @@ from ctr_dynamics.diagnosis.inference.contact_plane import time_of_divergence
 from ctr_dynamics.diagnosis.inference.discretisation_error import correct_discretisation
 from ctr_dynamics.diagnosis.inference.evidence import WeighedHypotheses, probabilities, weigh
 from ctr_dynamics.diagnosis.inference.fit_problem import Problem
-from ctr_dynamics.diagnosis.inference.fit_quality import excess, explains
+from ctr_dynamics.diagnosis.inference.fit_quality import excess, explains, is_far_from_noise
 from ctr_dynamics.diagnosis.inference.hypotheses import Hypothesis, check_time_error, with_form
 from ctr_dynamics.diagnosis.inference.map_fit import Fit, corrected, fit
 from ctr_dynamics.diagnosis.inference.screening import screen
@@ -59,6 +59,8 @@ def search_hypotheses(
             found = _with_hypotheses(found, every, problem, found)
         if explains(problem, found.best, recalibrated) or context.out_of_time:
             return found
+    if is_far_from_noise(problem, found.best, recalibrated):
+        return found
     context.report("once more, with nuisances beyond their tolerances")
     free = replace(problem, reach=math.inf)
     far = fit(free, (), recalibrated.point, polish=False)

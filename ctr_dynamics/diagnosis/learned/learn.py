@@ -296,5 +296,7 @@ def _moving(problem: Problem) -> list[bool]:
 def _noises(problem: Problem) -> list[Noise]:
     """Correlation times of what is left, of which the evidence chooses; sizes are in deviations of the tracker's noise."""
     unit = max(problem.robot.tracker.noise.position.value, 1e-6)
+    turn = 1.5 / problem.robot.exposed_length  # rad at the tip of a cantilever for each m of its deflection
     processes = [CorrelatedNoise(problem, time) for time in problem.options.discrepancy.times_s]
-    return [Noise(p, unit**2 * p.variance, p.time) for p in processes]
+    units = [np.where(p.of_position, unit, unit * turn) for p in processes]
+    return [Noise(p, each**2 * p.variance, p.time) for p, each in zip(processes, units, strict=True)]

@@ -199,7 +199,9 @@ def _with_remainder(
             )
             return Verdict("clean", cause_sets=_sets(weighed, o), notes=[text], discrepancy=remainder)
         return _unknown(problem, found, weighed)
-    explained = 1.0 - _fraction_left(problem, found, best)
+    without = found.no_cause.discrepancy
+    # of the squares of what is left of positions, whatever the noise
+    explained = 0.0 if without is None else 1.0 - (remainder.rms_m / without.rms_m) ** 2
     sure = weighed.of(best.effects) >= o.verdict.named and explained >= o.discrepancy.dominant
     worse = validation is not None and validation.interval[1] < 0.0
     if not sure or worse:
@@ -212,7 +214,10 @@ def _with_remainder(
         if cause.separation is not None:  # noise is not what limits it
             cause.separation /= left
     if not all(cause.is_apart(o.verdict) for cause in result.causes):
-        return _unknown(problem, found, weighed)
+        result.word = "ambiguous"
+        result.notes.append(
+            f"{1e3 * remainder.rms_m:.1f} mm rms remain, correlated over {remainder.correlation_time_s:.2g} s, whichever cause it is"
+        )
     return result
 
 
