@@ -219,7 +219,9 @@ class SearchOptions:
     poor_fit: float = option(0.3, "of the misfit", "two causes that leave more are not made right by a third")
     acceptable: float = option(1.5, "times the noise", "squares; a hypothesis that leaves more is not right")
     far_from_noise: float = option(
-        10.0, "times the noise", "squares; a poor fit that leaves more is not searched for again"
+        10.0,
+        "times the noise",
+        "squares; a poor fit, or three causes, that leaves more is not searched for again",
     )
     further_gain: float = option(5.0, LOG, "that a further cause must add")
     further_slack: float = option(2.0, LOG, "by which the linear estimate of that may be wrong")

@@ -9,6 +9,7 @@ from diagnosis_cases import Vibration, quantity
 from ctr_dynamics.diagnosis.diagnosis_options import DiagnosisOptions
 from ctr_dynamics.diagnosis.inference.candidates import candidates, causes_of
 from ctr_dynamics.diagnosis.inference.fit_problem import make_problem
+from ctr_dynamics.diagnosis.inference.fit_quality import is_far_from_noise
 from ctr_dynamics.diagnosis.inference.hypotheses import Hypothesis, best_size_nearby
 from ctr_dynamics.diagnosis.inference.map_fit import fit
 from ctr_dynamics.diagnosis.inference.search_moves import (
@@ -70,3 +71,19 @@ def test_nuisances_that_a_cause_has_led_to_replace_those_without(recording, robo
     assert begin_again_without_causes(state)
     assert state.recalibrated.cost == pytest.approx(whole.cost, abs=1.0)
     assert not begin_again_without_causes(state)
+
+
+@pytest.mark.parametrize(
+    ("noises", "left", "causes", "far"),
+    [(8.0, 0.9, 1, False), (15.0, 0.9, 1, True), (15.0, 0.1, 1, False), (15.0, 0.1, 3, True)],
+)
+def test_a_search_far_from_the_noise_ends(recording, robot, known, noises, left, causes, far):
+    """Far above the noise, and little explained or as many causes as there may be: the error is the model's."""
+    problem = make_problem(robot, [recording], [], np.ones(6, bool))
+    some = fit(problem, (), {}, iterations=0)
+    assert some is not None
+    chi2 = noises * problem.size
+    before = problem.size + (chi2 - problem.size) / left
+    members = candidates(list(known.values()), recording.position)[:causes]
+    hypothesis = Hypothesis(tuple(members), replace(some, chi2=chi2, cost=chi2))
+    assert is_far_from_noise(problem, hypothesis, replace(some, chi2=before, cost=before)) is far

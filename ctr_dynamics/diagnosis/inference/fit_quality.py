@@ -8,6 +8,8 @@ from ctr_dynamics.diagnosis.inference.fit_problem import Problem
 from ctr_dynamics.diagnosis.inference.hypotheses import Hypothesis
 from ctr_dynamics.diagnosis.inference.map_fit import Fit
 
+MOST_CAUSES = 3  # of a hypothesis
+
 
 def excess(problem: Problem, fit: Fit) -> float:
     """Deviations by which the residual's squares exceed what noise gives."""
@@ -31,10 +33,11 @@ def is_wrong(problem: Problem, hypothesis: Hypothesis) -> bool:
 
 
 def is_far_from_noise(problem: Problem, hypothesis: Hypothesis, recalibrated: Fit) -> bool:
-    """Whether the likeliest ``hypothesis`` is so far from the noise, and explains so little, that nuisances beyond their tolerances would only follow
-    the error of the model."""
+    """Whether the likeliest ``hypothesis`` is so far from the noise that nuisances beyond their tolerances would only follow the error of the model:
+    it explains little, or has as many causes as there may be."""
     far = hypothesis.fit.chi2 > problem.options.search.far_from_noise * problem.size
-    return far and hypothesis.fit.cost > poor_fit_cost(problem, recalibrated)
+    most = len(hypothesis.members) == MOST_CAUSES
+    return far and (most or hypothesis.fit.cost > poor_fit_cost(problem, recalibrated))
 
 
 def poor_fit_cost(problem: Problem, recalibrated: Fit) -> float:
