@@ -82,6 +82,9 @@ def test_what_is_outside_the_catalogue_is_unknown(outcomes):
     assert findings["causes"][0]["effect"] == "unknown"
     assert findings["causes"][0]["separation"] is None
     assert any("like a force at the tip" in note for note in findings["notes"])
+    # it comes once, at a time of its own: nothing that predicts
+    assert findings["learned"] is None
+    assert any("nothing was learned" in note for note in findings["notes"])
 
 
 def test_a_robot_at_rest_cannot_be_diagnosed(outcomes):

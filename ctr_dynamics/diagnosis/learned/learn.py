@@ -19,6 +19,7 @@ from ctr_dynamics.diagnosis.inference.discrepancy import CorrelatedNoise
 from ctr_dynamics.diagnosis.inference.fit_problem import Problem, make_problem
 from ctr_dynamics.diagnosis.inference.gaussian_posterior import variances
 from ctr_dynamics.diagnosis.inference.map_fit import Fit, fit
+from ctr_dynamics.diagnosis.inference.sensitivities import off_nominal
 from ctr_dynamics.diagnosis.learned.dictionary import (
     EFFECT,
     Features,
@@ -186,8 +187,10 @@ def _terms(
     active, variance = variances(own.nuisances, base.causes)
     off = np.array([q.off for q in active])
     reach = np.array([own.reach * q.tolerance if q.tolerance else np.inf for q in active])
-    # nuisances are where they are to imitate the force that is missing
-    point = {q.key: q.off for q in active} | {q.key: base.point[q.key] for q in base.causes}
+    # nuisances that have left their tolerances imitate the force that is missing
+    point = {q.key: base.point[q.key] for q in active}
+    if off_nominal(own, base.point):
+        point.update({q.key: q.off for q in own.nuisances if q not in base.causes})
     force = np.zeros(len(columns))
     noises = _noises(own)
     coarse = own.with_least_step(o.dt_s)
@@ -203,6 +206,8 @@ def _terms(
     for strength in o.guidance:
         context.report(f"learning the unexplained force, guidance {strength:g}")
         found = _linearised(guided, point, active, strength, force, context)
+        if found is None and not chosen:
+            raise InputError("the model cannot be simulated on the measured path")
         if found is None:
             break
         residual, common, pressed = found
