@@ -101,6 +101,9 @@ def learn_force(
             terms = tuple(q for q in found.causes if q.effect == EFFECT)
     if found is None:
         return Learning(None, "the model cannot be simulated with the learned force")
+    left, before = found.chi2 / own.size - 1.0, base.chi2 / problem.size - 1.0
+    if left > (1.0 - problem.options.discrepancy.dominant) * before:
+        return Learning(None, "a learned force leaves most of the misfit of the bags that it is fitted to")
     context.report("validation of the learned force")
     gain = validate(on_robot(problem, robot, judged), base, found)
     reason = rejection(gain, held_out)
