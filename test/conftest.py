@@ -6,6 +6,7 @@ import os
 import shutil
 import subprocess
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 
 # Set before anything imports rclpy; child processes inherit both. 0 and the low ids are left to people.
@@ -19,6 +20,22 @@ import pytest
 from ctr_dynamics.one_blas_thread import one_blas_thread
 
 one_blas_thread()
+
+
+WITHOUT_ROS = find_spec("rclpy") is None
+collect_ignore = ["ros"] if WITHOUT_ROS else []
+
+
+def pytest_report_header() -> list[str]:
+    """Say in one line what is left out."""
+    return ["no ROS 2 here: test/ros and the tests marked ros are skipped"] if WITHOUT_ROS else []
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Tests that need ROS 2 are skipped where there is none."""
+    for item in items:
+        if WITHOUT_ROS and item.get_closest_marker("ros"):
+            item.add_marker(pytest.mark.skip(reason="no ROS 2 here"))
 
 
 @dataclass(frozen=True)
