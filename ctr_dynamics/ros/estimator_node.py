@@ -137,7 +137,7 @@ class EstimatorNode(Node):
         self._transforms = transform_topics.subscribe(self, self._taker)
         self.loop.start()
         self.get_logger().info(
-            f"robot '{self._robot.name}', policy '{self.timing.policy}', waiting for {topics.JOINT_STATES}"
+            f"robot '{self._robot.name}', policy '{self.timing.policy}', waiting for {self._inputs.names[topics.JOINT_STATES]}"
         )
 
     def _new_loop(self) -> StepLoop:
