@@ -26,6 +26,7 @@ from ctr_dynamics.estimation.monitoring.health import Health
 from ctr_dynamics.estimation.monitoring.innovation_log import InnovationLog
 from ctr_dynamics.estimation.monitoring.settling import Settling
 from ctr_dynamics.estimation.monitoring.statuses import all_statuses
+from ctr_dynamics.estimation.monitoring.unexpected_innovation import UnexpectedInnovation
 from ctr_dynamics.estimation.out_of_sequence import OutOfSequence
 from ctr_dynamics.estimation.runs import Runs
 from ctr_dynamics.estimation.step_output import SolverStats, StepOutput
@@ -133,6 +134,7 @@ class Estimator:
         self._modes = ModeTracker(self.model, self.options.modes_every)
         self._jacobian = JacobianTracker(self.model, self.options.jacobian_every)
         self._without_idle = 0  # steps since the last idle work
+        self._unexpected = UnexpectedInnovation(self._largest_deviation)
         self._driven_m = 0.0  # by which actuators may have moved the tip unknown to the last step
 
     # -- inputs --
@@ -192,6 +194,8 @@ class Estimator:
         change = self.inputs.add_load(stamp_ns, force, torque, frame_id)
         if change is not None:
             self.late.load_changed(change.from_ns, change.jumped)
+            if change.jumped:
+                self._unexpected.load_jumped(change.from_ns)
 
     # -- time --
 
@@ -384,7 +388,7 @@ class Estimator:
             health.restarts += 1
             return self._invalid(k, "the estimate is not finite; the model is reinitialised at rest")
         stamp = self.timeline.stamp(k)
-        deviation = position_deviation(tip.covariance)
+        deviation = tip.position_deviation
         if deviation > self._length:  # a tip that is known no better than that is not estimated any more
             fused.reinitialise(self.runs.open_loop, k)
             self.late.history.record(k)
@@ -394,15 +398,17 @@ class Estimator:
                 f"the tracker has led the estimate astray: deviation of the tip {deviation:.2g} m, limit "
                 f"{self._length:g} m; the filter is reinitialised from the open-loop run",
             )
+        innovations = self.innovations.take()
+        self._settling.take(innovations)
+        self._unexpected.take(innovations)
         fused.inflate_covariance(tip, self.runs.open_loop)
+        self._unexpected.inflate(tip.covariance, stamp)
         self._driven_m = self.inputs.actuator_error.inflate(
             tip.covariance, tip.position, self._length, stamp, late.lag * STEP_NS
         )
-        deviation = position_deviation(tip.covariance)
+        deviation = tip.position_deviation
         since = fused.measured_ns if fused.measured_ns is not None else self.t0_ns
         health.tracker_age_s = max(0.0, (stamp - (since or stamp)) * 1e-9)
-        innovations = self.innovations.take()
-        self._settling.take(innovations)
         unsettled = self._settling.problem(stamp)
         if unsettled:  # measurements tell nothing of the model's error either
             fused.model_error_search.clear()
@@ -491,8 +497,3 @@ class Estimator:
             "shortfall": self.health.shortfall,
         }
         return {**self.health.summary(), "numerics": numerics}
-
-
-def position_deviation(covariance: Floats) -> float:
-    """m, root of the trace of the position in the tip's ``covariance`` (12, 12)."""
-    return math.sqrt(max(covariance[0, 0] + covariance[1, 1] + covariance[2, 2], 0.0))

@@ -101,6 +101,12 @@ class TipEstimate(NamedTuple):
     force_sigma: Floats
     finite: bool
 
+    @property
+    def position_deviation(self) -> float:
+        """m, root of the trace of the position's covariance."""
+        covariance = self.covariance
+        return math.sqrt(max(covariance[0, 0] + covariance[1, 1] + covariance[2, 2], 0.0))
+
 
 class FilterState(NamedTuple):
     """What a checkpoint stores of a :class:`RodEkf`, part by part."""
