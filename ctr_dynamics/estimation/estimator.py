@@ -401,7 +401,7 @@ class Estimator:
         innovations = self.innovations.take()
         self._settling.take(innovations)
         self._unexpected.take(innovations)
-        fused.inflate_covariance(tip, self.runs.open_loop)
+        fused.inflate_covariance(tip, self.runs.open_loop, self._largest_deviation)
         self._unexpected.inflate(tip.covariance, stamp)
         self._driven_m = self.inputs.actuator_error.inflate(
             tip.covariance, tip.position, self._length, stamp, late.lag * STEP_NS

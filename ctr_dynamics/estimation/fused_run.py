@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -213,13 +214,17 @@ class FusedRun:
         self.reinitialise(open_loop, k)
         return True
 
-    def inflate_covariance(self, tip: TipEstimate, open_loop: OpenLoopRun) -> None:
+    def inflate_covariance(self, tip: TipEstimate, open_loop: OpenLoopRun, farthest: float) -> None:
         """Have the covariance of ``tip`` hold what else may be right: the open-loop run where the tracker may be late or the model may err more
-        than the filter counts on, the tracker where it is thought to be late or has been shifted since the start."""
-        if self.confirmed < CONFIRMED:
+        than the filter counts on, the tracker where it is thought to be late or has been shifted since the start.
+
+        A shift of more than ``farthest`` (m) is no error of a registration; outputs are invalid where tracker and model lie that far apart.
+        """
+        if self.confirmed < CONFIRMED and not self.ekf.adapted.noisy:
             # a shift that has been there since the start may be one of the registration, which belongs to the pose
             shift = self.ekf.shift_in_base()
-            tip.covariance[:3, :3] += np.multiply.outer(shift, shift)
+            if math.hypot(*shift.tolist()) < farthest:
+                tip.covariance[:3, :3] += np.multiply.outer(shift, shift)
         belief = self.delay_search.belief(self.ekf.delay)
         other = max(belief.late, self.model_error_search.probability(self.ekf.model_error))
         if not self._health.fusing or other < NEGLIGIBLE:
