@@ -21,11 +21,16 @@ def parameter(ekf, name):
 
 def nearest(covariance, row, value):
     """The x nearest to 0 in the norm of the inverse ``covariance`` with row x = value, by the conditions of Karush, Kuhn and Tucker."""
-    size = len(row)
+    known = (
+        covariance.diagonal() > 0.0
+    )  # what has no variance stays: the model error of a robot whose file states none
+    size = int(known.sum())
     system = np.zeros((size + 1, size + 1))
-    system[:size, :size] = np.linalg.inv(covariance)
-    system[:size, size] = system[size, :size] = row
-    return np.linalg.solve(system, np.append(np.zeros(size), value))[:size]
+    system[:size, :size] = np.linalg.inv(covariance[np.ix_(known, known)])
+    system[:size, size] = system[size, :size] = row[known]
+    x = np.zeros(len(row))
+    x[known] = np.linalg.solve(system, np.append(np.zeros(size), value))[:size]
+    return x
 
 
 def test_a_parameter_at_the_end_of_its_range_takes_the_rest_along(ekf):
