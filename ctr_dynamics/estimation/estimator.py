@@ -132,7 +132,7 @@ class Estimator:
         self._stability = StabilityWatch(self.model)
         self._stability_due = False
         self._modes = ModeTracker(self.model, self.options.modes_every)
-        self._jacobian = JacobianTracker(self.model, self.options.jacobian_every)
+        self._jacobian = JacobianTracker(self._modes.coarse, self.options.jacobian_every)
         self._without_idle = 0  # steps since the last idle work
         self._unexpected = UnexpectedInnovation(self._largest_deviation)
         self._driven_m = 0.0  # by which actuators may have moved the tip unknown to the last step

@@ -28,9 +28,7 @@ from ctr_dynamics.model.simulator import State
 
 Floats = NDArray[np.float64]
 NEGLIGIBLE = 1e-4  # probability of another delay or model error; less is no matter of the covariance
-CONFIRMED = (
-    8  # measurements without a shift, 0.2 s at 40 Hz, after which the registration is known to be right
-)
+CONFIRMED = 8  # measurements without a shift, 0.2 s at 40 Hz; the registration is known to be right then
 
 
 class FusedState(NamedTuple):
@@ -123,7 +121,7 @@ class FusedRun:
                     update.foretold,
                 )
             newer = self.measured_ns is None or measurement.stamp_ns > self.measured_ns
-            if update.accepted and newer and not self.ekf.tracker_fault()[0]:
+            if self.confirmed < CONFIRMED and update.accepted and newer and not self.ekf.tracker_fault()[0]:
                 self.confirmed += 1
             if update.dof:
                 self.measured_ns = max(self.measured_ns or 0, measurement.stamp_ns)

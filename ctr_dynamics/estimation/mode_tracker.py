@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 
 from ctr_dynamics.estimation.step_output import Modes
 from ctr_dynamics.estimation.timeline import seconds
-from ctr_dynamics.estimation.vibration_modes import ModalBasis, at_inputs, lanes_of, modal_parts
+from ctr_dynamics.estimation.vibration_modes import ModalBasis, lanes_of, modal_parts
 from ctr_dynamics.kernels.structures import SweepBuffers
 from ctr_dynamics.model.mesh import Key
 from ctr_dynamics.model.mesh_interpolation import MeshInterpolation, mesh_interpolation
 from ctr_dynamics.model.model import Model
-from ctr_dynamics.model.simulator import State
+from ctr_dynamics.model.state import State, at_inputs
 from ctr_dynamics.model.statics import Equilibrium, Statics
 
 Floats = NDArray[np.float64]
@@ -117,14 +117,8 @@ class ModeTracker:
 
     def _begin(self, state: State, parameters: Floats) -> None:
         now = state.inputs
-        equilibrium = Statics(self.model, self.options.tolerance).solve(
-            now.beta,
-            now.alpha,
-            now.force,
-            now.torque,
-            guess=state.unknowns_at_base,
-            parameters=parameters,
-            key=state.key,
+        equilibrium = Statics(self.model, self.options.tolerance).solve_at(
+            now, guess=state.unknowns_at_base, parameters=parameters, key=state.key
         )
         if not equilibrium.converged or equilibrium.key != state.key:
             return
@@ -137,8 +131,8 @@ class ModeTracker:
         par = at_inputs(self.model, parameters, now)
         on = equilibrium
         if self.coarse is not self.model:
-            on = Statics(self.coarse, self.options.tolerance).solve(
-                now.beta, now.alpha, now.force, now.torque, guess=equilibrium.x, parameters=parameters
+            on = Statics(self.coarse, self.options.tolerance).solve_at(
+                now, guess=equilibrium.x, parameters=parameters
             )
             if not on.converged:
                 return

@@ -11,15 +11,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctr_dynamics.estimation.step_output import NO_JACOBIAN
-from ctr_dynamics.estimation.vibration_modes import at_inputs, lanes_of, tip_response
+from ctr_dynamics.estimation.vibration_modes import lanes_of, tip_response
 from ctr_dynamics.kernels.structures import SweepBuffers
 from ctr_dynamics.model.mesh import Key
 from ctr_dynamics.model.model import Model
-from ctr_dynamics.model.simulator import State
+from ctr_dynamics.model.state import State, at_inputs
 from ctr_dynamics.model.statics import Statics
 
 Floats = NDArray[np.float64]
-NODES, TOLERANCE = 16, 1e-6  # of the mesh at most, and of the equilibrium's residual
+TOLERANCE = 1e-6  # of the equilibrium's residual
 
 
 class JacobianTracker:
@@ -29,13 +29,12 @@ class JacobianTracker:
     constant load, then force (N) and torque (N m) on the tip, base axes, with the actuators held.
 
     Args:
-        model: the robot.
+        model: the robot, on a mesh that is fine enough for its static shape.
         every: steps between two that are computed.
     """
 
     def __init__(self, model: Model, every: int) -> None:
         self.model, self._every = model, every
-        self._coarse = model if model.nodes <= NODES else Model(model.robot, NODES, model.base_cells)
         self._buffers: dict[Key, SweepBuffers] = {}
         self.clear()
 
@@ -49,14 +48,9 @@ class JacobianTracker:
         if self._age < self._every:
             return False
         self._age = 0
-        now, model = state.inputs, self._coarse
-        equilibrium = Statics(model, TOLERANCE).solve(
-            now.beta,
-            now.alpha,
-            now.force,
-            now.torque,
-            guess=state.unknowns_at_base,
-            parameters=parameters,
+        now, model = state.inputs, self.model
+        equilibrium = Statics(model, TOLERANCE).solve_at(
+            now, guess=state.unknowns_at_base, parameters=parameters
         )
         if not equilibrium.converged:
             self._found = None

@@ -158,14 +158,6 @@ def tip_response(model: Model, equilibrium: Equilibrium, par: Floats, buffers: S
     return np.asarray(columns[:6] / scale)
 
 
-def at_inputs(model: Model, parameters: Floats, now: Inputs) -> Floats:
-    """The parameter block (NP,) ``parameters`` with the actuators, standing, and the load of ``now``."""
-    par, layout = parameters.copy(), model.layout
-    par[layout["alpha"]], par[layout["beta"]], par[layout["alpha_rate"]] = now.alpha, now.beta, 0.0
-    par[layout["force"]], par[layout["torque"]] = now.force, now.torque
-    return par
-
-
 def _input_changes(model: Model) -> Floats:
     """(NP, 2N + 6) changes of the parameter block by those of :func:`_input_scale`."""
     layout, scale = model.layout, _input_scale(model.n)

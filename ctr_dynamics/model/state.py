@@ -83,6 +83,14 @@ class Record(NamedTuple):
     times: np.ndarray
 
 
+def at_inputs(model: Model, parameters: np.ndarray, now: Inputs) -> np.ndarray:
+    """The parameter block (NP,) ``parameters`` with the actuators, standing, and the load of ``now``."""
+    par, layout = parameters.copy(), model.layout
+    par[layout["alpha"]], par[layout["beta"]], par[layout["alpha_rate"]] = now.alpha, now.beta, 0.0
+    par[layout["force"]], par[layout["torque"]] = now.force, now.torque
+    return par
+
+
 @dataclass
 class State:
     """Everything that lives between steps; :meth:`copy` makes an independent one.

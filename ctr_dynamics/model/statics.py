@@ -18,6 +18,7 @@ from ctr_dynamics.kernels.shooting import CONVERGED, broadcast, solve
 from ctr_dynamics.kernels.sweep import sweep
 from ctr_dynamics.model.mesh import Key, Mesh
 from ctr_dynamics.model.model import Model
+from ctr_dynamics.model.state import Inputs
 
 
 @dataclass
@@ -73,6 +74,20 @@ class Statics:
     def __init__(self, model: Model, tolerance: float = 1e-9) -> None:
         self.model = model
         self.tolerance = tolerance
+
+    def solve_at(
+        self, inputs: Inputs, *, guess: np.ndarray, parameters: np.ndarray, key: Key | None = None
+    ) -> Equilibrium:
+        """Equilibrium at the actuators and the load of ``inputs``; the others as for :meth:`solve`."""
+        return self.solve(
+            inputs.beta,
+            inputs.alpha,
+            inputs.force,
+            inputs.torque,
+            guess=guess,
+            parameters=parameters,
+            key=key,
+        )
 
     def solve(
         self,

@@ -453,11 +453,11 @@ class EstimatorNode(Node):
         self.destroy_node()
 
 
-def main(args: list[str] | None = None) -> int:
-    """Run the node; returns 0 after SIGINT or SIGTERM, 2 when it cannot start with what it was given."""
+def main(args: list[str] | None = None, kind: type[EstimatorNode] = EstimatorNode) -> int:
+    """Run a node of that ``kind``; returns 0 after SIGINT or SIGTERM, 2 when it cannot start with what it was given."""
     sys.setswitchinterval(SWITCH_INTERVAL_S)
     keep_memory()
-    return run_node("estimator", EstimatorNode, EstimatorNode.close, args)
+    return run_node("estimator", kind, kind.close, args)
 
 
 if __name__ == "__main__":

@@ -11,10 +11,10 @@ from rclpy.lifecycle import LifecycleState, TransitionCallbackReturn
 from rclpy.lifecycle.node import LifecycleNodeMixin
 
 from ctr_dynamics.errors import InputError
-from ctr_dynamics.ros.estimator_node import SWITCH_INTERVAL_S, EstimatorNode
-from ctr_dynamics.ros.node_runner import RCLError, Stopped, exit_at_once, run_node
+from ctr_dynamics.ros.estimator_node import EstimatorNode
+from ctr_dynamics.ros.estimator_node import main as run_estimator
+from ctr_dynamics.ros.node_runner import RCLError, Stopped, exit_at_once
 from ctr_dynamics.ros.parameter_declaration import declared
-from ctr_dynamics.runtime.memory import keep_memory
 
 
 class ManagedEstimatorNode(LifecycleNodeMixin, EstimatorNode):
@@ -106,9 +106,7 @@ class ManagedEstimatorNode(LifecycleNodeMixin, EstimatorNode):
 
 def main(args: list[str] | None = None) -> int:
     """Run the node; returns 0 after SIGINT or SIGTERM, 2 when it cannot start with what it was given."""
-    sys.setswitchinterval(SWITCH_INTERVAL_S)
-    keep_memory()
-    return run_node("estimator", ManagedEstimatorNode, ManagedEstimatorNode.close, args)
+    return run_estimator(args, ManagedEstimatorNode)
 
 
 if __name__ == "__main__":

@@ -35,7 +35,8 @@ from ctr_dynamics.kernels.rotations import matrix
 from ctr_dynamics.kernels.tracker_measurement import fused_tip
 from ctr_dynamics.kernels.variance_likelihood import position_density, pull_to_zero
 from ctr_dynamics.model.model import Model
-from ctr_dynamics.model.simulator import Inputs, Simulator, State, StepResult
+from ctr_dynamics.model.simulator import Simulator, State, StepResult
+from ctr_dynamics.model.state import at_inputs
 from ctr_dynamics.sensing import Tip, TrackerModel
 from ctr_dynamics.sensing.tracker import DELAY, MODEL_POSITION, MODEL_ROTATION, SHIFT, STATES
 
@@ -56,7 +57,6 @@ class RodEkf:
     Attributes:
         theta: (p,) estimated changes of the uncertain parameters. bias: (22,) tracker states b. pi: (r + 22, r + 22) Pi.
         factor: V. tips: those of the last steps. adapted: of the unknown tip force. gate: counts rejections.
-        model_error: size that the filter counts on.
         insertion_fraction: of beta's rate, what the model's velocities hold already.
     """
 
@@ -86,7 +86,6 @@ class RodEkf:
         force = ForceRange(least, most, options.force_change)
         noise = self.model.robot.tracker.noise.position.value
         self.adapted = AdaptedVariances(force, noise, self.model.robot.tubes[0].length)
-        self.model_error = ModelErrorSize.of_robot(self.model.robot)
         self._noise = ProcessNoise(self.model.robot, dt, self._force, options.force_time, self.adapted)
         self.schedule = FactorSchedule()
         self._strides: ColumnStrides | None = None
@@ -101,11 +100,12 @@ class RodEkf:
         """Begin at the static equilibrium in ``state``, of the time ``stamp`` (s), with the robot file's tolerances as the prior."""
         inputs = state.inputs
         self.forget_parameters()
+        block = at_inputs(self.model, self.simulator.parameters, inputs)
         pi_aa = self.factor.start(
-            state.key, state.mesh, inputs.beta, inputs.alpha, self._block(inputs), state.unknowns_at_base
+            state.key, state.mesh, inputs.beta, inputs.alpha, block, state.unknowns_at_base
         )
         if self._strides is None:  # of the first start; the exposed length tells how they change
-            self._strides = ColumnStrides.of(self.model, state, self._block(inputs), self.simulator.scheme.dt)
+            self._strides = ColumnStrides.of(self.model, state, block, self.simulator.scheme.dt)
         r = len(pi_aa)
         self.bias[:] = 0.0
         self.bias[DELAY] = self._delay
@@ -146,17 +146,14 @@ class RodEkf:
         self.tips.size += math.ceil(max(delay, 0.0) / dt) - math.ceil(max(self._delay, 0.0) / dt)
         self._delay, self._delay_sigma = delay, max(sigma, float(self.tracker.state_sigma[DELAY]))
 
+    @property
+    def model_error(self) -> ModelErrorSize:
+        """Size of the model error that the filter counts on."""
+        return self._noise.model_error
+
     def expect_model_error(self, size: ModelErrorSize) -> None:
         """Start with a model error of another ``size``; :meth:`start` is next."""
-        self.model_error = size
-        self._noise.expect_model_error(size)
-
-    def _block(self, inputs: Inputs) -> Floats:
-        par = self.simulator.parameters.copy()
-        layout = self.model.layout
-        par[layout["force"]], par[layout["torque"]] = inputs.force, inputs.torque
-        par[layout["alpha"]], par[layout["beta"]], par[layout["alpha_rate"]] = inputs.alpha, inputs.beta, 0.0
-        return par
+        self._noise.model_error = size
 
     def forget_parameters(self) -> None:
         """Have the parameters of the robot file again."""

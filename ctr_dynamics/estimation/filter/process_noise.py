@@ -39,7 +39,7 @@ class ProcessNoise:
     ) -> None:
         self.dt, noise = dt, robot.tracker.noise
         self._drift = (DRIFT, noise.drift.value, noise.drift_time.value)
-        self.expect_model_error(ModelErrorSize.of_robot(robot))
+        self.model_error = ModelErrorSize.of_robot(robot)
         self._rows, self._time = force_rows, force_time
         self.adapted = adapted
         self._decay = math.exp(-dt / force_time)
@@ -48,21 +48,18 @@ class ProcessNoise:
         """The tip force of the parameters ``theta`` (p,) and its rows of the factor decay over one step, in place."""
         decay(self._decay, theta[self._rows], factor.theta[self._rows])
 
-    def expect_model_error(self, size: ModelErrorSize) -> None:
-        """Have a model error of that ``size`` from now on."""
-        self._slow = [
-            self._drift,
-            (MODEL_POSITION, size.position, size.time),
-            (MODEL_ROTATION, size.rotation, size.time),
-        ]
-
     def add(self, steps: int, pi: Floats, bias: Floats, factor: CovarianceFactor) -> Floats:
         """Process noise of the last ``steps`` steps.
 
         The tracker states ``bias`` (22,) and the covariance ``pi`` (r + 22, r + 22) change in place. The factor gets a column for each axis of
         the force, and the covariance with them is returned.
         """
-        for part, sigma, time in self._slow:
+        error = self.model_error
+        for part, sigma, time in (
+            self._drift,
+            (MODEL_POSITION, error.position, error.time),
+            (MODEL_ROTATION, error.rotation, error.time),
+        ):
             self._wander(part, sigma, math.exp(-steps * self.dt / time), pi, bias)
         return self._force(steps, pi, factor)
 

@@ -125,9 +125,7 @@ class DelaySearch:
         total = before + noise
         # 2. Density of the position, by that of the stated noise at zero.
         density = -0.5 * ((change**2).sum(axis=1) / total + 3.0 * math.log(total / noise))
-        known, changed = foretold
-        likely = -math.expm1(-elapsed / self._change_s)
-        own = float(np.logaddexp(known + math.log1p(-likely), changed + math.log(likely)))
+        own = density_of_filter(foretold, elapsed / self._change_s)
         # 3. What is known of the past counts less and less.
         decay = math.exp(-elapsed / options.memory_s)
         gain = before / total
@@ -199,6 +197,16 @@ class DelaySearch:
             last = self._evidence.pop()
             same = np.abs(self.delays - present_s) <= self.options.least_s
             self._evidence.append(last._replace(filter=max([last.filter, *last.delays[same]])))
+
+
+def density_of_filter(foretold: tuple[float, float], changes: float) -> float:
+    """Logarithm of the density that a filter gave to a measured position, of which it ``foretold`` one for either case.
+
+    The unknown force may have met a change since the measurement before: ``changes`` are expected in that time.
+    """
+    known, changed = foretold
+    likely = -math.expm1(-changes)
+    return float(np.logaddexp(known + math.log1p(-likely), changed + math.log(likely)))
 
 
 def allowance(probability: float) -> float:

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctr_dynamics.estimation.filter.filter_records import ModelErrorSize
+from ctr_dynamics.estimation.monitoring.delay_search import density_of_filter
 
 Floats = NDArray[np.float64]
 
@@ -133,9 +134,7 @@ class ModelErrorSearch:
         change, total = residual - level, before + noise
         # 2. Density of the position, by that of the stated noise at zero.
         density = -0.5 * ((change**2).sum(axis=1) / total + 3.0 * np.log(total / noise))
-        known, changed = foretold
-        likely = -math.expm1(-elapsed / self._change_s)
-        own = float(np.logaddexp(known + math.log1p(-likely), changed + math.log(likely)))
+        own = density_of_filter(foretold, elapsed / self._change_s)
         # 3. What is known of the past counts less and less, and what the filter foretold while it learned does not count.
         decay, gain = math.exp(-elapsed / options.memory_s), before / total
         if self._span(stamp_ns) < options.learning_s:

@@ -13,7 +13,10 @@ from collections import deque
 from collections.abc import Iterable
 from typing import NamedTuple
 
+import numpy as np
+
 from ctr_dynamics.io.messages.cdr import PoseIn
+from ctr_dynamics.kernels.rotations import multiply
 
 Vector = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]  # x, y, z, w
@@ -46,14 +49,8 @@ class NotYet(Exception):
 
 def product(a: Quaternion, b: Quaternion) -> Quaternion:
     """Product of two quaternions x, y, z, w."""
-    ax, ay, az, aw = a
-    bx, by, bz, bw = b
-    return (
-        aw * bx + ax * bw + ay * bz - az * by,
-        aw * by - ax * bz + ay * bw + az * bx,
-        aw * bz + ax * by - ay * bx + az * bw,
-        aw * bw - ax * bx - ay * by - az * bz,
-    )
+    w, x, y, z = multiply(np.array([a[3], *a[:3]]), np.array([b[3], *b[:3]])).tolist()
+    return x, y, z, w
 
 
 def rotated(q: Quaternion, v: Vector) -> Vector:
