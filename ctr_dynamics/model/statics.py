@@ -78,7 +78,14 @@ class Statics:
     def solve_at(
         self, inputs: Inputs, *, guess: np.ndarray, parameters: np.ndarray, key: Key | None = None
     ) -> Equilibrium:
-        """Equilibrium at the actuators and the load of ``inputs``; the others as for :meth:`solve`."""
+        """Equilibrium at given actuators and load.
+
+        Args:
+            inputs: actuators and tip wrench; rates do not count.
+            guess: x of a neighbouring equilibrium.
+            parameters: (NP,) block instead of the robot file's.
+            key: of sections to keep where they fit.
+        """
         return self.solve(
             inputs.beta,
             inputs.alpha,
