@@ -5,13 +5,12 @@ It is found now and then as idle work, by the tangent of the static equations. B
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 from numpy.typing import NDArray
 
 from ctr_dynamics.estimation.step_output import NO_JACOBIAN
 from ctr_dynamics.estimation.vibration_modes import lanes_of, tip_response
+from ctr_dynamics.kernels.output_rows import turned
 from ctr_dynamics.kernels.structures import SweepBuffers
 from ctr_dynamics.model.mesh import Key
 from ctr_dynamics.model.model import Model
@@ -70,15 +69,4 @@ class JacobianTracker:
             return NO_JACOBIAN
         alpha, jacobian = self._found
         turn = float((state.inputs.alpha - alpha).sum()) / self.model.n
-        return turned(jacobian, turn, self.model.n) if turn else jacobian
-
-
-def turned(jacobian: Floats, angle: float, n: int) -> Floats:
-    """The ``jacobian`` (6, 2N + 6) of a robot whose ``n`` tubes have turned together by ``angle`` (rad) about the base's z axis, with its load."""
-    c, s = math.cos(angle), math.sin(angle)
-    left, right = np.eye(6), np.eye(2 * n + 6)
-    for square, first in ((left, 0), (left, 3), (right, 2 * n), (right, 2 * n + 3)):
-        square[first, first] = square[first + 1, first + 1] = c
-        square[first + 1, first] = s
-        square[first, first + 1] = -s
-    return np.asarray(left @ jacobian @ right.T)
+        return turned(jacobian, turn) if turn else jacobian

@@ -1,6 +1,8 @@
-"""Rows of the outputs: amplitudes of the vibration modes, and the published backbone."""
+"""Rows of the outputs: amplitudes of the vibration modes, the published backbone, and the Jacobian of a robot that has turned."""
 
 import math
+
+import numpy as np
 
 from ctr_dynamics.kernels.compiled_rotations import matrix
 from ctr_dynamics.kernels.compiler import njit
@@ -68,3 +70,23 @@ def backbone_rows(s, nodes, fields, points, n, insertion_rate, rotation, bias, d
         for k in range(3):
             rows[i, 11 + k] = fields[base + 6 + k]
         rows[i, 14] = deviation[i]
+
+
+@compiled
+def turned(jacobian, angle):
+    """The tip's ``jacobian`` (6, 2N + 6) of a robot whose tubes have all turned by ``angle`` (rad) about the base's z axis, with their load.
+
+    Rows are position and rotation, the last columns force and torque: these turn. Tubes' own rotations and translations do not.
+    """
+    c, s = math.cos(angle), math.sin(angle)
+    rows, columns = jacobian.shape
+    result = np.empty((rows, columns))
+    for i in range(0, rows, 3):
+        for k in range(columns):
+            x, y = jacobian[i, k], jacobian[i + 1, k]
+            result[i, k], result[i + 1, k], result[i + 2, k] = c * x - s * y, s * x + c * y, jacobian[i + 2, k]
+    for k in range(columns - 6, columns, 3):
+        for i in range(rows):
+            x, y = result[i, k], result[i, k + 1]
+            result[i, k], result[i, k + 1] = c * x - s * y, s * x + c * y
+    return result
