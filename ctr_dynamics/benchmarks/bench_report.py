@@ -37,11 +37,6 @@ def text(result: Result) -> str:
         f"{r['step_us']:9.0f}  {r['step_ratio_to_plain_sweep']:12.1f}  {r['realtime_ratio']:15.1f}  {r['compiled_realtime_ratio']:18.1f}"
         for r in result["simulate"]
     ]
-    lines += ["", "many releases on one core", "nodes  cases  at once  throughput over one after another"]
-    lines += [
-        f"{r['nodes']:5d}  {r['cases']:5d}  {r['lanes']:7d}  {r['throughput_ratio']:34.2f}"
-        for r in result["ensemble"]
-    ]
     lines += ["", "a simulation with derivatives, in simulations without", "nodes  parameters  simulations"]
     lines += [
         f"{r['nodes']:5d}  {r['columns']:10d}  {r['simulations']:11.2f}" for r in result["sensitivities"]

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ctr_dynamics.benchmarks.ensemble import ensemble, sensitivity_cost
 from ctr_dynamics.benchmarks.fused import fused_replay
 from ctr_dynamics.benchmarks.machine_info import machine
 from ctr_dynamics.benchmarks.release import Release
 from ctr_dynamics.benchmarks.release_figures import grid, space_error, time_error, work
+from ctr_dynamics.benchmarks.sensitivity_cost import sensitivity_cost
 from ctr_dynamics.benchmarks.snap_steps import snap_cost
 from ctr_dynamics.benchmarks.sweeps import sweeps
 from ctr_dynamics.parameters import Settings
@@ -39,8 +39,7 @@ class Size:
     space_s: float
     space_nodes: tuple[int, ...]
     fine_nodes: int
-    cases: int
-    cases_s: float
+    derived_s: float
     rounds: int
 
 
@@ -62,8 +61,7 @@ LONG = Size(
     space_s=3.0,
     space_nodes=(10, 12, 16, 20, 24, 32, 50, 75, 100, 150, 200),
     fine_nodes=400,
-    cases=64,
-    cases_s=2.0,
+    derived_s=2.0,
     rounds=5,
 )
 QUICK = Size(
@@ -84,8 +82,7 @@ QUICK = Size(
     space_s=0.15,
     space_nodes=(12, 24, 48),
     fine_nodes=100,
-    cases=16,
-    cases_s=0.15,
+    derived_s=0.15,
     rounds=1,
 )
 
@@ -106,12 +103,9 @@ def measure(bag: Path, quick: bool, say: Callable[[str], None]) -> dict[str, Any
     say("release test: sweeps a solve, cost of a step")
     tolerance = float(Settings()["model.tolerance"])
     result["simulate"] = work(test, size.work_nodes, size.work_s, tolerance)
-    say("many simulations at once, and sensitivities")
-    result["ensemble"] = [
-        ensemble(test, nodes, size.cases, size.cases_s, tolerance) for nodes in size.work_nodes[:2]
-    ]
+    say("sensitivities")
     result["sensitivities"] = [
-        sensitivity_cost(test, nodes, size.cases_s, tolerance) for nodes in size.work_nodes[:2]
+        sensitivity_cost(test, nodes, size.derived_s, tolerance) for nodes in size.work_nodes[:2]
     ]
     say("replay with fusion")
     result["replay"] = [

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 
 from ctr_dynamics.benchmarks.machine_info import best_of
+from ctr_dynamics.kernels.collocation import ONE_RUN
 from ctr_dynamics.kernels.kinds import ONE_LANE, Lanes, lanes_for
-from ctr_dynamics.kernels.paired_time_step import PAIR_LANES
 from ctr_dynamics.kernels.sections import section_lengths
 from ctr_dynamics.kernels.shooting import broadcast
 from ctr_dynamics.kernels.sweep import sweep
@@ -19,8 +19,8 @@ from ctr_dynamics.model.time_scheme import make_scheme
 from ctr_dynamics.robot import Robot
 from ctr_dynamics.robot_files import load_robot, robot_from_dict, robot_to_dict
 
-# one lane; those of two runs at once; batches of eight
-LANES = (ONE_LANE, PAIR_LANES, lanes_for(8), lanes_for(16), lanes_for(32))
+# one lane; the stages of a step; batches of eight
+LANES = (ONE_LANE, ONE_RUN, lanes_for(8), lanes_for(16), lanes_for(32))
 
 
 def sweep_cost(model: Model, lanes: Lanes, repeats: int) -> float:
@@ -74,7 +74,7 @@ def sweeps(quick: bool) -> list[dict[str, Any]]:
             model = Model(robot, nodes=nodes)
             repeats = max(3, (2000 if quick else 20000) // nodes)
             plain = sweep_cost(model, ONE_LANE, repeats)
-            for lanes in LANES if tubes == 2 else (LANES[0], *LANES[2:4]):
+            for lanes in LANES[:3] if quick else LANES:
                 cost = (
                     sweep_cost(model, lanes, max(3, repeats // lanes.count))
                     if lanes is not ONE_LANE

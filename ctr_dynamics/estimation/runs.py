@@ -22,7 +22,6 @@ from ctr_dynamics.estimation.timeline import DT, seconds
 from ctr_dynamics.kernels import rotations
 from ctr_dynamics.model.collocation_pair import CollocationPair
 from ctr_dynamics.model.model import Model
-from ctr_dynamics.model.paired_steps import PairedSteps
 from ctr_dynamics.model.simulator import Simulator, StepResult
 from ctr_dynamics.model.time_scheme import Collocation, scheme_of
 from ctr_dynamics.parameters import Settings
@@ -52,8 +51,7 @@ class Runs:
         scheme = scheme_of(str(settings["model.scheme"]), DT, float(settings["model.alpha"]))
         tolerance = float(settings["model.tolerance"])
         corrected, nominal = Simulator(model, scheme, tolerance), Simulator(model, scheme, tolerance)
-        paired = CollocationPair if isinstance(scheme, Collocation) else PairedSteps
-        self._pair: CollocationPair | PairedSteps = paired(corrected, nominal)
+        self._pair = CollocationPair(corrected, nominal) if isinstance(scheme, Collocation) else None
         self._interpolated = InterpolatedInputs(model, inputs)
         load = np.zeros(model.input_count)  # of the robot file
         load[3 * model.n : 3 * model.n + 3] = model.plant.tip_force
@@ -194,6 +192,8 @@ class Runs:
         self, k: int, events: Sequence[float], record: bool
     ) -> tuple[StepResult, StepResult] | None:
         """Both runs to step ``k`` in the same sweeps; None where they cannot go together."""
+        if self._pair is None:
+            return None
         fused, open_loop = self.fused, self.open_loop
         assert fused.state is not None and open_loop.state is not None
         return self._pair.step(

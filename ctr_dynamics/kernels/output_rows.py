@@ -84,7 +84,11 @@ def turned(jacobian, angle):
     for i in range(0, rows, 3):
         for k in range(columns):
             x, y = jacobian[i, k], jacobian[i + 1, k]
-            result[i, k], result[i + 1, k], result[i + 2, k] = c * x - s * y, s * x + c * y, jacobian[i + 2, k]
+            result[i, k], result[i + 1, k], result[i + 2, k] = (
+                c * x - s * y,
+                s * x + c * y,
+                jacobian[i + 2, k],
+            )
     for k in range(columns - 6, columns, 3):
         for i in range(rows):
             x, y = result[i, k], result[i, k + 1]

@@ -133,29 +133,6 @@ class RunArrays(NamedTuple):
     nodes: np.ndarray
 
 
-@structure
-class PairBuffers(NamedTuple):
-    """For a step of two runs: buffers of their four lanes, a solver for Jacobians of one of them, and their histories (2, fields)."""
-
-    batch: SweepBuffers
-    solver: ShootingSolver
-    histories: np.ndarray
-
-
-class Cases(NamedTuple):
-    """Shooting problems that are solved together, C of them.
-
-    ``unknowns`` (5 + N, C), flat; ``inverse`` (C, m, m) Jacobians; ``fresh`` (C,): those whose inverse is not usable; ``alive`` (C,): those
-    that can be solved; ``sweeps`` (C,): counted on.
-    """
-
-    unknowns: np.ndarray
-    inverse: np.ndarray
-    fresh: np.ndarray
-    alive: np.ndarray
-    sweeps: np.ndarray
-
-
 class Solution(NamedTuple):
     """Where a two-point problem has been solved: ``parameters`` (NP,), ``unknowns`` (m,), ``history`` and ``base_history``."""
 

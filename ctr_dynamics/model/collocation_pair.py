@@ -47,7 +47,12 @@ class CollocationPair:
         record: bool = False,
         events: Sequence[float] = (),
     ) -> tuple[StepResult, StepResult] | None:
-        """As :meth:`ctr_dynamics.model.paired_steps.PairedSteps.step`."""
+        """Advance the states ``a`` of the first simulator and ``b`` of the second from t to t + dt (s) in place, as :meth:`Simulator.step` does
+        each, divided at ``events`` (s). With ``record`` the first result carries what the tangent of the step needs, until the state is written to.
+
+        None where they cannot go together: other sections or translations than each other's, sections that change, inputs that are not finite,
+        a hard step. Nothing is done then, but that the next step of a run that has failed begins with a new Jacobian.
+        """
         times = self.first.divisions(t, events)
         if len(times) == 2:
             return self._part(a, b, t, self.scheme, inputs_a, inputs_b, record)
