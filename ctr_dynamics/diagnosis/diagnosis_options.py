@@ -47,6 +47,15 @@ class RecordingOptions:
     start_noise: float = option(6.0, "deviations", "of the encoders' noise in a peak-to-peak value of rest")
     unsettled_s: float = option(2.0, "s", "until an unknown initial motion has died away; 1 s leaves 0.3 mm")
     first_load_s: float = option(0.1, "s", "a first load that comes this early acts from the start")
+    coarse_s: float = option(
+        1e-3, "s", "resolution of stamps that is made good; at 0.1 m/s finer ones move the tip by less than its noise"
+    )
+    coarse_steps: float = option(
+        3.0, "of the resolution", "in an interval at least; fewer are missing readings of an even sequence"
+    )
+    coarse_even: float = option(
+        0.9, "of the intervals", "that an even device explains, pauses apart; else it is uneven itself"
+    )
 
 
 @dataclass(frozen=True)

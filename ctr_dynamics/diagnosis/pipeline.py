@@ -148,7 +148,13 @@ def diagnose_recordings(
     evidence = Evidence(result.whiteness_extended, result.validation, seen.excited, weighed, result.numerics)
     verdict = decide(problem, found, best, evidence, context)
     _take(result, verdict)
-    if verdict.causes and verdict.causes[0].candidate is not None and verdict.discrepancy is not None:
+    named = any(cause.candidate is not None for cause in verdict.causes)
+    if best.members and not named:  # a cause that the verdict does not list is in no robot file
+        best = found.no_cause
+        result.extended, result.whiteness_extended = best.fit, result.whiteness_recalibrated
+        if held_out is not None:
+            result.validation = validate(held_out, best.fit, best.fit)
+    if named and verdict.discrepancy is not None:
         # values and intervals with the remainder as a correlated process instead of larger noise
         beside = fit_beside(problem, best.fit, verdict.discrepancy) or best.fit
         result.extended = replace(

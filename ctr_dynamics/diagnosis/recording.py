@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from ctr_dynamics.diagnosis.coarse_stamps import evened
 from ctr_dynamics.diagnosis.diagnosis_options import RecordingOptions
 from ctr_dynamics.errors import InputError
 from ctr_dynamics.io.bag_reader import Bag, open_bag
@@ -108,7 +109,8 @@ def read_recording(
     joints, loads, parted = _longest_part(_once(joints), _once(loads), o)
     notes += [parted] if parted else []
     t0 = joints[0][0]
-    table = np.array([[(stamp - t0) * 1e-9, *value] for stamp, value in joints])
+    table, coarse = _rows(joints, t0, o)
+    notes += [f"joint states: {coarse}"] if coarse else []
     reason = robot.actuator_problem(table[0, 1 + robot.n_tubes :], table[0, 1 : 1 + robot.n_tubes])
     if reason:
         raise InputError(
@@ -120,7 +122,8 @@ def read_recording(
             do="cut the bag; ten seconds with motion are enough",
             where=where,
         )
-    tracker = np.array([[(stamp - t0) * 1e-9, *value] for stamp, value in _once(poses)])
+    tracker, coarse = _rows(_once(poses), t0, o)
+    notes += [f"tracker poses: {coarse}"] if coarse else []
     inside = (tracker[:, 0] >= 0.0) & (tracker[:, 0] <= table[-1, 0])
     if not inside.all():
         notes.append(
@@ -166,6 +169,21 @@ def measured_axes(recordings: Sequence[Recording], notes: list[str]) -> NDArray[
     return mask
 
 
+def _rows(samples: Samples, t0: int, options: RecordingOptions) -> tuple[Floats, str]:
+    """(k, 1 + c): s after ``t0`` (ns), then the values; and a note where the stamps were coarse and are evened."""
+    stamps = np.array([stamp for stamp, _ in samples], dtype=np.int64)
+    times, step = evened(stamps, options)
+    values = np.array([value for _, value in samples])
+    rows = np.column_stack([(times + float(stamps[0] - t0)) * 1e-9, values])
+    if not step:
+        return rows, ""
+    moved = 1e-6 * float(np.abs(times - (stamps - stamps[0])).max())
+    return (
+        rows,
+        f"stamps are multiples of {1e-6 * step:g} ms; inside that they were made even, which moved them by up to {moved:.1f} ms",
+    )
+
+
 def _longest_part(joints: Samples, loads: Samples, options: RecordingOptions) -> tuple[Samples, Samples, str]:
     """The longest part of ``joints`` without a long gap, the ``loads`` in it, and a note on what was left out.
 
@@ -191,7 +209,7 @@ def _longest_part(joints: Samples, loads: Samples, options: RecordingOptions) ->
 def _moving(joints: Floats, robot: Robot, options: RecordingOptions) -> str:
     """Which actuator moves most at the beginning of ``joints`` (k, 1 + 2N), in words; empty where all stand."""
     n = robot.n_tubes
-    rows = joints[joints[:, 0] <= options.start_s]
+    rows = joints[: max(int(np.sum(joints[:, 0] <= options.start_s)), 2)]
     noise = options.start_noise * robot.encoders.noise.value
     least = np.repeat([options.start_rad + noise, options.start_m], n)
     travel = np.ptp(rows[:, 1:], axis=0)

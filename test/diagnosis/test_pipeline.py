@@ -34,6 +34,9 @@ def test_what_no_cause_explains_competes_by_its_evidence(recording, robot):
         robot, [wandering], context=RunContext(lambda stage: None, workers=1, time_budget_s=0.0)
     )
     assert found.verdict == "unknown"
+    assert found.search is not None
+    assert found.search.best.members  # the likeliest hypothesis has a cause, which is not named
+    assert found.extended.causes == ()
     assert found.discrepancy is not None
     told = findings(found, "", None)
     assert 1e-3 < told["discrepancy"]["rms_m"] < 2e-2

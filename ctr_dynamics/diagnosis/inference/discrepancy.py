@@ -1,7 +1,9 @@
 """Discrepancy: what a model leaves as a correlated process of unknown size, whose evidence competes with that of causes.
 
-In: fits of a problem. Out: for each, the log evidence with a discrepancy, its sizes and its correlation time. The discrepancy is an
-Ornstein-Uhlenbeck process on every axis; Kennedy and O'Hagan (2001) argue for such a term. Positions have one size, and rotations another.
+In: fits of a problem. Out: for each, the log evidence with a discrepancy, its sizes and its correlation time. The discrepancy is a Gaussian
+process on every axis, with Matern's covariance; Kennedy and O'Hagan (2001) argue for such a term. It is rough (smoothness 1/2, an
+Ornstein-Uhlenbeck process) or smooth (3/2, with a rate of its own, as the error of a model of a smooth motion has). Positions have one size, and
+rotations another.
 """
 
 from __future__ import annotations
@@ -11,6 +13,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 
 import numpy as np
+from joblib import delayed
 from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 from scipy.special import log_ndtr, logsumexp
@@ -19,6 +22,7 @@ from ctr_dynamics.diagnosis.forward_model import Key
 from ctr_dynamics.diagnosis.inference.fit_problem import Problem
 from ctr_dynamics.diagnosis.inference.gaussian_posterior import posterior, variances, within_tolerance
 from ctr_dynamics.diagnosis.inference.map_fit import Fit, fit, fit_at
+from ctr_dynamics.diagnosis.run_context import RunContext
 from ctr_dynamics.effects import EffectQuantity
 
 Floats = NDArray[np.float64]
@@ -26,6 +30,7 @@ Sizes = tuple[float, float]
 """Of positions in m, and of rotations in rad."""
 ROUNDS = 4  # over both sizes
 SETTLED = 0.05  # log evidence, which decides nothing
+SMOOTH = 2.1461932  # root of (1 + x) exp(-x) = 1 / e
 
 
 @dataclass(frozen=True)
@@ -48,20 +53,28 @@ class Discrepancy:
     sizes: Sizes
 
 
+def correlation(lag: Floats, smooth: bool) -> Floats:
+    """Matern's correlation at ``lag``, in units of that at which it is 1/e: of smoothness 3/2 or 1/2."""
+    if not smooth:
+        return np.asarray(np.exp(-lag))
+    x = SMOOTH * lag
+    return np.asarray((1.0 + x) * np.exp(-x))
+
+
 class CorrelatedNoise:
     """Eigenvectors of the whitened covariance of a process of unit size (m, rad) with one correlation time, where it is diagonal.
 
     Args:
-        time: correlation time in s.
+        time: in s, at which the correlation has fallen to 1/e. smooth: whether the process has a rate.
     """
 
-    def __init__(self, problem: Problem, time: float) -> None:
-        self.time = time
+    def __init__(self, problem: Problem, time: float, smooth: bool = False) -> None:
+        self.time, self.smooth = time, smooth
         self._axes: list[tuple[Floats, Floats]] = []
         of_position: list[NDArray[np.bool_]] = []
         for forward_model, whiten in zip(problem.forward_models, problem.whiteners, strict=True):
             t = forward_model.recording.stamps[whiten.used]
-            process = np.exp(-np.abs(t[:, None] - t[None]) / time)
+            process = correlation(np.abs(t[:, None] - t[None]) / time, smooth)
             axes = np.flatnonzero(whiten.mask)
             kinds = dict.fromkeys((axes < 3).tolist())
             turned = {kind: np.linalg.eigh(whiten.covariance(process, position=kind)) for kind in kinds}
@@ -132,8 +145,21 @@ def fit_beside(problem: Problem, fit_before: Fit, discrepancy: Discrepancy) -> F
     return fit_at(problem, found.causes, found.active, found.values, *local)
 
 
-def discrepancy_of(problem: Problem, found_fit: Fit, processes: list[CorrelatedNoise]) -> Discrepancy:
-    """Evidence of a discrepancy beside ``found_fit``, with its sizes and one of the correlation times of ``processes``."""
+def every_process(problem: Problem, context: RunContext) -> list[CorrelatedNoise]:
+    """Rough and smooth processes with every correlation time of the options."""
+    times = problem.options.discrepancy.times_s
+    return context.run(
+        delayed(CorrelatedNoise)(problem, time, smooth) for smooth in (False, True) for time in times
+    )
+
+
+def discrepancy_of(
+    problem: Problem, found_fit: Fit, processes: Sequence[CorrelatedNoise], among: int | None = None
+) -> Discrepancy:
+    """Evidence of a discrepancy beside ``found_fit``, with its sizes and as one of the ``processes``.
+
+    ``among``: number of all that are as likely before the data, where the others are known to contribute nothing; None stands for no others.
+    """
     noise = problem.robot.tracker.noise
     o = problem.options.discrepancy
     floors = np.array([max(noise.position.value, 1e-6), max(noise.rotation.value, 1e-6)])
@@ -151,7 +177,7 @@ def discrepancy_of(problem: Problem, found_fit: Fit, processes: list[CorrelatedN
     time = math.exp(float(weights @ np.log([p.time for p in processes])))
     _, at, model = found[int(np.argmax(logs))]
     sizes = math.exp(at[0]), math.exp(at[1])
-    average = float(logsumexp(logs)) - math.log(len(processes))
+    average = float(logsumexp(logs)) - math.log(among or len(processes))
     return Discrepancy(
         average,
         average - plain,

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from ctr_dynamics.diagnosis.diagnosis_options import DiagnosisOptions
 from ctr_dynamics.diagnosis.forward_model import Key
 from ctr_dynamics.diagnosis.inference.candidates import Candidate, log_prior
-from ctr_dynamics.diagnosis.inference.discrepancy import CorrelatedNoise, discrepancy_of
+from ctr_dynamics.diagnosis.inference.discrepancy import CorrelatedNoise, discrepancy_of, every_process
 from ctr_dynamics.diagnosis.inference.fit_problem import Problem
 from ctr_dynamics.diagnosis.inference.gaussian_posterior import posterior
 from ctr_dynamics.diagnosis.inference.hypotheses import Hypothesis, fit_exactly
@@ -128,23 +128,21 @@ class WithDiscrepancy:
 def weigh_discrepancy(found: WeighedHypotheses, problem: Problem, context: RunContext) -> WithDiscrepancy:
     """Let a discrepancy of unknown size compete with the likeliest hypotheses, by itself and beside each of them.
 
-    The likeliest hypothesis and that without causes are asked with every correlation time, the others with those that came out. Only the
-    fitted bags choose: those that were not fitted are left to judge.
+    The likeliest hypothesis and that without causes are asked with every process, the others with those that came out. Only the fitted
+    bags choose: those that were not fitted are left to judge.
     """
     o = problem.options
     first = [found.best] if found.best is found.no_cause else [found.best, found.no_cause]
     others = [e for e in found.hypotheses if e not in first][: o.discrepancy.hypotheses]
-    processes = context.run(delayed(CorrelatedNoise)(problem, time) for time in o.discrepancy.times_s)
+    processes = every_process(problem, context)
 
-    def ask(those: Sequence[Hypothesis], models: list[CorrelatedNoise]) -> None:
-        answers = context.run(delayed(discrepancy_of)(problem, e.fit, models) for e in those)
+    def ask(those: Sequence[Hypothesis], models: Sequence[CorrelatedNoise]) -> None:
+        answers = context.run(delayed(discrepancy_of)(problem, e.fit, models, len(processes)) for e in those)
         for e, answer in zip(those, answers, strict=True):
             e.discrepancy = answer
 
     ask(first, processes)
-    stood = [e.discrepancy.correlation_time_s for e in first if e.discrepancy is not None]
-    near = [min(processes, key=lambda p: abs(np.log(p.time / time))) for time in stood]
-    ask(others, list(dict.fromkeys(near)))
+    ask(others, list(dict.fromkeys(e.discrepancy.process for e in first if e.discrepancy is not None)))
     asked = [*first, *others]
     priors = np.array([log_prior(e.members, found.pool, o.prior) for e in asked])
     outside, temperature = o.prior.discrepancy, o.evidence.temperature
