@@ -48,7 +48,9 @@ class RecordingOptions:
     unsettled_s: float = option(2.0, "s", "until an unknown initial motion has died away; 1 s leaves 0.3 mm")
     first_load_s: float = option(0.1, "s", "a first load that comes this early acts from the start")
     coarse_s: float = option(
-        1e-3, "s", "resolution of stamps that is made good; at 0.1 m/s finer ones move the tip by less than its noise"
+        1e-3,
+        "s",
+        "resolution of stamps that is made good; at 0.1 m/s finer ones move the tip by less than its noise",
     )
     coarse_steps: float = option(
         3.0, "of the resolution", "in an interval at least; fewer are missing readings of an even sequence"
@@ -282,6 +284,8 @@ class DiscrepancyOptions:
     smallest: float = option(0.1, "of the position noise", "size that no bag of usual length shows")
     largest: float = option(100.0, "of the position noise", "larger is a configuration mistake")
     hypotheses: int = option(12, COUNT, "likeliest that are weighed with it, that without causes beside them")
+    refitted: int = option(8, COUNT, "hypotheses that are fitted again with it; one takes a few simulations")
+    refit_gain: float = option(15.0, LOG, "that such a fit may add; 10 to 12 on a real robot's log")
     dominant: float = option(0.5, "of the misfit", "that causes explain which are named beside a remainder")
 
 

@@ -17,7 +17,6 @@ from ctr_dynamics.diagnosis.diagnosis_options import DiagnosisOptions
 from ctr_dynamics.diagnosis.diagnosis_result import Diagnosis
 from ctr_dynamics.diagnosis.inference.calibration import calibrate, nuisances_of
 from ctr_dynamics.diagnosis.inference.candidates import candidates
-from ctr_dynamics.diagnosis.inference.discrepancy import fit_beside
 from ctr_dynamics.diagnosis.inference.evidence import weigh_by_prediction, weigh_discrepancy
 from ctr_dynamics.diagnosis.inference.fit_problem import Problem, choose_steps, make_problem
 from ctr_dynamics.diagnosis.inference.fit_quality import is_wrong
@@ -156,7 +155,7 @@ def diagnose_recordings(
             result.validation = validate(held_out, best.fit, best.fit)
     if named and verdict.discrepancy is not None:
         # values and intervals with the remainder as a correlated process instead of larger noise
-        beside = fit_beside(problem, best.fit, verdict.discrepancy) or best.fit
+        beside = verdict.discrepancy.fit
         result.extended = replace(
             beside, covariance=verdict.discrepancy.covariance, chi2=min(beside.chi2, float(problem.size))
         )

@@ -51,6 +51,10 @@ class Whitener:
         out = np.concatenate(parts)
         return out if values.ndim == 3 else out[:, 0]
 
+    def positions(self, whitened: Floats) -> Floats:
+        """(n, ...) in m of whitened positions (n, ...) of one axis: the inverse of whitening."""
+        return np.asarray(self._factor @ whitened)
+
     def covariance(self, process: Floats, position: bool) -> Floats:
         """Whitened covariance (n, n) of a process on one axis, whose covariance at the poses that count is ``process`` (m^2 or rad^2)."""
         if not position:

@@ -41,6 +41,7 @@ class EffectParameter:
         power: the coordinate is value^power: -1 for a stiffness that acts as a compliance, -2 where the effect grows with its square.
         shape: True for a parameter that has no effect by itself (a speed, an axis, a place); its ``off`` is where a search starts.
         period: of an angle that means the same again, rad; findings tell it from 0 on. 0: none.
+        unbounded: whether nothing bounds the size of a departure, as of the offset between two clocks: it may be many ``scale``.
     """
 
     name: str
@@ -54,6 +55,7 @@ class EffectParameter:
     power: int = 1
     shape: bool = False
     period: float = 0.0
+    unbounded: bool = False
 
     def coordinate(self, value: float) -> float:
         """The number in which the effect is nearly linear."""

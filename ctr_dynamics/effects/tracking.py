@@ -88,6 +88,7 @@ def tracker_lever_arm(plant: Plant, values: Values) -> None:
         0.015,
         lambda robot, i: robot.tracker.delay.tolerance,
         text="how much older than its stamp a pose is",
+        unbounded=True,  # drivers, networks and the clocks of two computers: from a millisecond to a good part of a second
     ),
     text="Tracker poses are older than their stamps.",
     source="reading(stamp) = pose(stamp - delay)",
@@ -98,7 +99,8 @@ def tracker_latency(plant: Plant, values: Values) -> None:
 
 @effect(
     "tracker_averaging",
-    EffectParameter("window_s", "s", 0.0, 0.04, low=0.0, text="length of the average before the stamp"),
+    # a mean delay of half of it, as plausible as that of tracker_latency
+    EffectParameter("window_s", "s", 0.0, 0.03, low=0.0, text="length of the average before the stamp"),
     text="The tracker averages over a time before its stamp: delay and loss of amplitude.",
     source="moving average",
 )

@@ -4,10 +4,17 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy import stats
 
 from ctr_dynamics.diagnosis.forward_model import ForwardModel
-from ctr_dynamics.diagnosis.inference.discrepancy import CorrelatedNoise, discrepancy_of, fit_beside
+from ctr_dynamics.diagnosis.inference.discrepancy import (
+    CorrelatedNoise,
+    CorrelatedProblem,
+    discrepancy_of,
+    fit_beside,
+)
 from ctr_dynamics.diagnosis.inference.fit_problem import make_problem
+from ctr_dynamics.diagnosis.inference.gaussian_posterior import tail_gain
 from ctr_dynamics.diagnosis.inference.map_fit import fit
 
 SEEDS = range(12)
@@ -102,3 +109,39 @@ def test_a_fit_beside_a_discrepancy_follows_what_varies_fast(recording, robot, k
     of_white, of_beside = np.sqrt(np.mean(np.square(errors), axis=0))
     assert of_beside < 0.4 * of_white
     assert of_beside < 2.0 * np.sqrt(np.mean(np.square(expected)))
+
+
+def test_a_smooth_error_is_told_from_a_rough_one(problem, plain):
+    t, size = problem.forward_models[0].recording.stamps, 5.0 * problem.robot.tracker.noise.position.value
+    both = [CorrelatedNoise(problem, 0.3, smooth) for smooth in (False, True)]
+    x = np.sqrt(3.0) * np.abs(t[:, None] - t) / 0.242  # Rasmussen and Williams (2006), eq. 4.17; 1/e at 0.3 s
+    root = np.linalg.cholesky((1.0 + x) * np.exp(-x) + 1e-10 * np.eye(len(t)))
+    for seed in SEEDS[:4]:
+        rng = np.random.default_rng(seed)
+        values = size * root @ rng.normal(size=(len(t), 6))
+        values[:, 3:] *= 1.5 / problem.robot.exposed_length
+        smooth = rng.normal(size=problem.size) + problem.whiteners[0](values)
+        rough = _noise(problem, rng, size, 0.3)
+        assert discrepancy_of(problem, replace(plain, residual=smooth), both).process.smooth
+        assert not discrepancy_of(problem, replace(plain, residual=rough), both).process.smooth
+        # processes that are not asked cost no more than their share of the prior
+        one, among = (discrepancy_of(problem, replace(plain, residual=smooth), both[1:], n) for n in (1, 2))
+        assert one.log_evidence - among.log_evidence == pytest.approx(np.log(2.0))
+
+
+def test_values_come_back_from_the_axes_of_a_process(problem):
+    process = CorrelatedNoise(problem, 0.3, smooth=True)
+    beside = CorrelatedProblem.of(problem, process, (1e-3, 1e-2))
+    values = np.random.default_rng(1).normal(size=(problem.size, 2))
+    np.testing.assert_allclose(beside.undone(beside.whitened(values)), values, atol=1e-12)
+
+
+def test_a_delay_may_be_many_times_its_usual_size_and_others_not(known):
+    """Cauchy's distribution over the normal one, by their densities."""
+    delay, other = known["tracker_latency", "delay_s"], known["actuator_latency", "delay_s"]
+    width = np.hypot(delay.scale, delay.tolerance)
+    for d in (0.0, 0.01, 0.1):
+        expected = stats.cauchy.logpdf(d, scale=width) - stats.norm.logpdf(d, scale=width)
+        assert tail_gain([other, delay], [0.3, d]) == pytest.approx(expected)
+    # an average over a window is as plausible as the delay that it makes in the mean
+    assert known["tracker_averaging", "window_s"].scale / 2.0 == delay.scale == other.scale

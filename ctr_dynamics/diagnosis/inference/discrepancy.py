@@ -20,7 +20,12 @@ from scipy.special import log_ndtr, logsumexp
 
 from ctr_dynamics.diagnosis.forward_model import Key
 from ctr_dynamics.diagnosis.inference.fit_problem import Problem
-from ctr_dynamics.diagnosis.inference.gaussian_posterior import posterior, variances, within_tolerance
+from ctr_dynamics.diagnosis.inference.gaussian_posterior import (
+    posterior,
+    tail_gain,
+    variances,
+    within_tolerance,
+)
 from ctr_dynamics.diagnosis.inference.map_fit import Fit, fit, fit_at
 from ctr_dynamics.diagnosis.run_context import RunContext
 from ctr_dynamics.effects import EffectQuantity
@@ -39,9 +44,10 @@ class Discrepancy:
 
     Attributes:
         log_evidence: with it, averaged over its sizes and correlation time. log_bayes: that over the one without.
-        rms_m: 3-D, of its positions. correlation_time_s: at which it has fallen to 1/e.
+        rms_m: 3-D, expected of its positions given the data. correlation_time_s: at which it has fallen to 1/e.
         covariance: (a, a) of the fit's coordinates, with it.
-        process, sizes: the likeliest correlation time, and the sizes in m and rad there.
+        process, sizes: the likeliest process, and its sizes in m and rad.
+        fit: that it stands beside.
     """
 
     log_evidence: float
@@ -51,6 +57,7 @@ class Discrepancy:
     covariance: Floats
     process: CorrelatedNoise
     sizes: Sizes
+    fit: Fit
 
 
 def correlation(lag: Floats, smooth: bool) -> Floats:
@@ -91,6 +98,32 @@ class CorrelatedNoise:
             start += len(size)
         return np.concatenate(parts)
 
+    def undone(self, turned: Floats) -> Floats:
+        """Whitened values (m, ...) of those in the axes of the eigenvectors."""
+        parts, start = [], 0
+        for size, vectors in self._axes:
+            parts.append(vectors @ turned[start : start + len(size)])
+            start += len(size)
+        return np.concatenate(parts)
+
+    def rms_m(self, problem: Problem, turned: Floats, size: float) -> float:
+        """3-D rms that is expected of a process of ``size`` (m), given what is left (m,) in the axes of the eigenvectors."""
+        total, start, samples, axis = 0.0, 0, 0, 0
+        for whiten in problem.whiteners:
+            count = int(whiten.used.sum())
+            for k in np.flatnonzero(whiten.mask):
+                variances, vectors = self._axes[axis]
+                left = turned[start : start + count]
+                start, axis = start + count, axis + 1
+                if k >= 3:
+                    continue
+                free = size**2 * np.maximum(variances, 0.0)
+                shown = free / (1.0 + free)
+                modes = np.sum(whiten.positions(vectors) ** 2, axis=0)
+                total += float(np.sum(whiten.positions(vectors @ (shown * left)) ** 2) + modes @ shown)
+            samples += count
+        return math.sqrt(total / samples)
+
     def scale(self, sizes: Sizes) -> Floats:
         """(m,) factors that whiten values in the axes of the eigenvectors beside a process of these sizes."""
         squares = np.where(self.of_position, sizes[0] ** 2, sizes[1] ** 2)
@@ -109,25 +142,44 @@ class CorrelatedProblem(Problem):
         """``problem`` beside a process of ``sizes``."""
         given = {f.name: getattr(problem, f.name) for f in fields(Problem)}
         other = cls(**given, process=process, scale=process.scale(sizes))
-        other.numerics = other._white(problem.numerics)
+        other.numerics = other.whitened(problem.numerics)
         return other
 
-    def _white(self, values: Floats) -> Floats:
+    def whitened(self, values: Floats) -> Floats:
+        """(m, ...) of values (m, ...) that are white without the process."""
         assert self.process is not None
         assert self.scale is not None
         return (self.scale * self.process(values).T).T
 
+    def undone(self, values: Floats) -> Floats:
+        """The inverse of :meth:`whitened`."""
+        assert self.process is not None
+        assert self.scale is not None
+        return self.process.undone((values.T / self.scale).T)
+
     def residual(self, point: Mapping[Key, float]) -> Floats | None:
         """As that of a problem."""
         found = super().residual(point)
-        return None if found is None else self._white(found)
+        return None if found is None else self.whitened(found)
 
     def linearise(
         self, point: Mapping[Key, float], wanted: Sequence[EffectQuantity]
     ) -> tuple[Floats, Floats] | None:
         """As that of a problem."""
         found = super().linearise(point, wanted)
-        return None if found is None else (self._white(found[0]), self._white(found[1]))
+        return None if found is None else (self.whitened(found[0]), self.whitened(found[1]))
+
+
+def as_beside(problem: CorrelatedProblem, found: Fit) -> Fit:
+    """``found``, a fit of the problem without the process, as one of ``problem``."""
+    return fit_at(
+        problem,
+        found.causes,
+        found.active,
+        found.values,
+        problem.whitened(found.residual),
+        problem.whitened(found.columns),
+    )
 
 
 def fit_beside(problem: Problem, fit_before: Fit, discrepancy: Discrepancy) -> Fit | None:
@@ -173,7 +225,6 @@ def discrepancy_of(
     assert plain is not None
     logs = np.array([log for log, _, _ in found])
     weights = np.exp(logs - logsumexp(logs))
-    size = math.exp(float(weights @ [at[0] for _, at, _ in found]))
     time = math.exp(float(weights @ np.log([p.time for p in processes])))
     _, at, model = found[int(np.argmax(logs))]
     sizes = math.exp(at[0]), math.exp(at[1])
@@ -181,12 +232,20 @@ def discrepancy_of(
     return Discrepancy(
         average,
         average - plain,
-        math.sqrt(3.0) * size,
+        model.process.rms_m(problem, model.left(sizes), sizes[0]),
         time,
         model.log_evidence(sizes)[1],
         model.process,
         sizes,
+        found_fit,
     )
+
+
+def refitted(problem: Problem, before: Discrepancy, among: int) -> Discrepancy:
+    """``before`` beside a fit with it as a part of the noise, if that is likelier; ``among`` as for :func:`discrepancy_of`."""
+    found = fit_beside(problem, before.fit, before)
+    after = None if found is None else discrepancy_of(problem, found, [before.process], among)
+    return before if after is None or after.log_evidence < before.log_evidence else after
 
 
 def _best_sizes(model: _Linear, low: Floats, high: Floats) -> tuple[float, Floats]:
@@ -238,6 +297,18 @@ class _Linear:
         self.variance = np.array([by_key[q.key] for q in fit.active])
         self.departure = fit.values - np.array([q.off for q in fit.active])
 
+    def left(self, sizes: Sizes) -> Floats:
+        """(m,) what is left of the residual at the likeliest departures, in the axes in which the discrepancy is diagonal."""
+        scale = self.process.scale(sizes)
+        best, _, _ = posterior(
+            self.residual * scale,
+            self.columns * scale[:, None],
+            self.departure,
+            self.variance,
+            self.numerics * scale[:, None],
+        )
+        return np.asarray(self.residual - self.columns @ (best - self.departure))
+
     def log_evidence(self, sizes: Sizes) -> tuple[float, Floats]:
         """Log evidence up to a constant, and covariance (a, a) of the coordinates, with a discrepancy of ``sizes`` (m, rad)."""
         scale = self.process.scale(sizes)
@@ -252,6 +323,8 @@ class _Linear:
         wide = {q.key for q in self.fit.causes}
         limit = self.options.calibration.tolerance_limit
         evidence += within_tolerance(self.fit.active, wide, departure, covariance, limit)
+        by_key = {q.key: d for q, d in zip(self.fit.active, departure, strict=True)}
+        evidence += tail_gain(self.fit.causes, [by_key[q.key] for q in self.fit.causes])
         for i, q in enumerate(self.fit.active):
             if q.key in wide and q.one_sided:
                 deviation = math.sqrt(max(covariance[i, i], 1e-30))

@@ -17,7 +17,12 @@ from numpy.typing import NDArray
 from ctr_dynamics.diagnosis.diagnosis_options import DiagnosisOptions
 from ctr_dynamics.diagnosis.forward_model import Key
 from ctr_dynamics.diagnosis.inference.candidates import Candidate, log_prior
-from ctr_dynamics.diagnosis.inference.discrepancy import CorrelatedNoise, discrepancy_of, every_process
+from ctr_dynamics.diagnosis.inference.discrepancy import (
+    CorrelatedNoise,
+    discrepancy_of,
+    every_process,
+    refitted,
+)
 from ctr_dynamics.diagnosis.inference.fit_problem import Problem
 from ctr_dynamics.diagnosis.inference.gaussian_posterior import posterior
 from ctr_dynamics.diagnosis.inference.hypotheses import Hypothesis, fit_exactly
@@ -128,12 +133,13 @@ class WithDiscrepancy:
 def weigh_discrepancy(found: WeighedHypotheses, problem: Problem, context: RunContext) -> WithDiscrepancy:
     """Let a discrepancy of unknown size compete with the likeliest hypotheses, by itself and beside each of them.
 
-    The likeliest hypothesis and that without causes are asked with every process, the others with those that came out. Only the fitted
-    bags choose: those that were not fitted are left to judge.
+    The likeliest hypothesis and that without causes are asked with every process, the others with those that came out. Hypotheses of one cause
+    are among them: beside a discrepancy fewer causes may do. Only the fitted bags choose: those that were not fitted are left to judge.
     """
     o = problem.options
     first = [found.best] if found.best is found.no_cause else [found.best, found.no_cause]
-    others = [e for e in found.hypotheses if e not in first][: o.discrepancy.hypotheses]
+    rest = [e for e in found.hypotheses if e not in first]
+    others = [e for i, e in enumerate(rest) if i < o.discrepancy.hypotheses or len(e.members) == 1]
     processes = every_process(problem, context)
 
     def ask(those: Sequence[Hypothesis], models: Sequence[CorrelatedNoise]) -> None:
@@ -145,13 +151,13 @@ def weigh_discrepancy(found: WeighedHypotheses, problem: Problem, context: RunCo
     ask(others, list(dict.fromkeys(e.discrepancy.process for e in first if e.discrepancy is not None)))
     asked = [*first, *others]
     priors = np.array([log_prior(e.members, found.pool, o.prior) for e in asked])
+    _refit_likeliest(asked, priors, problem, len(processes), context)
     outside, temperature = o.prior.discrepancy, o.evidence.temperature
     plain = np.array([e.fitted_score for e in asked]) - priors
-    beside = np.array([-np.inf if e.discrepancy is None else e.discrepancy.log_evidence for e in asked])
     scores = np.concatenate(
         [
             plain / temperature + priors + np.log(1.0 - outside),
-            beside / temperature + priors + np.log(outside),
+            _beside(asked) / temperature + priors + np.log(outside),
         ]
     )
     weights = np.exp(scores - scores.max())
@@ -163,6 +169,34 @@ def weigh_discrepancy(found: WeighedHypotheses, problem: Problem, context: RunCo
         part[effects] = part.get(effects, 0.0) + float(p)
     alone, with_it = (sorted(part.items(), key=lambda item: -item[1]) for part in pooled)
     return WithDiscrepancy(alone, with_it, asked[int(np.argmax(weights)) % count])
+
+
+def _beside(asked: Sequence[Hypothesis]) -> Floats:
+    """Log evidence of each with a discrepancy beside it."""
+    return np.array([-np.inf if e.discrepancy is None else e.discrepancy.log_evidence for e in asked])
+
+
+def _refit_likeliest(
+    asked: Sequence[Hypothesis], priors: Floats, problem: Problem, among: int, context: RunContext
+) -> None:
+    """Fit those again with their discrepancy that are within the gain of such a fit of the likeliest one with it, that first.
+
+    A fit to white noise that leaves much more follows the model's own error, and the evidence beside it is that of a linear model far from the
+    place where both are likeliest. What leaves about the noise is at its best already.
+    """
+    o, enough = problem.options.discrepancy, problem.options.search.acceptable * problem.size
+    done = {i for i, e in enumerate(asked) if e.fit.chi2 <= enough}
+    limit = len(done) + o.refitted
+    while len(done) < limit and not context.out_of_time:
+        scores = _beside(asked) + priors
+        reachable = scores + np.where(np.isin(np.arange(len(asked)), list(done)), 0.0, o.refit_gain)
+        best = int(np.argmax(reachable))
+        if best in done or not np.isfinite(reachable[best]):
+            return
+        e = asked[best]
+        assert e.discrepancy is not None
+        e.discrepancy = refitted(problem, e.discrepancy, among)
+        done.add(best)
 
 
 def weigh_by_prediction(

@@ -35,6 +35,20 @@ def variances(
     return tuple(active), np.array([prior_variance(q, q.key in wide) for q in active])
 
 
+def tail_gain(causes: Sequence[EffectQuantity], departure: Sequence[float]) -> float:
+    """Log density of Cauchy's distribution over the normal one, of the causes whose size nothing bounds.
+
+    Their prior has the same scale, but departures of many times that are rare and not impossible. The steps of a fit take it for a normal one:
+    where the data speak of so large a departure, they are much narrower than either.
+    """
+    total = 0.0
+    for q, d in zip(causes, departure, strict=True):
+        if q.parameter.unbounded:
+            z2 = d**2 / prior_variance(q, True)
+            total += 0.5 * math.log(2.0 / math.pi) - math.log1p(z2) + 0.5 * z2
+    return total
+
+
 def posterior(
     residual: Floats, columns: Floats, departure: Floats, variance: Floats, numerics: Floats
 ) -> tuple[Floats, Floats, float]:

@@ -37,7 +37,7 @@ class Hypothesis:
         predicted: log likelihood of bags that were not fitted, up to a constant, if known.
         exact: whether it was fitted with exact Jacobians.
         resolved: whether the error in time is small against what is left.
-        discrepancy: beside its causes, where it was asked for.
+        discrepancy: beside its causes, where it was asked for. beside: whether the fit is that beside it.
     """
 
     members: tuple[Candidate, ...]
@@ -48,6 +48,7 @@ class Hypothesis:
     exact: bool = False
     resolved: bool = True
     discrepancy: Discrepancy | None = None
+    beside: bool = False
 
     @property
     def effects(self) -> tuple[str, ...]:

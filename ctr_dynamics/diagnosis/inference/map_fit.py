@@ -22,6 +22,7 @@ from ctr_dynamics.diagnosis.inference.gaussian_posterior import (
     numerics_part,
     posterior,
     prior_variance,
+    tail_gain,
     variances,
     within_tolerance,
 )
@@ -154,6 +155,8 @@ class GaussNewton:
         self.problem, self.causes = problem, tuple(causes)
         self.active, self.variance = variances(problem.nuisances, causes)
         self.off = np.array([q.off for q in self.active])
+        place = {q.key: i for i, q in enumerate(self.active)}
+        self.of_causes = [place[q.key] for q in causes]
         free = {q.key for q in causes}
         reach = np.array([math.inf if q.key in free else problem.reach * q.tolerance for q in self.active])
         self.low = np.maximum([q.low for q in self.active], self.off - reach)
@@ -181,7 +184,9 @@ class GaussNewton:
 
     def cost_at(self, residual: Floats, values: Floats) -> float:
         """Cost of ``residual`` (m,) at ``values`` (a,)."""
-        return cost(residual, values - self.off, self.variance, self.problem.numerics)
+        departure = values - self.off
+        tails = tail_gain(self.causes, departure[self.of_causes])
+        return cost(residual, departure, self.variance, self.problem.numerics) - 2.0 * tails
 
     def renew(self) -> bool:
         """Exact columns where the fit stands; False where it cannot be simulated."""
@@ -298,7 +303,9 @@ def fit_at(
     departure = values - np.array([q.off for q in active])
     _, covariance, _ = posterior(residual, columns, departure, variance, numerics)
     J = np.hstack([columns * np.sqrt(variance), numerics])
-    total = cost(residual, departure, variance, numerics)
+    place = {q.key: i for i, q in enumerate(active)}
+    tails = tail_gain(causes, [departure[place[q.key]] for q in causes])
+    total = cost(residual, departure, variance, numerics) - 2.0 * tails
     evidence = -0.5 * total - 0.5 * float(np.linalg.slogdet(np.eye(J.shape[1]) + J.T @ J)[1])
     evidence += math.log(2.0) * sum(q.one_sided for q in causes)
     within = within_tolerance(active, wide, departure, covariance, o.tolerance_limit)

@@ -6,7 +6,7 @@ at zero says little (backlash, clearance, contact) is tried at finite sizes; its
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -68,6 +68,15 @@ class Sensitivities:
     def carried_to(self, fit: Fit) -> Sensitivities:
         """The same at a fit not far away: its residual and columns, and the candidates' sensitivities of here."""
         return Sensitivities(fit.point, fit.residual, {**self.columns, **fit.by_key}, self.by_candidate)
+
+    def mapped(self, to: Callable[[Floats], Floats]) -> Sensitivities:
+        """Residual and columns through a linear map ``to``, from one whitening to another; without the trials."""
+        return Sensitivities(
+            self.point,
+            to(self.residual),
+            {key: to(column) for key, column in self.columns.items()},
+            {c: to(columns) for c, columns in self.by_candidate.items()},
+        )
 
     def columns_of(self, c: Candidate) -> dict[Key, Floats]:
         """Columns of a candidate's quantities; empty where it has none."""

@@ -7,10 +7,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from ctr_dynamics.diagnosis.diagnosis_options import DiagnosisOptions
-from ctr_dynamics.diagnosis.inference.discrepancy import Discrepancy
+from ctr_dynamics.diagnosis.inference.discrepancy import CorrelatedProblem, Discrepancy, as_beside
 from ctr_dynamics.diagnosis.inference.evidence import WeighedHypotheses, WithDiscrepancy
 from ctr_dynamics.diagnosis.inference.fit_problem import Problem
 from ctr_dynamics.diagnosis.inference.fit_quality import is_wrong
@@ -207,12 +207,20 @@ def _with_remainder(
     if not sure or worse:
         return _unknown(problem, found, weighed)
     result = Verdict("named_with_remainder", cause_sets=_sets(weighed, o), discrepancy=remainder)
-    _separate(result, problem, found, best, context)
-    left = math.sqrt(max(1.0, best.fit.chi2 / problem.size))
+    beside = CorrelatedProblem.of(problem, remainder.process, remainder.sizes)
+    _separate(
+        result, beside, found, replace(best, fit=as_beside(beside, remainder.fit), beside=True), context
+    )
+    if result.sensitivities is not None:
+        result.sensitivities = result.sensitivities.mapped(beside.undone)
     for cause in result.causes:
         cause.probability = weighed.of((cause.effect,))
-        if cause.separation is not None:  # noise is not what limits it
-            cause.separation /= left
+        if cause.less_plausible:
+            rivals = " or ".join(name.replace("_", " ") for name in cause.less_plausible)
+            result.notes.append(
+                f"by the data alone {rivals} could stand in the place of {cause.effect.replace('_', ' ')}; "
+                "it would have a size that is less plausible"
+            )
     if not all(cause.is_apart(o.verdict) for cause in result.causes):
         result.word = "ambiguous"
         result.notes.append(

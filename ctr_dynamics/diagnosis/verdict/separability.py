@@ -26,6 +26,7 @@ class Cause:
         candidate: None for a configuration mistake and for a cause outside the catalogue.
         separation: from the nearest rival, in whitened units; None where there is no candidate.
         rivals: effects that cannot be told from it, nearest first.
+        less_plausible: effects that could stand in its place by the data, but only with a size that is less plausible before them.
     """
 
     candidate: Candidate | None
@@ -33,6 +34,7 @@ class Cause:
     probability: float | None
     separation: float | None = None
     rivals: list[str] = field(default_factory=list)
+    less_plausible: list[str] = field(default_factory=list)
 
     def is_apart(self, options: VerdictOptions) -> bool:
         """Whether it is told from every rival."""
@@ -66,7 +68,8 @@ def cause_with_rivals(
 ) -> Cause:
     """A cause of ``best`` with its nearest rivals: effects that could stand in its place.
 
-    Where a rival has been fitted in its place, the difference of the costs counts; it knows what linear sensitivities do not.
+    Where a rival has been fitted in its place, the difference of the costs counts; it knows what linear sensitivities do not, and how plausible
+    the sizes are. Beside a discrepancy ``problem`` and ``best`` are those with it, and the evidence with it counts in place of costs.
     """
     o = problem.options.verdict
     near: dict[str, tuple[float, float]] = {}  # effect: distance and the one that is needed
@@ -75,6 +78,7 @@ def cause_with_rivals(
         if rival.effect not in own:
             d = separation(problem, best.fit, (candidate,), rival, sensitivities)
             near[rival.effect] = min((d, o.separation), near.get(rival.effect, (math.inf, o.separation)))
+    alike = {name for name, (d, needed) in near.items() if d < needed}
     near.update(_fitted_rivals(found, best, candidate, o))
     rivals = sorted((d, name) for name, (d, needed) in near.items() if d < needed)
     nearest = min((d for d, _ in near.values()), default=math.inf)
@@ -85,6 +89,7 @@ def cause_with_rivals(
         found.probability_of(candidate.effect),
         min(nearest, by_itself),
         [name for _, name in rivals],
+        sorted(alike - {name for _, name in rivals}),
     )
 
 
@@ -99,7 +104,11 @@ def _fitted_rivals(
         others = [m for m in e.members if not m.keys <= rest]
         if len(others) == 1 and e.keys - others[0].keys == rest and others[0].effect not in own:
             more = e.fit.cost - best.fit.cost
-            if e.predicted is not None and best.predicted is not None:
+            if best.discrepancy is not None and best.beside:
+                if e.discrepancy is None:
+                    continue
+                more = 2.0 * (best.discrepancy.log_evidence - e.discrepancy.log_evidence)
+            elif e.predicted is not None and best.predicted is not None:
                 more += 2.0 * (best.predicted - e.predicted)
             d, needed = math.sqrt(max(more, 0.0)), options.separation_fitted
             fitted[others[0].effect] = min((d, needed), fitted.get(others[0].effect, (math.inf, needed)))
