@@ -284,8 +284,11 @@ class DiscrepancyOptions:
     smallest: float = option(0.1, "of the position noise", "size that no bag of usual length shows")
     largest: float = option(100.0, "of the position noise", "larger is a configuration mistake")
     hypotheses: int = option(12, COUNT, "likeliest that are weighed with it, that without causes beside them")
-    refitted: int = option(8, COUNT, "hypotheses that are fitted again with it; one takes a few simulations")
-    refit_gain: float = option(15.0, LOG, "that such a fit may add; 10 to 12 on a real robot's log")
+    refitted: int = option(
+        6,
+        COUNT,
+        "likeliest that are fitted again with it where much more than noise is left; a few simulations each",
+    )
     dominant: float = option(0.5, "of the misfit", "that causes explain which are named beside a remainder")
 
 

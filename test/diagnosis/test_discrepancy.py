@@ -1,6 +1,7 @@
 """A discrepancy: found where there is one, with its size and correlation time, and not where there is noise only."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from ctr_dynamics.diagnosis.inference.discrepancy import (
     discrepancy_of,
     fit_beside,
 )
+from ctr_dynamics.diagnosis.inference.evidence import dominant_part
 from ctr_dynamics.diagnosis.inference.fit_problem import make_problem
 from ctr_dynamics.diagnosis.inference.gaussian_posterior import tail_gain
 from ctr_dynamics.diagnosis.inference.map_fit import fit
@@ -145,3 +147,21 @@ def test_a_delay_may_be_many_times_its_usual_size_and_others_not(known):
         assert tail_gain([other, delay], [0.3, d]) == pytest.approx(expected)
     # an average over a window is as plausible as the delay that it makes in the mean
     assert known["tracker_averaging", "window_s"].scale / 2.0 == delay.scale == other.scale
+
+
+@pytest.mark.parametrize(
+    ("left_m", "expected"),
+    [
+        ({"": 5e-3, "a": 2.5e-3, "b": 4.9e-3, "ab": 2.4e-3}, "a"),  # b gains evidence, and takes nothing away
+        ({"": 5e-3, "a": 2.5e-3, "b": 4.9e-3, "ab": 1.5e-3}, "ab"),
+        ({"": 5e-3, "a": 4.5e-3, "b": 4.5e-3, "ab": 4e-3}, ""),
+        ({"": 5e-3, "ab": 2e-3}, "ab"),
+    ],
+)
+def test_a_cause_beside_a_discrepancy_takes_away_what_remains(left_m, expected):
+    def hypothesis(names, rms_m):
+        discrepancy = SimpleNamespace(rms_m=rms_m, log_evidence=100.0 * len(names))
+        return SimpleNamespace(keys=frozenset(names), members=tuple(names), discrepancy=discrepancy)
+
+    asked = [hypothesis(names, rms_m) for names, rms_m in left_m.items()]
+    assert dominant_part(asked, asked[-1], 0.5).members == tuple(expected)

@@ -113,7 +113,7 @@ class WithDiscrepancy:
 
     Attributes:
         alone: of sets of causes that explain all, likeliest first. beside: of sets with a discrepancy beside them; () is one alone.
-        leading: the likeliest hypothesis of all, with a discrepancy or without.
+        leading: the likeliest hypothesis of all, with a discrepancy or without; of one with it, the part that counts.
     """
 
     alone: list[tuple[tuple[str, ...], float]]
@@ -168,7 +168,29 @@ def weigh_discrepancy(found: WeighedHypotheses, problem: Problem, context: RunCo
         part, effects = pooled[i // count], asked[i % count].effects
         part[effects] = part.get(effects, 0.0) + float(p)
     alone, with_it = (sorted(part.items(), key=lambda item: -item[1]) for part in pooled)
-    return WithDiscrepancy(alone, with_it, asked[int(np.argmax(weights)) % count])
+    place = int(np.argmax(weights))
+    leading = asked[place % count]
+    if place >= count:
+        leading = dominant_part(asked, leading, o.discrepancy.dominant)
+    return WithDiscrepancy(alone, with_it, leading)
+
+
+def dominant_part(asked: Sequence[Hypothesis], leading: Hypothesis, dominant: float) -> Hypothesis:
+    """The smallest part of ``leading`` of which the other causes explain less than the fraction ``dominant`` of what it leaves.
+
+    Beside a discrepancy a further cause may gain much evidence by the finest details of the model's own error, whose covariance nobody knows. It is
+    needed where it takes away what remains.
+    """
+    assert leading.discrepancy is not None
+    left = leading.discrepancy.rms_m**2
+    parts = [
+        e
+        for e in asked
+        if e.keys <= leading.keys
+        and e.discrepancy is not None
+        and left > (1.0 - dominant) * e.discrepancy.rms_m**2
+    ]
+    return min(parts, key=lambda e: (len(e.members), -e.discrepancy.log_evidence if e.discrepancy else 0.0))
 
 
 def _beside(asked: Sequence[Hypothesis]) -> Floats:
@@ -179,24 +201,21 @@ def _beside(asked: Sequence[Hypothesis]) -> Floats:
 def _refit_likeliest(
     asked: Sequence[Hypothesis], priors: Floats, problem: Problem, among: int, context: RunContext
 ) -> None:
-    """Fit those again with their discrepancy that are within the gain of such a fit of the likeliest one with it, that first.
+    """Fit the likeliest again with their discrepancy.
 
     A fit to white noise that leaves much more follows the model's own error, and the evidence beside it is that of a linear model far from the
     place where both are likeliest. What leaves about the noise is at its best already.
     """
-    o, enough = problem.options.discrepancy, problem.options.search.acceptable * problem.size
+    enough = problem.options.search.acceptable * problem.size
     done = {i for i, e in enumerate(asked) if e.fit.chi2 <= enough}
-    limit = len(done) + o.refitted
-    while len(done) < limit and not context.out_of_time:
-        scores = _beside(asked) + priors
-        reachable = scores + np.where(np.isin(np.arange(len(asked)), list(done)), 0.0, o.refit_gain)
-        best = int(np.argmax(reachable))
-        if best in done or not np.isfinite(reachable[best]):
+    for _ in range(problem.options.discrepancy.refitted):
+        scores = np.where(np.isin(np.arange(len(asked)), list(done)), -np.inf, _beside(asked) + priors)
+        i = int(np.argmax(scores))
+        before = asked[i].discrepancy
+        if before is None or i in done or context.out_of_time:
             return
-        e = asked[best]
-        assert e.discrepancy is not None
-        e.discrepancy = refitted(problem, e.discrepancy, among)
-        done.add(best)
+        asked[i].discrepancy = refitted(problem, before, among)
+        done.add(i)
 
 
 def weigh_by_prediction(
