@@ -113,7 +113,7 @@ class WithDiscrepancy:
 
     Attributes:
         alone: of sets of causes that explain all, likeliest first. beside: of sets with a discrepancy beside them; () is one alone.
-        leading: the likeliest hypothesis of all, with a discrepancy or without; of one with it, the part that counts.
+        leading: the likeliest hypothesis of all, with a discrepancy or without.
     """
 
     alone: list[tuple[tuple[str, ...], float]]
@@ -151,46 +151,43 @@ def weigh_discrepancy(found: WeighedHypotheses, problem: Problem, context: RunCo
     ask(others, list(dict.fromkeys(e.discrepancy.process for e in first if e.discrepancy is not None)))
     asked = [*first, *others]
     priors = np.array([log_prior(e.members, found.pool, o.prior) for e in asked])
-    _refit_likeliest(asked, priors, problem, len(processes), context)
+    count = len(asked)
+    counts = np.where(take_away(asked, o.discrepancy.dominant), 0.0, -np.inf)
+    _refit_likeliest(asked, priors + counts, problem, len(processes), context)
     outside, temperature = o.prior.discrepancy, o.evidence.temperature
     plain = np.array([e.fitted_score for e in asked]) - priors
     scores = np.concatenate(
         [
             plain / temperature + priors + np.log(1.0 - outside),
-            _beside(asked) / temperature + priors + np.log(outside),
+            _beside(asked) / temperature + priors + counts + np.log(outside),
         ]
     )
     weights = np.exp(scores - scores.max())
     weights /= weights.sum()
-    count = len(asked)
     pooled: list[dict[tuple[str, ...], float]] = [{}, {}]
     for i, p in enumerate(weights):
         part, effects = pooled[i // count], asked[i % count].effects
         part[effects] = part.get(effects, 0.0) + float(p)
     alone, with_it = (sorted(part.items(), key=lambda item: -item[1]) for part in pooled)
-    place = int(np.argmax(weights))
-    leading = asked[place % count]
-    if place >= count:
-        leading = dominant_part(asked, leading, o.discrepancy.dominant)
-    return WithDiscrepancy(alone, with_it, leading)
+    return WithDiscrepancy(alone, with_it, asked[int(np.argmax(weights)) % count])
 
 
-def dominant_part(asked: Sequence[Hypothesis], leading: Hypothesis, dominant: float) -> Hypothesis:
-    """The smallest part of ``leading`` of which the other causes explain less than the fraction ``dominant`` of what it leaves.
+def take_away(asked: Sequence[Hypothesis], dominant: float) -> NDArray[np.bool_]:
+    """Which of ``asked`` leave less than the rest of the fraction ``dominant`` of what each smaller set of their causes leaves.
 
-    Beside a discrepancy a further cause may gain much evidence by the finest details of the model's own error, whose covariance nobody knows. It is
-    needed where it takes away what remains.
+    Beside a discrepancy a further cause may gain much evidence by the finest details of the model's own error, whose covariance nobody knows. It
+    counts where it takes away what remains.
     """
-    assert leading.discrepancy is not None
-    left = leading.discrepancy.rms_m**2
-    parts = [
-        e
-        for e in asked
-        if e.keys <= leading.keys
-        and e.discrepancy is not None
-        and left > (1.0 - dominant) * e.discrepancy.rms_m**2
-    ]
-    return min(parts, key=lambda e: (len(e.members), -e.discrepancy.log_evidence if e.discrepancy else 0.0))
+    left = [np.nan if e.discrepancy is None else e.discrepancy.rms_m**2 for e in asked]
+    return np.array(
+        [
+            not any(
+                part.keys < e.keys and mine > (1.0 - dominant) * its
+                for part, its in zip(asked, left, strict=True)
+            )
+            for e, mine in zip(asked, left, strict=True)
+        ]
+    )
 
 
 def _beside(asked: Sequence[Hypothesis]) -> Floats:
@@ -212,7 +209,7 @@ def _refit_likeliest(
         scores = np.where(np.isin(np.arange(len(asked)), list(done)), -np.inf, _beside(asked) + priors)
         i = int(np.argmax(scores))
         before = asked[i].discrepancy
-        if before is None or i in done or context.out_of_time:
+        if before is None or not np.isfinite(scores[i]) or context.out_of_time:
             return
         asked[i].discrepancy = refitted(problem, before, among)
         done.add(i)
