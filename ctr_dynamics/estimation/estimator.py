@@ -124,7 +124,8 @@ class Estimator:
         self._clear()
 
     def _clear(self) -> None:
-        self._settling = Settling(self.robot.tracker.noise.position.value)
+        noise = self.robot.tracker.noise.position.value
+        self._settling = Settling(noise)
         self._watched: tuple[int, Floats] | None = (
             None  # stamp and joints of a start, until they have told whether the robot moves
         )
@@ -134,7 +135,7 @@ class Estimator:
         self._modes = ModeTracker(self.model, self.options.modes_every)
         self._jacobian = JacobianTracker(self._modes.coarse, self.options.jacobian_every)
         self._without_idle = 0  # steps since the last idle work
-        self._unexpected = UnexpectedInnovation(self._largest_deviation)
+        self._unexpected = UnexpectedInnovation(self._largest_deviation, noise)
         self._driven_m = 0.0  # by which actuators may have moved the tip unknown to the last step
 
     # -- inputs --
@@ -400,7 +401,9 @@ class Estimator:
             )
         innovations = self.innovations.take()
         self._settling.take(innovations)
-        self._unexpected.take(innovations)
+        health.refutation = fused.ekf.refutation()
+        unsettled = self._settling.problem(stamp)
+        self._unexpected.take(innovations, fused.ekf.refuted, fused.agreed or bool(unsettled))
         fused.inflate_covariance(tip, self.runs.open_loop, self._largest_deviation)
         self._unexpected.inflate(tip.covariance, stamp)
         self._driven_m = self.inputs.actuator_error.inflate(
@@ -409,7 +412,6 @@ class Estimator:
         deviation = tip.position_deviation
         since = fused.measured_ns if fused.measured_ns is not None else self.t0_ns
         health.tracker_age_s = max(0.0, (stamp - (since or stamp)) * 1e-9)
-        unsettled = self._settling.problem(stamp)
         if unsettled:  # measurements tell nothing of the model's error either
             fused.model_error_search.clear()
             self.innovations.pass_over()

@@ -90,6 +90,11 @@ class FusedRun:
         self.ekf.start(state, t)
 
     @property
+    def agreed(self) -> bool:
+        """Whether measurements have agreed since the start."""
+        return self.confirmed >= CONFIRMED
+
+    @property
     def inputs_at(self) -> RunInputs:
         """Actuators and load with the estimated offsets and force."""
         return RunInputs(self._interpolated, self._load, self._by_theta, self.ekf.theta)
@@ -121,7 +126,7 @@ class FusedRun:
                     update.foretold,
                 )
             newer = self.measured_ns is None or measurement.stamp_ns > self.measured_ns
-            if self.confirmed < CONFIRMED and update.accepted and newer and not self.ekf.tracker_fault()[0]:
+            if not self.agreed and update.accepted and newer and not self.ekf.tracker_fault()[0]:
                 self.confirmed += 1
             if update.dof:
                 self.measured_ns = max(self.measured_ns or 0, measurement.stamp_ns)
@@ -218,7 +223,7 @@ class FusedRun:
 
         A shift of more than ``farthest`` (m) is no error of a registration; outputs are invalid where tracker and model lie that far apart.
         """
-        if self.confirmed < CONFIRMED and not self.ekf.adapted.noisy:
+        if not self.agreed and not self.ekf.adapted.noisy:
             # a shift that has been there since the start may be one of the registration, which belongs to the pose
             shift = self.ekf.shift_in_base()
             if math.hypot(*shift.tolist()) < farthest:

@@ -24,6 +24,7 @@ def replay_notes(bag: Bag, settings: Settings, numbers: dict[str, Any]) -> list[
         *notes,
         *input_notes(numbers["input_problems"]),
         *_model_error(numbers["model_error"]),
+        *_refutation(numbers["refutation"]),
         *_left_out(numbers),
     ]
 
@@ -36,6 +37,11 @@ def _model_error(found: dict[str, float] | None) -> list[str]:
         f"the tip departs from its model by {1e3 * found['position']:.1f} mm and {math.degrees(found['rotation']):.1f} deg per axis, for "
         f"{found['time']:g} s, beyond the robot file: the filter has counted on that; measure it with ctr-dynamics calibrate"
     ]
+
+
+def _refutation(found: str) -> list[str]:
+    """Where the estimate has left the tolerances of the robot file at the end."""
+    return [f"{found}: calibrate it with ctr-dynamics calibrate, or widen its tolerances"] if found else []
 
 
 def shortfall(bag: Bag, settings: Settings, numbers: dict[str, Any]) -> str:

@@ -24,7 +24,7 @@ def deviation(watch, at_ms):
 
 
 def test_the_distance_counts_until_measurements_in_a_row_agree():
-    watch = UnexpectedInnovation(0.02)
+    watch = UnexpectedInnovation(0.02, 1e-4)
     watch.take([innovation(0, 1e-4, 5.0), innovation(25, 1e-4, 22.0)])
     assert deviation(watch, 30) == 0.0  # chance
     watch.take([innovation(50, 2e-3, 60.0)])
@@ -38,7 +38,7 @@ def test_the_distance_counts_until_measurements_in_a_row_agree():
 
 
 def test_one_outside_the_gate_counts_after_a_jump_of_the_load_alone():
-    watch = UnexpectedInnovation(0.02)
+    watch = UnexpectedInnovation(0.02, 1e-4)
     watch.take([innovation(0, 1e-4, 5.0), innovation(25, 3e-3, 200.0, accepted=False)])
     assert deviation(watch, 30) == 0.0
     watch.load_jumped(40 * MS)
@@ -49,6 +49,31 @@ def test_one_outside_the_gate_counts_after_a_jump_of_the_load_alone():
     watch.take([innovation(75 + 25 * i, 1e-4, 3.0) for i in range(AGREEING)])
     watch.take([innovation(5000, 3e-3, 200.0, accepted=False)])
     assert deviation(watch, 5000) == 0.0
+
+
+def test_before_anything_has_agreed_any_distance_counts():
+    """A registration that is 19 mm off is as likely as an outlier of the tracker; half a metre is not."""
+    watch = UnexpectedInnovation(0.02, 1e-4)
+    watch.take([innovation(0, 0.5, 1e9, accepted=False)], confirmed=False)
+    assert deviation(watch, 0) == 0.0
+    watch.take([innovation(0, 1.9e-2, 1e5, accepted=False)], confirmed=False)
+    assert deviation(watch, 0) == pytest.approx(1.9e-2)
+    watch.take([innovation(25, np.nan, 1e5, accepted=False)], confirmed=False)  # no position is measured
+    assert deviation(watch, 0) == pytest.approx(1.9e-2)
+    watch.take([innovation(50 + 25 * i, 1e-4, 3.0) for i in range(AGREEING)])
+    watch.take([innovation(500, 1.9e-2, 1e5, accepted=False)])
+    assert deviation(watch, 500) == 0.0
+
+
+def test_with_a_refuted_robot_file_the_covariance_holds_what_measurements_lie_apart():
+    watch = UnexpectedInnovation(0.02, 1e-4)
+    probable = [innovation(25 * i, 2e-3, 5.0, accepted=i % 2 == 0) for i in range(100)]
+    watch.take(probable)
+    assert deviation(watch, 2500) == 0.0
+    watch.take(probable, refuted=True)
+    assert deviation(watch, 2500) == pytest.approx(2e-3, rel=0.01)
+    watch.take([], refuted=False)
+    assert deviation(watch, 2500) == 0.0
 
 
 def test_after_the_release_of_a_robot_with_a_heavier_payload_the_covariance_holds():

@@ -29,6 +29,7 @@ from ctr_dynamics.estimation.filter.parameter_priors import force_range, model_u
 from ctr_dynamics.estimation.filter.process_noise import ProcessNoise
 from ctr_dynamics.estimation.filter.rational_step import ColumnStrides, exposed
 from ctr_dynamics.estimation.filter.tip_window import TipWindow, insertion_fraction
+from ctr_dynamics.estimation.filter.tolerances import Tolerances, gain_beside, release
 from ctr_dynamics.estimation.step_output import FUSION_OFF
 from ctr_dynamics.kernels.factor_operations import move_unknowns
 from ctr_dynamics.kernels.rotations import matrix
@@ -57,6 +58,7 @@ class RodEkf:
     Attributes:
         theta: (p,) estimated changes of the uncertain parameters. bias: (22,) tracker states b. pi: (r + 22, r + 22) Pi.
         factor: V. tips: those of the last steps. adapted: of the unknown tip force. gate: counts rejections.
+        refuted: whether the estimate refutes the tolerances of the robot file. The delay is not estimated then.
         insertion_fraction: of beta's rate, what the model's velocities hold already.
     """
 
@@ -86,6 +88,8 @@ class RodEkf:
         force = ForceRange(least, most, options.force_change)
         noise = self.model.robot.tracker.noise.position.value
         self.adapted = AdaptedVariances(force, noise, self.model.robot.tubes[0].length)
+        self._tolerances = Tolerances(self.uncertainty.names, self.uncertainty.sigma, tracker.state_sigma)
+        self.refuted = False
         self._noise = ProcessNoise(self.model.robot, dt, self._force, options.force_time, self.adapted)
         self.schedule = FactorSchedule()
         self._strides: ColumnStrides | None = None
@@ -107,6 +111,7 @@ class RodEkf:
         if self._strides is None:  # of the first start; the exposed length tells how they change
             self._strides = ColumnStrides.of(self.model, state, block, self.simulator.scheme.dt)
         r = len(pi_aa)
+        self.refuted = False
         self.bias[:] = 0.0
         self.bias[DELAY] = self._delay
         self.pi = np.zeros((r + STATES, r + STATES))
@@ -283,7 +288,8 @@ class RodEkf:
                 reason=f"outside the gate {self.gate.rejections} times in a row: fused with an inflated covariance"
             )
         # 5. Gain and covariance, then what is left of a shift that is over; correction by both.
-        x = self._fuse(nu, H, R)
+        x = self._judge_tolerances(nu, H)
+        x += self._fuse(nu, H, R)
         self._end_shift(x)
         self._correct(state, x)
         self.schedule.since_correction = 0
@@ -292,6 +298,10 @@ class RodEkf:
     def _fuse(self, nu: Floats, H: Floats, R: Floats) -> Floats:
         """The correction (r + 22,) by an innovation ``nu`` (k,) of derivative ``H`` (k, r + 22) and stated noise ``R`` (k, k), and the covariance
         after it: Joseph form."""
+        if self.refuted:
+            K, self.pi = gain_beside(len(self.pi) - STATES + DELAY, self.pi, H, self.adapted.noise * R)
+            self.adapted.correct(K, H, R)
+            return K @ nu
         size, dof = len(self.pi), len(nu)
         if (size, dof) not in self._filters:
             self._filters[size, dof] = ExtendedKalmanFilter(dim_x=size, dim_z=dof)
@@ -302,6 +312,30 @@ class RodEkf:
         self.adapted.correct(ekf.K, H, R)
         correction: Floats = ekf.x[:, 0]
         return correction
+
+    def _judge_tolerances(self, nu: Floats, H: Floats) -> Floats:
+        """Where the estimate begins to refute the tolerances, the correction (r + 22,) that goes with the delay that was expected; else none.
+
+        ``nu`` (k,), of derivative ``H`` (k, r + 22), is the innovation that is fused next; it is corrected in place.
+        """
+        before, states = self.refuted, self._from_file()
+        self.refuted = self._tolerances.refuted(self.theta, states, before)
+        at = len(self.pi) - STATES + DELAY
+        if before or not self.refuted or not self.pi[at, at] > 0.0:
+            return np.zeros(len(self.pi))
+        gain = release(at, self._delay_sigma, self.pi)
+        correction: Floats = -states[DELAY] * gain
+        nu -= H @ correction
+        known = np.zeros((1, len(gain)))
+        known[0, at] = 1.0
+        self.adapted.correct(gain[:, None], known, np.zeros((1, 1)))
+        return correction
+
+    def _from_file(self) -> Floats:
+        """(22,) tracker states, less what is expected of them."""
+        states = self.bias.copy()
+        states[DELAY] -= self._delay
+        return states
 
     def _end_shift(self, x: Floats) -> None:
         """Bring the tracker's shift back to zero where the tracker is sound and nothing speaks against it: the covariance changes, and the correction
@@ -408,6 +442,13 @@ class RodEkf:
         ratio = math.sqrt(self.adapted.noise) if self.adapted.noisy else 1.0
         return shift if shift > 3.0 * math.sqrt(self.tracker.variance[0]) else 0.0, ratio
 
+    def refutation(self) -> str:
+        """What refutes the tolerances of the robot file, in words; empty where nothing does."""
+        if not self.refuted:
+            return ""
+        name, times = self._tolerances.farthest(self.theta, self._from_file())
+        return f"{name} is found {times:.0f} of its tolerances away from the robot file"
+
     def parameters(self, known: bool = True) -> dict[str, dict[str, float | None]]:
         """Value and deviation of every uncertain parameter by its name; no deviations unless they are ``known``."""
         rows = self.factor.theta if known else None
@@ -427,7 +468,7 @@ class RodEkf:
         """What :meth:`restore` returns to."""
         return FilterState(
             self.theta.copy(), self.bias.copy(), self.pi.copy(), self.adapted.checkpoint(), self.gate.rejections,
-            self.schedule.checkpoint(), self.factor.checkpoint(), self.tips.checkpoint(),
+            self.schedule.checkpoint(), self.factor.checkpoint(), self.tips.checkpoint(), self.refuted,
         )  # fmt: skip
 
     def restore(self, state: FilterState) -> None:
@@ -446,7 +487,7 @@ class RodEkf:
     def _restore_all_but_tips(self, state: FilterState) -> None:
         self.theta, self.bias, self.pi = state.theta.copy(), state.bias.copy(), state.pi.copy()
         self.adapted.restore(state.adapted)
-        self.gate.rejections = state.rejections
+        self.gate.rejections, self.refuted = state.rejections, state.refuted
         self.schedule.restore(state.schedule)
         self.factor.restore(state.factor)
         self._apply_theta()

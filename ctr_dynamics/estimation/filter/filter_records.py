@@ -119,3 +119,4 @@ class FilterState(NamedTuple):
     schedule: ScheduleState
     factor: FactorState
     tips: TipWindowState
+    refuted: bool

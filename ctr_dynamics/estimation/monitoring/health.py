@@ -86,6 +86,7 @@ class Health:
         shift_m: m, by which measured positions lie beside what any force on the robot explains; 0 where they do not.
         noise_ratio: deviation of the tracker's noise by the stated one; 1 while nothing else is established.
         model_error: by which the robot is found to depart from its model beyond the robot file; None while it is not.
+        refutation: what refutes the tolerances of the robot file; empty where nothing does.
         residuals: of the measurements that were used; unused_residuals: of those that were rejected or dropped.
         distances: m, between measured and published positions, of the last measurements. apart_m: their median, as half of them may be outliers,
             whatever the filter made of them; 0 before there are ``FEWEST_APART``.
@@ -124,6 +125,7 @@ class Health:
     tracker_age_s: float = 0.0
     consistency: ConsistencyMonitor = field(default_factory=ConsistencyMonitor)
     stability: Stability | None = None
+    refutation: str = ""
     residuals: Residuals = NOTHING_COMPARED
     unused_residuals: Residuals = NOTHING_COMPARED
 
@@ -282,6 +284,7 @@ class Health:
             },
             "nis": self.nis_summary(),
             "model_error": self.model_error._asdict() if self.model_error else None,
+            "refutation": self.refutation,
             "rejected": self.rejected,
             "late": self.late,
             "dropped": self.dropped,

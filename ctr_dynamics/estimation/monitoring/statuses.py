@@ -142,6 +142,9 @@ def consistency(health: Health) -> Status:
             "beyond the robot file: the filter counts on that now; ctr-dynamics calibrate measures it"
         )
         return Status("consistency", WARN, message, values)
+    if health.refutation:
+        message = f"{health.refutation}: calibrate it, or widen its tolerances; until then the delay is not estimated"
+        return Status("consistency", WARN, message, values)
     if mean > limit:
         message = f"mean NIS {mean:.2f} per degree of freedom, limit {limit:.2f}: the model misses an effect, or the noise is larger than stated"
         return Status("consistency", WARN, message, values)
