@@ -5,7 +5,7 @@ import pytest
 from estimation_cases import BAGS, Run, estimator
 
 from ctr_dynamics import chi_square
-from ctr_dynamics.estimation.filter.tolerances import PROBABILITY, Tolerances, gain_beside, release
+from ctr_dynamics.estimation.filter.tolerances import PROBABILITY, SHORT, Tolerances, gain_beside, release
 from ctr_dynamics.io.bag_reader import open_bag
 from ctr_dynamics.robot_files import load_robot
 from ctr_dynamics.runtime.replay import Player
@@ -53,9 +53,8 @@ def test_the_file_is_refuted_beyond_chance_until_the_estimate_is_back():
     states = np.zeros(STATES)
     states[DELAY], states[DRIFT] = 1e-3, 1.0
     file = Tolerances(("stiffness", "force"), np.array([0.01, 0.0]), states)
-    limit = np.sqrt(
-        chi_square.quantile(PROBABILITY, 2)
-    )  # of stiffness and delay; a drift is no error of the file, nor is a force
+    # of stiffness and delay; a drift is no error of the file, nor is a force
+    limit = np.sqrt(max(chi_square.quantile(PROBABILITY, 2), 2 * SHORT**2))
 
     def refuted(times, before=False):
         found = np.zeros(STATES)

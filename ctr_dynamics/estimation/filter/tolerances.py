@@ -15,6 +15,7 @@ from ctr_dynamics.estimation.filter.adapted_variances import joseph
 from ctr_dynamics.sensing.tracker import DELAY, LEVER, STATE_NAMES
 
 Floats = NDArray[np.float64]
+SHORT = 3.0  # times too small, up to which parameters still follow the robot, and the estimated delay is worth more than its tolerance
 PROBABILITY = 0.9999  # with which parameters by their tolerances lie as near the file as they are found; that of the gate for a measurement
 
 
@@ -22,7 +23,7 @@ class Tolerances:
     """What the robot file allows parameters, registration, lever arm and delay, beside what is found of them.
 
     With the tolerances as independent normal deviations, the squared distance of the estimate from the file, in units of them, is at most a
-    chi-square variable. Where it is larger, the tolerances are too small, or parameters have been bent to explain what the model lacks.
+    chi-square variable. Where it is far larger, the tolerances are too small, or parameters have been bent to explain what the model lacks.
 
     Args:
         names, robot: (p,) the model's parameters and their deviations; 0 for those that are none of the file.
@@ -36,7 +37,8 @@ class Tolerances:
         of_states = [name for name, axes in STATE_NAMES for _ in range(axes)]
         self._names = [names[i] for i in self._rows] + [of_states[i] for i in self._states]
         self._sigma = np.concatenate([robot[self._rows], states[self._states]])
-        self._limit = chi_square.quantile(PROBABILITY, len(self._sigma)) if len(self._sigma) else np.inf
+        count = len(self._sigma)
+        self._limit = max(chi_square.quantile(PROBABILITY, count), SHORT**2 * count) if count else np.inf
 
     def _apart(self, theta: Floats, states: Floats) -> Floats:
         return np.concatenate([theta[self._rows], states[self._states]]) / self._sigma
