@@ -126,9 +126,8 @@ class Estimator:
     def _clear(self) -> None:
         noise = self.robot.tracker.noise.position.value
         self._settling = Settling(noise)
-        self._watched: tuple[int, Floats] | None = (
-            None  # stamp and joints of a start, until they have told whether the robot moves
-        )
+        # stamp and joints of a start, until they have told whether the robot moves
+        self._watched: tuple[int, Floats] | None = None
         self._no_start: tuple[int, str] | None = None  # step and reason of a start that found no equilibrium
         self._stability = StabilityWatch(self.model)
         self._stability_due = False

@@ -41,7 +41,7 @@ def _model_error(found: dict[str, float] | None) -> list[str]:
 
 def _refutation(found: str) -> list[str]:
     """Where the estimate has left the tolerances of the robot file at the end."""
-    return [f"{found}: calibrate it with ctr-dynamics calibrate, or widen its tolerances"] if found else []
+    return [f"{found}: calibrate it with ctr-dynamics calibrate, or state larger tolerances"] if found else []
 
 
 def shortfall(bag: Bag, settings: Settings, numbers: dict[str, Any]) -> str:

@@ -84,6 +84,6 @@ def gain_beside(at: int, pi: Floats, H: Floats, R: Floats) -> tuple[Floats, Floa
     rest = H.copy()
     rest[:, at] = 0.0
     columns = pi @ rest.T
-    gain: Floats = np.linalg.solve(rest @ columns + R, columns.T).T
+    gain = np.ascontiguousarray(np.linalg.solve(rest @ columns + R, columns.T).T, dtype=np.float64)
     gain[at] = 0.0
     return gain, joseph(pi, gain, H, R)

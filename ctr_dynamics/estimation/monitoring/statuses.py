@@ -143,7 +143,7 @@ def consistency(health: Health) -> Status:
         )
         return Status("consistency", WARN, message, values)
     if health.refutation:
-        message = f"{health.refutation}: calibrate it, or widen its tolerances; until then the delay is not estimated"
+        message = f"{health.refutation}: calibrate it, or state larger tolerances; until then the delay is not estimated"
         return Status("consistency", WARN, message, values)
     if mean > limit:
         message = f"mean NIS {mean:.2f} per degree of freedom, limit {limit:.2f}: the model misses an effect, or the noise is larger than stated"

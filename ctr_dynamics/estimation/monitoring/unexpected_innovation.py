@@ -39,7 +39,9 @@ class UnexpectedInnovation:
         """Nothing was unexpected."""
         self._variance = 0.0  # m^2, of the position in all
         self._last_ns: int | None = None
-        self._mean = 0.0  # m^2, of what measurements in general lie apart beyond their noise, where the robot file is refuted
+        self._mean = (
+            0.0  # m^2, mean square of the distances less that of the noise, where the robot file is refuted
+        )
         self._agreed = 0
         self._period_s = 1.0
         self._jump_ns: int | None = None
@@ -68,8 +70,8 @@ class UnexpectedInnovation:
             if not (innovation.dof and near and (innovation.accepted or jumped or refuted or not confirmed)):
                 continue
             if refuted:
-                beyond = max(float(apart @ apart) - self._noise, 0.0)
-                self._mean += (beyond - self._mean) / MEAN_OF
+                more = max(float(apart @ apart) - self._noise, 0.0)
+                self._mean += (more - self._mean) / MEAN_OF
             if self._last_ns is not None and innovation.stamp_ns > self._last_ns:
                 self._period_s = (innovation.stamp_ns - self._last_ns) * 1e-9
             self._last_ns = innovation.stamp_ns
