@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,6 +45,30 @@ class Mode:
     resolved: bool
 
 
+class VibrationErrors(NamedTuple):
+    """How the robot vibrates at rest, and how the model goes astray from it, mode by mode (m).
+
+    Attributes:
+        exponent: (m,) complex, 1/s. twist: (m, 6) complex, of the tip by the modal coordinate; by_load: (m, 6) complex, modal coordinate of the
+            equilibrium by force and torque (:class:`~ctr_dynamics.estimation.vibration_modes.ModalBasis`).
+        phase_rate: (m,) rad/s, errors of nodes and steps. tolerance: relative deviation of a frequency by the robot file's tolerances.
+        resolved: (m,) whether the steps resolve it.
+    """
+
+    exponent: NDArray[np.complex128]
+    twist: NDArray[np.complex128]
+    by_load: NDArray[np.complex128]
+    phase_rate: Floats
+    tolerance: float
+    resolved: NDArray[np.bool_]
+
+    @classmethod
+    def none(cls) -> VibrationErrors:
+        """Of a robot whose modes are not known."""
+        no_rows = np.zeros((0, 6), complex)
+        return cls(np.zeros(0, complex), no_rows, no_rows, np.zeros(0), 0.0, np.zeros(0, bool))
+
+
 @dataclass(frozen=True)
 class Discretisation:
     """Nodes of the model, and what errors to expect of the tip.
@@ -53,13 +77,14 @@ class Discretisation:
         nodes: chosen.
         space_error_m, time_error_m: rms over 4 s after a load is cut that deflects the tip by a third of the exposed length; None where the modes
         are not known.
-        modes: the slowest at rest.
+        modes: the slowest at rest. vibration: their shapes at the tip and errors.
     """
 
     nodes: int
     space_error_m: float | None
     time_error_m: float | None
     modes: tuple[Mode, ...]
+    vibration: VibrationErrors
 
     def shortfall(self, accuracy_m: float) -> str:
         """What of the accuracy that is asked cannot be had in steps of 3 ms; empty where nothing is missing."""
@@ -121,9 +146,9 @@ def discretise(robot: Robot, least: int, accuracy_m: float) -> Discretisation:
         )
         least = max(least, math.ceil(steepest / GROWTH_PER_CELL) + 1)
     except InputError:
-        return Discretisation(least, None, None, ())
+        return Discretisation(least, None, None, (), VibrationErrors.none())
     if coarse is None or fine is None:
-        return Discretisation(least, None, None, ())
+        return Discretisation(least, None, None, (), VibrationErrors.none())
     count = min(len(coarse.frequency_hz), len(fine.frequency_hz))
     frequency, damping = fine.frequency_hz[:count], np.maximum(fine.damping[:count], 0.0)
     amplitude = _amplitudes(fine, robot)[:count]
@@ -141,7 +166,31 @@ def discretise(robot: Robot, least: int, accuracy_m: float) -> Discretisation:
         Mode(float(f), float(d), float(a), bool(k))
         for f, d, a, k in zip(frequency, damping, np.linalg.norm(amplitude, axis=1), kept, strict=True)
     )
-    return Discretisation(nodes, at_coarse * (COARSE / nodes) ** 4, time_error, modes)
+    omega, n = 2 * np.pi * frequency, robot.n_tubes
+    by_load = fine.by_inputs[:, 2 * n :]
+    m = len(fine.frequency_hz)
+    vibration = VibrationErrors(
+        np.minimum(fine.exponent[:count].real, 0.0) + 1j * fine.exponent[:count].imag,
+        fine.twist[:count],
+        (by_load[:m] + 1j * by_load[m:])[:count],
+        np.hypot(
+            omega * shift * (COARSE / nodes) ** 4, np.abs(amplification(scheme, z) * np.exp(-z) - 1.0) / DT
+        ),
+        frequency_tolerance(robot),
+        kept,
+    )
+    return Discretisation(nodes, at_coarse * (COARSE / nodes) ** 4, time_error, modes, vibration)
+
+
+def frequency_tolerance(robot: Robot) -> float:
+    """Relative deviation of a mode's frequency, at most: half of those of stiffness and mass, in the mean square."""
+    stiffness = mass = 0.0
+    for tube in robot.tubes:
+        stiffness = max(stiffness, tube.youngs_modulus.tolerance / tube.youngs_modulus.value)
+        mass = max(mass, tube.density.tolerance / tube.density.value)
+        if tube.end_body is not None and tube.end_body.mass.value > 0.0:
+            mass = max(mass, tube.end_body.mass.tolerance / tube.end_body.mass.value)
+    return 0.5 * math.hypot(stiffness, mass)
 
 
 def _modes_at(robot: Robot, nodes: int) -> ModalBasis | None:

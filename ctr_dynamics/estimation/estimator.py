@@ -22,10 +22,12 @@ from ctr_dynamics.estimation.inputs.input_buffer import InputBuffer
 from ctr_dynamics.estimation.inputs.measurement_queue import tracker_of
 from ctr_dynamics.estimation.mode_tracker import ModeTracker
 from ctr_dynamics.estimation.monitoring.consistency_monitor import consistency_monitor
+from ctr_dynamics.estimation.monitoring.deviations import Deviations
 from ctr_dynamics.estimation.monitoring.health import Health
 from ctr_dynamics.estimation.monitoring.innovation_log import InnovationLog
 from ctr_dynamics.estimation.monitoring.settling import Settling
 from ctr_dynamics.estimation.monitoring.statuses import all_statuses
+from ctr_dynamics.estimation.monitoring.twist_error import TwistError
 from ctr_dynamics.estimation.monitoring.unexpected_innovation import UnexpectedInnovation
 from ctr_dynamics.estimation.out_of_sequence import OutOfSequence
 from ctr_dynamics.estimation.runs import Runs
@@ -135,6 +137,7 @@ class Estimator:
         self._jacobian = JacobianTracker(self._modes.coarse, self.options.jacobian_every)
         self._without_idle = 0  # steps since the last idle work
         self._unexpected = UnexpectedInnovation(self._largest_deviation, noise)
+        self._twist_error = TwistError(self.discretisation.vibration)
         self._driven_m = 0.0  # by which actuators may have moved the tip unknown to the last step
 
     # -- inputs --
@@ -176,8 +179,7 @@ class Estimator:
             quaternion_xyzw: (4,) of the sensor in the tracker's frame.
             frame_id: of its header; empty stands for the expected one.
         """
-        joints = self.inputs.joints.stamps
-        joints_ns = joints[-1] if joints else None
+        joints_ns = next(reversed(self.inputs.joints.stamps), None)
         self.inputs.measurements.add(stamp_ns, position, quaternion_xyzw, frame_id, joints_ns)
 
     def add_tip_load(
@@ -194,6 +196,7 @@ class Estimator:
         change = self.inputs.add_load(stamp_ns, force, torque, frame_id)
         if change is not None:
             self.late.load_changed(change.from_ns, change.jumped)
+            self._twist_error.load_changed(change.begin_ns, change.end_ns, change.difference)
             if change.jumped:
                 self._unexpected.load_jumped(change.from_ns)
 
@@ -405,6 +408,7 @@ class Estimator:
         self._unexpected.take(innovations, fused.ekf.refuted, fused.agreed or bool(unsettled))
         fused.inflate_covariance(tip, self.runs.open_loop, self._largest_deviation)
         self._unexpected.inflate(tip.covariance, stamp)
+        self._twist_error.inflate(tip.covariance, stamp, self.runs.open_loop.tips.last, fused.ekf)
         self._driven_m = self.inputs.actuator_error.inflate(
             tip.covariance, tip.position, self._length, stamp, late.lag * STEP_NS
         )
@@ -420,8 +424,7 @@ class Estimator:
             stamp, k, not problem, problem, tip.position, tip.quaternion, tip.covariance[:6, :6], tip.twist, tip.covariance[6:, 6:],
             predicted[:3], predicted[3:], self._backbone.rows(fused.state), self._modes.measure(fused.state, k), fused.ekf.force,
             tip.force_sigma, innovations, SolverStats(result.iterations, result.sweeps, result.reason),
-            fused.state.inputs.beta.tolist(),
-            self._jacobian.measure(fused.state),
+            fused.state.inputs.beta.tolist(), self._jacobian.measure(fused.state),
         )  # fmt: skip
 
     def _invalid(self, k: int, reason: str) -> StepOutput:
@@ -430,28 +433,12 @@ class Estimator:
 
     def _problem(self, stamp: int, deviation: float) -> str:
         """Why the output of that stamp (ns) and ``deviation`` of the tip (m) cannot be trusted; empty when it can."""
-        age = (stamp - self.inputs.joints.stamps[-1]) * 1e-9
-        limit = self.inputs.timeout_ns * 1e-9
-        if age > limit:
-            return f"joint states are missing: the last is {age:.3f} s old, limit {limit:g} s"
-        largest = self._largest_deviation
-        if deviation > largest and 2.0 * self._driven_m**2 > deviation**2:
-            return (
-                f"joint states come too late: what the actuators did meanwhile may have moved the tip by {1e3 * deviation:.1f} mm, limit "
-                f"{1e3 * largest:.1f} mm (output.largest_deviation_m)"
-            )
-        if deviation > largest:
-            return f"the tip is known to no better than the limit of {1e3 * largest:.1f} mm (output.largest_deviation_m)"
-        compared = self.health.fusing and self.health.tracker_alive and not self.runs.fused.late
-        apart = self.health.apart_m if compared else 0.0
-        if apart > largest:
-            return (
-                f"tracker and model lie {1e3 * apart:.1f} mm apart, limit {1e3 * largest:.1f} mm: check the tracker's frame and sensor, the joints' "
-                "zeros and the robot file"
-            )
-        if self.health.fusing and self.health.rejecting:
-            return "the tracker contradicts the model: most of its last measurements are outside the gate"
-        return ""
+        age_s = (stamp - self.inputs.joints.stamps[-1]) * 1e-9
+        limit_s = self.inputs.timeout_ns * 1e-9
+        if age_s > limit_s:
+            return f"joint states are missing: the last is {age_s:.3f} s old, limit {limit_s:g} s"
+        deviations = Deviations(deviation, self._driven_m, self._largest_deviation)
+        return deviations.problem(self.health, unknown_delay=self.runs.fused.late)
 
     def _look_for_motion(self) -> None:
         """Have outputs wait after a gap of the joints, or after a start, in which the robot moved."""

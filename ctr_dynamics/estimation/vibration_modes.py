@@ -49,6 +49,7 @@ class ModalBasis:
         by_inputs: (2m, 2N + 6) modal coordinates of the equilibrium that moves with alpha, beta, force and torque.
         direction: (m, 3) unit, main direction of the tip's motion in ``ctr_base``; zero where a mode does not move it.
         by_input_rates: (m, 2N + 6) speed of the equilibrium along the direction, by the rates of alpha, beta, force and torque.
+        twist: (m, 6) complex twist of the tip about the base axes, per unit of the modal coordinate: the tip's is 2 Re (twist z).
         shapes: (fields, m) complex, the fields in each mode where its own coordinate is 1 and all others are 0, but for a factor.
     """
 
@@ -61,6 +62,7 @@ class ModalBasis:
     inputs: Floats
     by_inputs: Floats
     by_input_rates: Floats
+    twist: NDArray[np.complex128]
     shapes: NDArray[np.complex128]
 
     def measure(self, fields: Floats, now: Inputs, load_rate: Floats | None = None) -> Modes:
@@ -118,6 +120,7 @@ class ModalBasis:
             self.inputs,
             (signs * self.by_inputs)[rows],
             (sign[:, None] * self.by_input_rates)[order],
+            (sign[:, None] * self.twist)[order],
             self.shapes[:, order],
         )
 
@@ -325,12 +328,16 @@ def modal_parts(
         (pairs.left.real @ Q.T) + 1j * (pairs.left.imag @ Q.T)
     ) * weights  # of the modes, in any fields
     main = step.main - (7 + 2 * model.n)
-    tip = matrix(equilibrium.tip_quaternion) @ image[main:][:3]  # velocity of the images
+    turn = matrix(equilibrium.tip_quaternion)
+    tip = turn @ image[main:][:3]  # velocity of the images
     moved = (tip @ (pairs.right / (pairs.factor * pairs.exponent))).T  # displacement: an ellipse
     axis = _main_axes(moved)
-    readout = coordinates * (axis * moved).sum(1)[:, None]
+    scale = (axis * moved).sum(1)[:, None]
+    readout = coordinates * scale
     rows = np.concatenate([readout.real, readout.imag])
     layout = model.layout
+    shapes = np.concatenate(whole, axis=1) @ pairs.right
+    twist = np.concatenate([turn @ shapes[main:][:3], turn @ shapes[main:][3:6]]).T
     yield ModalBasis(
         np.abs(pairs.exponent.imag) / (2 * np.pi),
         -pairs.exponent.real / np.abs(pairs.exponent),
@@ -341,7 +348,8 @@ def modal_parts(
         np.concatenate([par[layout["alpha"]], beta, par[layout["force"]], par[layout["torque"]]]),
         rows @ slope,
         2.0 * (pairs.exponent[:, None] * (readout @ moving)).real,
-        np.concatenate(whole, axis=1) @ pairs.right,
+        twist / np.where(scale == 0.0, 1.0, scale) / np.sum(coordinates * shapes.T, axis=1)[:, None],
+        shapes,
     )
 
 

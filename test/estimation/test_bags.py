@@ -47,6 +47,16 @@ def test_tip_speed_errs_by_a_tenth_at_most(run_of, name):
 
 
 @pytest.mark.parametrize("name", CLEAN)
+def test_speed_errors_are_as_large_as_the_published_covariance_says(run_of, name):
+    run = run_of(name)
+    error, steps = truth_error(run, name, "v")
+    covariance = run.column("tip_velocity_covariance")[steps, :3, :3]
+    nees = np.einsum("ki,kij,kj->k", error, np.linalg.inv(covariance), error) / 3
+    assert 0.2 <= np.median(nees) <= 3.0
+    assert np.mean(3 * nees > 14.2) <= 0.3  # 0.3 % of normal errors
+
+
+@pytest.mark.parametrize("name", CLEAN)
 def test_innovations_are_as_large_as_predicted(run_of, name):
     nis = run_of(name).estimator.summary()["nis"]
     assert nis["dof"] > 1000

@@ -27,7 +27,7 @@ from ctr_dynamics.estimation.filter.filter_records import (
 from ctr_dynamics.estimation.filter.gating import Gate
 from ctr_dynamics.estimation.filter.parameter_priors import force_range, model_uncertainty
 from ctr_dynamics.estimation.filter.process_noise import ProcessNoise
-from ctr_dynamics.estimation.filter.rational_step import ColumnStrides, exposed
+from ctr_dynamics.estimation.filter.rational_step import ColumnStrides, Stride, exposed
 from ctr_dynamics.estimation.filter.tip_window import TipWindow, insertion_fraction
 from ctr_dynamics.estimation.filter.tolerances import Tolerances, gain_beside, release
 from ctr_dynamics.estimation.step_output import FUSION_OFF
@@ -57,7 +57,7 @@ class RodEkf:
 
     Attributes:
         theta: (p,) estimated changes of the uncertain parameters. bias: (22,) tracker states b. pi: (r + 22, r + 22) Pi.
-        factor: V. tips: those of the last steps. adapted: of the unknown tip force. gate: counts rejections.
+        factor: V. tips: those of the last steps. adapted: of the unknown tip force. gate: counts rejections. stride: of the columns in the last step.
         refuted: whether the estimate refutes the tolerances of the robot file. The delay is not estimated then.
         insertion_fraction: of beta's rate, what the model's velocities hold already.
     """
@@ -93,6 +93,7 @@ class RodEkf:
         self._noise = ProcessNoise(self.model.robot, dt, self._force, options.force_time, self.adapted)
         self.schedule = FactorSchedule()
         self._strides: ColumnStrides | None = None
+        self.stride: Stride | None = None
         self.gate = Gate(options.gate)
         self._sees_position = bool(tracker.mask[:3].all())
         self.insertion_fraction = insertion_fraction(self.model)
@@ -192,7 +193,7 @@ class RodEkf:
         # 3. Is the factor propagated now, or later over this step and the next?
         skipped, records = self.schedule.skipped, result.records
         assert self._strides is not None
-        stride = self._strides.at(exposed(self._length, state))
+        stride = self.stride = self._strides.at(exposed(self._length, state))
         self.schedule.most_skipped = stride.steps - 1
         propagate = self.schedule.plan_step(
             records[0].key, records[-1].key, len(records) > 1, measured, idle, self.adapted.fraction

@@ -70,13 +70,21 @@ def stability(fraction: PartialFractions, z: Complexes) -> Complexes:
 FRACTIONS = {stages: partial_fractions(matrix) for stages, matrix in RADAU.items()}
 
 
+def error_rates(
+    fraction: PartialFractions, frequency_hz: NDArray[np.float64], over_s: float
+) -> NDArray[np.float64]:
+    """(m,) 1/s, relative error of a column's vibration at each frequency, when it follows in steps of ``over_s``."""
+    z = 2j * np.pi * frequency_hz * over_s
+    rates: NDArray[np.float64] = np.abs(stability(fraction, z) * np.exp(-z) - 1.0) / over_s
+    return rates
+
+
 def column_error(fraction: PartialFractions, frequency_hz: NDArray[np.float64], over_s: float) -> float:
     """Relative error of a column ``FOLLOWED_S`` after an abrupt load, when it follows in steps of ``over_s``.
 
     A load on the tip excites a mode by its part of the compliance, which falls as the inverse square of the frequency.
     """
-    z = 2j * np.pi * frequency_hz * over_s
-    errors = np.abs(stability(fraction, z) * np.exp(-z) - 1.0) * (FOLLOWED_S / over_s)
+    errors = FOLLOWED_S * error_rates(fraction, frequency_hz, over_s)
     weights = (frequency_hz.min() / frequency_hz) ** 2
     return float((weights * np.minimum(errors, 1.0)).sum() / weights.sum())
 

@@ -41,10 +41,16 @@ class JointGap(NamedTuple):
 
 
 class LoadChange(NamedTuple):
-    """A load that changes what was known: from the stamp ``from_ns`` on, and whether it has ``jumped``."""
+    """A load that changes what was known: from the stamp ``from_ns`` on, and whether it has ``jumped``.
+
+    ``begin_ns``, ``end_ns``: stamps between which it has changed by ``difference`` (6,) N, N m.
+    """
 
     from_ns: int
     jumped: bool
+    begin_ns: int
+    end_ns: int
+    difference: Floats
 
 
 class InputBuffer:
@@ -243,7 +249,10 @@ class InputBuffer:
             from_ns = load.stamps[i - 1]
         else:
             return None
-        return LoadChange(from_ns, bool(np.any(np.abs(value - known) > self.model.load_slope_limit)))
+        begin_ns = stamp_ns if first or not i else load.stamps[i - 1]
+        difference = np.zeros(6) if begin_ns == stamp_ns else value - before
+        jumped = bool(np.any(np.abs(value - known) > self.model.load_slope_limit))
+        return LoadChange(from_ns, jumped, begin_ns, stamp_ns, difference)
 
     def _open_load(self, t0_ns: int) -> None:
         """Before the first load there is none, or that one if it comes soon enough after the first joints."""

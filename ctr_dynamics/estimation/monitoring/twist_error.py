@@ -1,0 +1,155 @@
+"""What the covariance factor does not know of the tip's velocity (docs/filter.md, "The twist's covariance").
+
+A position error of a tenth of a millimetre is small at any frequency. As a velocity it counts by its frequency, and there the factor is silent: it
+follows few columns, in steps of several milliseconds, and knows nothing of the errors of nodes and steps.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ctr_dynamics.estimation.discretisation import VibrationErrors
+from ctr_dynamics.estimation.filter.ekf import RodEkf
+from ctr_dynamics.estimation.filter.rational_step import FOLLOWED_S, error_rates
+from ctr_dynamics.sensing import Tip
+
+Floats = NDArray[np.float64]
+MEMORY_S = (
+    1.0  # in which the frequency of the motion is measured: a period of slow turning, some of a vibration
+)
+MOST = 2.0  # mean square of the difference of two vibrations of unknown phase, by that of one
+KEPT = 0.5  # part of a column's vibration that it may lose in the time for which columns count, and still corrects the mode
+OVER = 1e-3  # of its amplitude: a vibration that has decayed so far is over
+
+
+class MotionFrequency:
+    """The angular frequency of the tip's motion: the ratio of speed and excursion of late, as of one sine.
+
+    An error of the position is as likely a part of the motion, as by a wrong friction, as it is constant. Then it has the motion's frequency.
+    """
+
+    def __init__(self) -> None:
+        self.clear()
+
+    def clear(self) -> None:
+        """Nothing has moved."""
+        self._stamp_ns: int | None = None
+        self._mean, self._excursion, self._speed = np.zeros(3), 0.0, 0.0  # m; m^2; m^2/s^2
+
+    def add(self, stamp_ns: int, position: Floats, velocity: Floats) -> None:
+        """Take in the tip ``position`` (3,) m and ``velocity`` (3,) m/s of a run that measurements do not move."""
+        if self._stamp_ns is None:
+            self._mean = position.copy()
+        else:
+            new = -math.expm1(-max(stamp_ns - self._stamp_ns, 0) * 1e-9 / MEMORY_S)
+            away = position - self._mean
+            self._mean += new * away
+            self._excursion += new * (float(away @ away) - self._excursion)
+            self._speed += new * (float(velocity @ velocity) - self._speed)
+        self._stamp_ns = stamp_ns
+
+    def square(self, variance: float) -> float:
+        """Square of the frequency, 1/s^2. An excursion within the position's ``variance`` (m^2) is no motion."""
+        return self._speed / (self._excursion + variance) if self._speed > 0.0 else 0.0
+
+    def inflate(self, covariance: Floats, pose: Floats) -> None:
+        """Add to the twist in the ``covariance`` (12, 12) of the tip, in place, what an error of covariance ``pose`` (6, 6) is then."""
+        square = self.square(float(pose[0, 0] + pose[1, 1] + pose[2, 2]))
+        covariance[6:, 6:] += square * pose
+
+
+class LoadVibration:
+    """Vibrations that changes of the known load have excited, as far as model and factor do not follow them.
+
+    Args:
+        modes: how the robot vibrates at rest, and how well that is followed.
+    """
+
+    def __init__(self, modes: VibrationErrors) -> None:
+        self._modes = modes
+        self.clear()
+
+    def clear(self) -> None:
+        """Nothing vibrates."""
+        self._amplitude = np.zeros(len(self._modes.exponent), complex)  # modal coordinates at `_stamp_ns`
+        self._stamp_ns = 0
+        self._since_ns = np.zeros(len(self._amplitude))  # when a vibration got most of its amplitude
+
+    def load_changed(self, from_ns: int, to_ns: int, difference: Floats) -> None:
+        """The known load (6,) N, N m has changed evenly by ``difference`` between two stamps: the robot is off its new equilibrium."""
+        if not difference.any():
+            return
+        over_s = max(to_ns - from_ns, 1) * 1e-9
+        mu = self._modes.exponent
+        excited = -(self._modes.by_load @ difference) * np.expm1(mu * over_s) / (mu * over_s)
+        before = self._at(to_ns) if self.vibrating else self._amplitude
+        newer = np.abs(excited) > np.abs(before)
+        self._since_ns[newer] = to_ns
+        self._amplitude, self._stamp_ns = before + excited, to_ns
+
+    def _at(self, stamp_ns: int) -> NDArray[np.complexfloating]:
+        """Modal coordinates at ``stamp_ns``, at the earliest those of the last change."""
+        elapsed_s = max(stamp_ns - self._stamp_ns, 0) * 1e-9
+        return self._amplitude * np.exp(self._modes.exponent * elapsed_s)
+
+    @property
+    def vibrating(self) -> bool:
+        """Whether anything vibrates."""
+        return bool(self._amplitude.any())
+
+    def inflate(self, covariance: Floats, stamp_ns: int, lost: Floats) -> None:
+        """Add to the ``covariance`` (12, 12) of the tip at ``stamp_ns``, in place, the vibrations' errors.
+
+        A vibration is off by its phase, which goes astray with time; of unknown phase, it is off by as much as it vibrates.
+
+        Args:
+            lost: (m,) 1/s, of each mode's error by the parameters' tolerances, what the columns of the covariance factor lose.
+        """
+        if not self.vibrating:
+            return
+        modes = self._modes
+        size = np.abs(self._at(stamp_ns))
+        if not (size > OVER * np.abs(self._amplitude)).any():
+            self.clear()
+            return
+        age = np.maximum(stamp_ns - self._since_ns, 0.0) * 1e-9
+        # by columns that follow a mode, measurements correct it
+        age = np.where(lost * FOLLOWED_S < KEPT, np.minimum(age, FOLLOWED_S), age)
+        by_tolerances = np.abs(modes.exponent) * modes.tolerance * age * np.minimum(lost * age, 1.0)
+        square = np.minimum((modes.phase_rate * age) ** 2 + by_tolerances**2, MOST)
+        square[~modes.resolved] = 1.0  # the model follows the mean
+        variance = 2.0 * size**2 * square
+        twist = modes.twist.T * np.sqrt(variance)
+        pose = twist / modes.exponent
+        whole = np.vstack([pose, twist])
+        covariance += (whole @ whole.conj().T).real
+
+
+class TwistError:
+    """Both: errors of the twist by the frequency of the motion, and by vibrations that a load has left.
+
+    Args:
+        modes: how the robot vibrates at rest, and how well that is followed.
+    """
+
+    def __init__(self, modes: VibrationErrors) -> None:
+        self._motion, self._vibration = MotionFrequency(), LoadVibration(modes)
+        self._frequency_hz = modes.exponent.imag / (2 * np.pi)
+
+    def load_changed(self, from_ns: int, to_ns: int, difference: Floats) -> None:
+        """The known load (6,) N, N m has changed evenly by ``difference`` between two stamps."""
+        self._vibration.load_changed(from_ns, to_ns, difference)
+
+    def inflate(self, covariance: Floats, stamp_ns: int, open_loop: Tip, ekf: RodEkf) -> None:
+        """Add to the ``covariance`` (12, 12) of pose and twist at ``stamp_ns``, in place; ``open_loop``: the tip that measurements do not move."""
+        self._motion.add(stamp_ns, open_loop.mean[:3], open_loop.mean[7:10])
+        columns = ekf.tips.last.columns[:6]
+        r = columns.shape[1]
+        self._motion.inflate(covariance, columns @ ekf.pi[:r, :r] @ columns.T)
+        if self._vibration.vibrating and ekf.stride is not None:
+            over_s = ekf.stride.steps * ekf.simulator.scheme.dt
+            lost = error_rates(ekf.stride.fraction, self._frequency_hz, over_s)
+            self._vibration.inflate(covariance, stamp_ns, lost)

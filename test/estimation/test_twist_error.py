@@ -1,0 +1,166 @@
+"""What is added to the covariance of the twist: by the frequency of the motion, and by vibrations that a load has left."""
+
+import numpy as np
+import pytest
+
+from ctr_dynamics.estimation.discretisation import VibrationErrors, discretise
+from ctr_dynamics.estimation.monitoring.twist_error import LoadVibration, MotionFrequency
+from ctr_dynamics.estimation.vibration_modes import lanes_of, modal_basis, tip_response
+from ctr_dynamics.model.model import Model
+from ctr_dynamics.model.statics import Statics
+from ctr_dynamics.robot_files import load_robot
+
+SECOND = 1_000_000_000
+MU = np.array([-0.5 + 30.0j, -2.0 + 900.0j])
+FORCE = np.array([0.0, 0.5, 0.0, 0.0, 0.0, 0.0])
+
+
+def vibration(phase_rate=(0.0, 0.0), tolerance=0.0, resolved=(True, True)):
+    """Two modes that a force in y excites, along y and along z."""
+    along = np.zeros((2, 6), complex)
+    along[0, 1] = along[1, 2] = 1.0
+    by_load = np.zeros((2, 6), complex)
+    by_load[:, 1] = 0.01, 0.001
+    errors = VibrationErrors(
+        MU, along * MU[:, None], by_load, np.array(phase_rate), tolerance, np.array(resolved)
+    )
+    return LoadVibration(errors)
+
+
+def added(found, at_s, lost=(0.0, 0.0)):
+    covariance = np.zeros((12, 12))
+    found.inflate(covariance, round(at_s * SECOND), np.array(lost))
+    return covariance
+
+
+def test_the_modes_together_give_the_static_response():
+    """Twist, exponent and response to a load of all modes belong together: their displacements add up to the compliance of the tip."""
+    model = Model(load_robot("till2020_tissue"), nodes=24)
+    beta, alpha = np.array([-0.2521, -0.1977]), np.array([1.5708, 1.5708])
+    rest = Statics(model, 1e-10).solve(beta, alpha, np.zeros(3), np.zeros(3))
+    par = model.parameters.copy()
+    par[model.layout["alpha"]], par[model.layout["beta"]] = alpha, beta
+    basis = modal_basis(model, rest, par, beta, 8)
+    response = tip_response(model, rest, par, model.sweep_buffers(rest.mesh, lanes_of(model).count))
+    assert basis is not None
+    assert response is not None
+    m = len(basis.frequency_hz)
+    by_load = (basis.by_inputs[:m] + 1j * basis.by_inputs[m:])[:, 4:]
+    total = 2.0 * ((basis.twist / basis.exponent[:, None]).T @ by_load).real
+    static = response[:, 4:]
+    for rows in (slice(0, 3), slice(3, 6)):
+        assert np.abs(total - static)[rows].max() < 0.02 * np.abs(static[rows]).max()
+
+
+def test_a_mode_that_the_steps_do_not_resolve_counts_as_it_vibrates():
+    found = vibration(resolved=(True, False))
+    found.load_changed(0, 1, FORCE)  # at once
+    covariance = added(found, 0.0)
+    amplitude = 2 * 0.001 * 0.5  # m
+    expected = np.zeros((12, 12))
+    expected[2, 2] = amplitude**2 / 2
+    expected[8, 8] = amplitude**2 / 2 * abs(MU[1]) ** 2
+    expected[2, 8] = expected[8, 2] = amplitude**2 / 2 * MU[1].real
+    np.testing.assert_allclose(covariance, expected, rtol=1e-4, atol=1e-12)
+    later = added(found, 0.5)
+    np.testing.assert_allclose(later, covariance * np.exp(2 * MU[1].real * 0.5), rtol=1e-6, atol=1e-15)
+
+
+def test_a_phase_error_grows_with_time_to_that_of_an_unknown_phase():
+    found = vibration(phase_rate=(0.0, 3.0))
+    found.load_changed(0, 1, FORCE)
+    lost = 0.0, 100.0  # not kept by the columns
+    assert not added(found, 0.0).any()
+    for at_s, square in ((0.1, 0.3**2), (0.3, 0.9**2), (1.0, 2.0)):
+        size = np.exp(MU[1].real * at_s) * 1e-3
+        assert added(found, at_s, lost)[2, 2] == pytest.approx(square * size**2 / 2, rel=1e-3)
+
+
+def test_tolerances_count_as_far_as_the_columns_lose_the_mode():
+    sizes = []
+    for lost in (0.0, 2.0, 1e3):
+        found = vibration(tolerance=1e-3)
+        found.load_changed(0, 1, FORCE)
+        sizes.append(added(found, 0.25, (0.0, lost))[2, 2])
+    assert sizes[0] == 0.0
+    assert sizes[1] == pytest.approx(0.25 * sizes[2], rel=1e-6)  # half of the error, not of its variance
+    phase = abs(MU[1]) * 1e-3 * 0.25
+    assert sizes[2] == pytest.approx(phase**2 * (np.exp(MU[1].real * 0.25) * 1e-3) ** 2 / 2, rel=1e-3)
+
+
+def test_of_a_mode_that_the_columns_keep_old_errors_are_corrected():
+    found = vibration(phase_rate=(1e-3, 0.0))
+    found.load_changed(0, 1, FORCE)
+    half, much = added(found, 0.5)[1, 1], added(found, 2.0)[1, 1]
+    assert much == pytest.approx(half * np.exp(2 * MU[0].real * 1.5), rel=1e-6)
+
+
+def test_a_slow_change_excites_less_and_none_nothing():
+    sizes = []
+    for duration_s in (1e-9, 0.01, 0.1):
+        found = vibration(resolved=(True, False))
+        found.load_changed(0, round(duration_s * SECOND), FORCE)
+        sizes.append(added(found, duration_s)[2, 2])
+    assert sizes[0] > 20 * sizes[1] > 100 * sizes[2] > 0.0
+    found = vibration(resolved=(False, False))
+    found.load_changed(1_700_000_000 * SECOND, 1_700_000_001 * SECOND, 0.0 * FORCE)
+    assert not added(found, 1_700_000_002.0).any()
+
+
+def test_a_change_and_its_reverse_of_one_period_cancel():
+    found = vibration(resolved=(False, True))
+    period_ns = round(2 * np.pi / MU[0].imag * SECOND)
+    found.load_changed(0, 1, FORCE)
+    once = added(found, period_ns * 1e-9)[1, 1]
+    found.load_changed(period_ns, period_ns + 1, -FORCE)
+    assert added(found, period_ns * 1e-9)[1, 1] < 0.02 * once
+
+
+def test_what_has_decayed_is_over():
+    found = vibration(resolved=(False, False))
+    found.load_changed(0, 1, FORCE)
+    assert added(found, 1.0).any()
+    assert not added(found, 60.0).any()
+    assert not added(found, 1.0).any()
+
+
+def test_without_modes_nothing_is_added():
+    found = LoadVibration(VibrationErrors.none())
+    found.load_changed(0, 1, FORCE)
+    covariance = np.zeros((12, 12))
+    found.inflate(covariance, SECOND, np.zeros(0))
+    assert not covariance.any()
+
+
+def test_the_frequency_is_that_of_the_motion():
+    omega, size = 14.0, 0.01
+    motion = MotionFrequency()
+    for k in range(2000):
+        t = 0.003 * k
+        motion.add(
+            round(t * SECOND),
+            np.array([0.05 + size * np.sin(omega * t), 0.0, 0.1]),
+            np.array([size * omega * np.cos(omega * t), 0.0, 0.0]),
+        )
+    assert motion.square(0.0) == pytest.approx(omega**2, rel=0.1)
+    pose = 1e-8 * np.eye(6)
+    covariance = np.zeros((12, 12))
+    motion.inflate(covariance, pose)
+    np.testing.assert_allclose(covariance[6:, 6:], motion.square(3e-8) * pose)
+    assert not covariance[:6].any()
+
+
+def test_a_robot_at_rest_has_no_frequency():
+    motion = MotionFrequency()
+    assert motion.square(0.0) == 0.0
+    for k in range(100):
+        motion.add(3_000_000 * k, np.array([0.05, 0.0, 0.1]), np.full(3, 1e-9))
+    assert motion.square(1e-8) < 1e-9
+
+
+def test_fast_modes_of_a_shipped_robot_are_among_the_errors():
+    errors = discretise(load_robot("three_tube"), 12, 5e-5).vibration
+    assert (~errors.resolved).any()
+    assert errors.resolved[:4].all()
+    assert np.all(errors.exponent.real <= 0.0)
+    assert 0.001 < errors.tolerance < 0.05
