@@ -31,7 +31,10 @@ class Deviations(NamedTuple):
         compared = health.fusing and health.tracker_alive and not unknown_delay
         apart = health.apart_m if compared else 0.0
         if apart > self.largest:
-            return f"tracker and model lie {1e3 * apart:.1f} mm apart, {limit}: check the tracker's frame and sensor, the joints' zeros and the robot file"
+            return (
+                f"tracker and model lie {1e3 * apart:.1f} mm apart, {limit}: check the tracker's frame and sensor, the joints' "
+                "zeros and the robot file"
+            )
         if health.fusing and health.rejecting:
             return "the tracker contradicts the model: most of its last measurements are outside the gate"
         return ""
