@@ -125,6 +125,7 @@ class StandIn:
             "input_problems": {"joints": {}, "tracker": {}, "load": {}},
             "solver": {"failures": 0, "reasons": {}},
             "model_error": None,
+            "refutation": "",
         }
 
 
