@@ -405,7 +405,9 @@ class Estimator:
         self._settling.take(innovations)
         health.refutation = fused.ekf.refutation()
         unsettled = self._settling.problem(stamp)
-        self._unexpected.take(innovations, fused.ekf.refuted, fused.agreed or bool(unsettled) or not health.fusing)
+        self._unexpected.take(
+            innovations, fused.ekf.refuted, fused.agreed or bool(unsettled) or not health.fusing
+        )
         fused.inflate_covariance(tip, self.runs.open_loop, self._largest_deviation)
         self._unexpected.inflate(tip.covariance, stamp)
         self._twist_error.inflate(tip.covariance, stamp, self.runs.open_loop.tips.last, fused.ekf)
