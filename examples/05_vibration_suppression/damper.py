@@ -43,7 +43,8 @@ class Tuning:
         stale_s: an estimate older than this is not used.
         settle_steps: valid estimates in a row before the loop is closed (again).
         fade_s: time constant with which delta goes back to zero while the loop is open.
-        noise_gain: deviations of the rate below which there is nothing to damp.
+        noise_gain: deviations of the rate below which there is nothing to damp. Most of the published deviation is of errors that move with the
+            motion; only the rest would shake the drives.
     """
 
     damping: float = 0.12
@@ -51,7 +52,7 @@ class Tuning:
     stale_s: float = 0.06
     settle_steps: int = 20
     fade_s: float = 0.3
-    noise_gain: float = 0.7
+    noise_gain: float = 0.2
 
 
 @dataclass(frozen=True)
