@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ctr_dynamics.estimation.discretisation import VibrationErrors
 from ctr_dynamics.estimation.filter.ekf import RodEkf
-from ctr_dynamics.estimation.filter.rational_step import FOLLOWED_S, error_rates
+from ctr_dynamics.estimation.filter.rational_step import FOLLOWED_S, Stride, error_rates
 from ctr_dynamics.sensing import Tip
 
 Floats = NDArray[np.float64]
@@ -138,6 +138,8 @@ class TwistError:
     def __init__(self, modes: VibrationErrors) -> None:
         self._motion, self._vibration = MotionFrequency(), LoadVibration(modes)
         self._frequency_hz = modes.exponent.imag / (2 * np.pi)
+        self._stride: Stride | None = None  # of the columns, and what they lose by it
+        self._lost = np.zeros(len(self._frequency_hz))
 
     def load_changed(self, from_ns: int, to_ns: int, difference: Floats) -> None:
         """The known load (6,) N, N m has changed evenly by ``difference`` between two stamps."""
@@ -150,6 +152,7 @@ class TwistError:
         r = columns.shape[1]
         self._motion.inflate(covariance, columns @ ekf.pi[:r, :r] @ columns.T)
         if self._vibration.vibrating and ekf.stride is not None:
-            over_s = ekf.stride.steps * ekf.simulator.scheme.dt
-            lost = error_rates(ekf.stride.fraction, self._frequency_hz, over_s)
-            self._vibration.inflate(covariance, stamp_ns, lost)
+            if ekf.stride is not self._stride:
+                self._stride, over_s = ekf.stride, ekf.stride.steps * ekf.simulator.scheme.dt
+                self._lost = error_rates(ekf.stride.fraction, self._frequency_hz, over_s)
+            self._vibration.inflate(covariance, stamp_ns, self._lost)
