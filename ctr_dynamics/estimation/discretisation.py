@@ -160,22 +160,19 @@ def discretise(robot: Robot, least: int, accuracy_m: float) -> Discretisation:
     wanted = COARSE * (at_coarse / accuracy_m) ** 0.25
     nodes = max(least, min(MOST, math.ceil(wanted)))
     z = 2j * np.pi * frequency * DT
-    missed = np.abs(amplification(scheme, z) - np.exp(z)) * followed / DT
-    time_error = _tip_error(amplitude, kept * np.minimum(missed, 2.0))
+    by_steps = np.abs(amplification(scheme, z) - np.exp(z)) / DT  # 1/s
+    time_error = _tip_error(amplitude, kept * np.minimum(by_steps * followed, 2.0))
     modes = tuple(
         Mode(float(f), float(d), float(a), bool(k))
         for f, d, a, k in zip(frequency, damping, np.linalg.norm(amplitude, axis=1), kept, strict=True)
     )
-    omega, n = 2 * np.pi * frequency, robot.n_tubes
-    by_load = fine.by_inputs[:, 2 * n :]
+    by_load = fine.by_inputs[:, 2 * robot.n_tubes :]
     m = len(fine.frequency_hz)
     vibration = VibrationErrors(
         np.minimum(fine.exponent[:count].real, 0.0) + 1j * fine.exponent[:count].imag,
         fine.twist[:count],
         (by_load[:m] + 1j * by_load[m:])[:count],
-        np.hypot(
-            omega * shift * (COARSE / nodes) ** 4, np.abs(amplification(scheme, z) * np.exp(-z) - 1.0) / DT
-        ),
+        np.hypot(2 * np.pi * frequency * shift * (COARSE / nodes) ** 4, by_steps),
         frequency_tolerance(robot),
         kept,
     )

@@ -297,28 +297,25 @@ class _Linear:
         self.variance = np.array([by_key[q.key] for q in fit.active])
         self.departure = fit.values - np.array([q.off for q in fit.active])
 
-    def left(self, sizes: Sizes) -> Floats:
-        """(m,) what is left of the residual at the likeliest departures, in the axes in which the discrepancy is diagonal."""
-        scale = self.process.scale(sizes)
-        best, _, _ = posterior(
+    def _posterior(self, scale: Floats) -> tuple[Floats, Floats, float]:
+        """Likeliest departures (a,), their covariance (a, a) and log evidence, where the factors ``scale`` (m,) whiten."""
+        return posterior(
             self.residual * scale,
             self.columns * scale[:, None],
             self.departure,
             self.variance,
             self.numerics * scale[:, None],
         )
+
+    def left(self, sizes: Sizes) -> Floats:
+        """(m,) what is left of the residual at the likeliest departures, in the axes in which the discrepancy is diagonal."""
+        best, _, _ = self._posterior(self.process.scale(sizes))
         return np.asarray(self.residual - self.columns @ (best - self.departure))
 
     def log_evidence(self, sizes: Sizes) -> tuple[float, Floats]:
         """Log evidence up to a constant, and covariance (a, a) of the coordinates, with a discrepancy of ``sizes`` (m, rad)."""
         scale = self.process.scale(sizes)
-        departure, covariance, evidence = posterior(
-            self.residual * scale,
-            self.columns * scale[:, None],
-            self.departure,
-            self.variance,
-            self.numerics * scale[:, None],
-        )
+        departure, covariance, evidence = self._posterior(scale)
         evidence += float(np.log(scale).sum())
         wide = {q.key for q in self.fit.causes}
         limit = self.options.calibration.tolerance_limit
