@@ -25,6 +25,7 @@ from ctr_dynamics.kernels import rotations
 from ctr_dynamics.kernels.layout import parameters_of_inputs
 from ctr_dynamics.kernels.tracker_measurement import pose_difference
 from ctr_dynamics.model.simulator import State
+from ctr_dynamics.sensing.tracker import ROTATION, TRANSLATION
 
 Floats = NDArray[np.float64]
 NEGLIGIBLE = 1e-4  # probability of another delay or model error; less is no matter of the covariance
@@ -64,12 +65,15 @@ class FusedRun:
         model = ekf.model
         rows = parameters_of_inputs(model.n)[: model.input_count]
         self._by_theta = ekf.uncertainty.effect[rows]  # encoder offsets and tip force
-        noise = model.robot.tracker.noise
+        noise, length = model.robot.tracker.noise, float(model.robot.lengths[0])
+        file = ekf.tracker.state_sigma
+        registered = math.hypot(file[TRANSLATION].max(), length * file[ROTATION].max())
         self.delay_search = DelaySearch(noise.position.value, ekf.options.force_change)
         self.model_error_search = ModelErrorSearch(
             noise.position.value,
             noise.rotation.value,
-            float(model.robot.lengths[0]),
+            length,
+            registered,
             ekf.options.force_change,
         )
         self.state: State | None = None

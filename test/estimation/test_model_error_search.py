@@ -9,14 +9,14 @@ from ctr_dynamics.estimation.filter.filter_records import ModelErrorSize
 from ctr_dynamics.estimation.monitoring.model_error_search import ModelErrorSearch
 from ctr_dynamics.robot_files import load_robot
 
-NOISE, ROTATION_NOISE, LENGTH = 3e-4, 3e-3, 0.2
+NOISE, ROTATION_NOISE, LENGTH, REGISTERED = 3e-4, 3e-3, 0.2, 5e-4
 NONE = ModelErrorSize(0.0, 0.0, 1.0)
 WELL = -1.7  # as a filter foretells whose model is right: 3 ln(1 + 1/4) / 2 and the innovation's square
 
 
 def search(departures, turn=0.0, foretold=(-20.0, -4.0), seed=1):
     """Positions at 40 Hz that lie ``departures`` (k, 3) m from the open-loop run, beside a filter that has ``foretold`` every one like that."""
-    rng, found = np.random.default_rng(seed), ModelErrorSearch(NOISE, ROTATION_NOISE, LENGTH, 20.0)
+    rng, found = np.random.default_rng(seed), ModelErrorSearch(NOISE, ROTATION_NOISE, LENGTH, REGISTERED, 20.0)
     for k, departure_m in enumerate(departures):
         turned = np.array([turn, turn, turn]) + ROTATION_NOISE * rng.standard_normal(3)
         found.add(25_000_000 * k, departure_m + NOISE * rng.standard_normal(3), turned, foretold)
@@ -46,6 +46,14 @@ def test_a_departure_is_found_with_its_size_and_rotation(size, time):
 def test_nothing_is_found_beside_a_filter_that_foretells_well():
     assert search(np.zeros((400, 3)), foretold=(WELL, WELL)).probability(NONE) < 1e-3
     assert search(wandering(2e-3, 1.0, 400), foretold=(WELL, WELL)).found(NONE) is None
+
+
+@pytest.mark.parametrize("departure_m", [0.0, 1e-3])
+def test_a_robot_that_is_better_than_its_tolerances_has_no_model_error(departure_m):
+    """The open-loop run foretells better than a filter that counts on the tolerances, beside a constant error of the registration too."""
+    beyond = search(np.full((400, 3), departure_m), foretold=(-4.0, -4.0))
+    assert beyond.found(NONE) is None
+    assert beyond.probability(NONE) < 0.01
 
 
 def test_what_the_filter_counts_on_already_is_not_found_again():

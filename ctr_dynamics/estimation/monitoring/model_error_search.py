@@ -3,6 +3,9 @@
 The robot file may state it (``model_error``). Where it does not, or states too little, the filter takes it for a force and for wrong parameters,
 and is worse than the open-loop run. So measurements are also compared with the open-loop run and a departure from it, a Gauss-Markov process of
 each of some sizes and times. These and the filter compete by how well each foretells the next position (prequential evidence, Dawid 1984).
+
+A robot that is better than its tolerances is foretold by its open-loop run better than by the filter, which counts on them. So the open-loop run
+with a constant departure, that of a registration within its tolerance, competes too. Where it foretells best, the model does not err.
 """
 
 from __future__ import annotations
@@ -55,8 +58,9 @@ class Evidence(NamedTuple):
     """What the measurements up to ``stamp_ns`` say.
 
     Attributes:
-        level: (h, 3) m, departure of the tip for every hypothesis, as known from the past. variance: (h,) m^2, of it per axis.
-        departures: (h,) logarithm of the evidence of every hypothesis; filter: of what the filter foretold.
+        level: (h + 1, 3) m, departure of the tip for every hypothesis, as known from the past; the last is constant. variance: (h + 1,) m^2, of it
+            per axis.
+        departures: (h + 1,) logarithm of the evidence of every hypothesis; filter: of what the filter foretold.
         turned: rad^2, mean square of the rotation between measurements and open-loop run, per axis; weight: of how many measurements.
     """
 
@@ -75,6 +79,7 @@ class ModelErrorSearch:
     Args:
         position_noise, rotation_noise: m and rad per axis, deviations of a measured pose.
         length: m, of the robot outside the base plate at most.
+        registered: m per axis, by which the tip may depart for the registration's tolerance alone.
         change_s: mean time between two changes of the unknown force. The filter may have met one with every measurement.
         options: when a model error is believed.
     """
@@ -84,6 +89,7 @@ class ModelErrorSearch:
         position_noise: float,
         rotation_noise: float,
         length: float,
+        registered: float,
         change_s: float,
         options: ModelErrorSearchOptions | None = None,
     ) -> None:
@@ -97,6 +103,8 @@ class ModelErrorSearch:
             np.repeat(sizes, len(options.times_s)),
             np.tile(np.array(options.times_s), count),
         )
+        self._variances = np.r_[self.sizes, registered] ** 2
+        self._rates = np.r_[1.0 / self.times, 0.0]
         self.clear()
 
     def clear(self) -> None:
@@ -116,7 +124,7 @@ class ModelErrorSearch:
         while self._evidence and self._evidence[-1].stamp_ns >= stamp_ns:
             self._evidence.pop()  # its step is taken again
         self._compared = None
-        noise, square = self._noise**2, self.sizes**2
+        noise, square = self._noise**2, self._variances
         angle = float(turn @ turn) / len(turn) if len(turn) else 0.0
         if not self._evidence:
             self._begin_ns = stamp_ns
@@ -128,7 +136,7 @@ class ModelErrorSearch:
         # 1. The departure decays and gets new randomness.
         last, options = self._evidence[-1], self.options
         elapsed = (stamp_ns - last.stamp_ns) * 1e-9
-        remains = np.exp(-elapsed / self.times)
+        remains = np.exp(-elapsed * self._rates)
         before = remains**2 * last.variance + (1.0 - remains**2) * square
         level = remains[:, None] * last.level
         change, total = residual - level, before + noise
@@ -179,10 +187,11 @@ class ModelErrorSearch:
         if not tried.any():
             return none
         prior = math.log(options.prior / len(self.sizes))
-        likely = np.where(tried, last.departures + prior, -np.inf)
-        most = max(last.filter, float(likely.max()))
+        likely = np.where(tried, last.departures[:-1] + prior, -np.inf)
+        file_right = np.logaddexp(last.filter, last.departures[-1])
+        most = max(file_right, float(likely.max()))
         weights: Floats = np.exp(likely - most)
-        return weights / (weights.sum() + math.exp(last.filter - most))
+        return weights / (weights.sum() + math.exp(file_right - most))
 
     def found(self, present: ModelErrorSize) -> ModelErrorSize | None:
         """The model error that is believed instead of ``present``, which the filter counts on; None where there is none."""
