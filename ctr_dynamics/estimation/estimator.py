@@ -420,7 +420,7 @@ class Estimator:
         if unsettled:  # measurements tell nothing of the model's error either
             fused.model_error_search.clear()
             self.innovations.pass_over()
-        problem = health.problem = self._problem(stamp, deviation) or unsettled
+        problem = health.problem = self._problem(stamp, deviation, unsettled)
         self._stability_due |= k % options.stability_every == 0
         return StepOutput(
             stamp, k, not problem, problem, tip.position, tip.quaternion, tip.covariance[:6, :6], tip.twist, tip.covariance[6:, 6:],
@@ -433,12 +433,17 @@ class Estimator:
         self.health.problem = reason
         return StepOutput.invalid(self.timeline.stamp(k), k, reason, self.innovations.take())
 
-    def _problem(self, stamp: int, deviation: float) -> str:
-        """Why the output of that stamp (ns) and ``deviation`` of the tip (m) cannot be trusted; empty when it can."""
+    def _problem(self, stamp: int, deviation: float, unsettled: str) -> str:
+        """Why the output of that stamp (ns) and ``deviation`` of the tip (m) cannot be trusted; empty when it can.
+
+        ``unsettled``: why the motion is not known yet. It comes before the deviation, of which it is the reason.
+        """
         age_s = (stamp - self.inputs.joints.stamps[-1]) * 1e-9
         limit_s = self.inputs.timeout_ns * 1e-9
         if age_s > limit_s:
             return f"joint states are missing: the last is {age_s:.3f} s old, limit {limit_s:g} s"
+        if unsettled:
+            return unsettled
         deviations = Deviations(deviation, self._driven_m, self._largest_deviation)
         return deviations.problem(self.health, unknown_delay=self.runs.fused.late)
 
@@ -455,11 +460,12 @@ class Estimator:
         if watched is None or not self.inputs.joints.stamps:
             return
         stamp = self.inputs.joints.stamps[-1]
-        if stamp > watched[0] + settling.options.watched_s * 1e9:
-            self._watched = None
-        elif settling.moved((self.inputs.joints.values[-1] - watched[1]).tolist()):
+        # the first joints behind the watched time still tell of it: a start may take longer
+        if settling.moved((self.inputs.joints.values[-1] - watched[1]).tolist()):
             self._watched = None
             settling.begin(watched[0], "the estimate has started while the robot moved")
+        elif stamp > watched[0] + settling.options.watched_s * 1e9:
+            self._watched = None
 
     # -- reports --
 

@@ -16,7 +16,10 @@ WELL = -1.7  # as a filter foretells whose model is right: 3 ln(1 + 1/4) / 2 and
 
 def search(departures, turn=0.0, foretold=(-20.0, -4.0), seed=1):
     """Positions at 40 Hz that lie ``departures`` (k, 3) m from the open-loop run, beside a filter that has ``foretold`` every one like that."""
-    rng, found = np.random.default_rng(seed), ModelErrorSearch(NOISE, ROTATION_NOISE, LENGTH, REGISTERED, 20.0)
+    rng, found = (
+        np.random.default_rng(seed),
+        ModelErrorSearch(NOISE, ROTATION_NOISE, LENGTH, REGISTERED, 20.0),
+    )
     for k, departure_m in enumerate(departures):
         turned = np.array([turn, turn, turn]) + ROTATION_NOISE * rng.standard_normal(3)
         found.add(25_000_000 * k, departure_m + NOISE * rng.standard_normal(3), turned, foretold)

@@ -135,8 +135,9 @@ class Live:
         self.listener.__exit__(None, None, None)
         assert code == 0, self.process.output()
 
-    def resting_robot(self, matched: bool = True, shift_ns: int = 0) -> RestingRobot:
+    def resting_robot(self, matched: bool = True, shift_ns: int = 0, turning: float = 0.0) -> RestingRobot:
         robot = RestingRobot(self, shift_ns)
+        robot.turning = turning
         self.robots.append(robot)
         if matched:
             self.wait(lambda: all(p.get_subscription_count() for p in robot.publishers.values()), "a match")
@@ -165,25 +166,32 @@ class Live:
     def valid(self) -> list[bool]:
         return [message.data for message in self.messages(topics.VALID)]
 
-    def status(self, name: str):
-        """The last diagnostics status of that name, None before the first."""
+    def status(self, name: str, at: int = -1):
+        """The diagnostics status of that name in the message ``at``, by default the last; None before the first."""
         heard = self.listener.received[topics.DIAGNOSTICS]
         if not heard:
             return None
-        array = deserialize_message(heard[-1].data, message_class(topics.TOPIC[topics.DIAGNOSTICS].ros_type))
+        array = deserialize_message(heard[at].data, message_class(topics.TOPIC[topics.DIAGNOSTICS].ros_type))
         found = [status for status in array.status if status.name == f"ctr_estimator: {name}"]
         assert len(found) == 1, [status.name for status in array.status]
         return found[0]
 
     def wait_for_status(self, name: str, level: int | None = None, text: str = ""):
+        """Wait for the present status of that name, or a later one, to be of that level and to contain the text: none is missed."""
+        at = max(0, self.count(topics.DIAGNOSTICS) - 1)
+
         def there() -> bool:
-            status = self.status(name)
-            if status is None or (level is not None and status.level != bytes([level])):
-                return False
-            return text in status.message + str([(v.key, v.value) for v in status.values])
+            nonlocal at
+            while at < self.count(topics.DIAGNOSTICS):
+                status = self.status(name, at)
+                said = status.message + str([(v.key, v.value) for v in status.values])
+                if text in said and (level is None or status.level == bytes([level])):
+                    return True
+                at += 1
+            return False
 
         self.wait(there, f"status {name} at level {level} with '{text}'; it is {self.status(name)}")
-        return self.status(name)
+        return self.status(name, at)
 
     def done(self, future):
         self.wait(future.done, "an answer")
