@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from ctr_dynamics.effects import make_plant
 from ctr_dynamics.io.bag_reader import open_bag
 from ctr_dynamics.io.messages.cdr import PoseIn, decode_point_cloud, decode_pose_stamped
+from ctr_dynamics.io.messages.topics import STEP_NS
 from ctr_dynamics.io.truth_files import read_truth
 from ctr_dynamics.robot import Robot
 from ctr_dynamics.sensing import TrackerModel
@@ -41,6 +42,13 @@ class Trace:
     def at(self, t: Floats) -> Floats:
         """Linear in between, (len(t), 3)."""
         return np.column_stack([np.interp(t, self.t, self.p[:, axis]) for axis in range(3)])
+
+    def covers(self, t: Floats) -> NDArray[np.bool_]:
+        """Whether each of ``t`` (k,) lies on a sample or between two of steps that followed each other; outputs that are invalid leave a gap."""
+        after = np.clip(np.searchsorted(self.t, t), 1, len(self.t) - 1)
+        within = (t >= self.t[0]) & (t <= self.t[-1])
+        found: NDArray[np.bool_] = within & (self.t[after] - self.t[after - 1] < 1.5e-9 * STEP_NS)
+        return found
 
 
 @dataclass(frozen=True)
@@ -112,10 +120,9 @@ def compare(
     Raises:
         ValueError: no sample of the reference lies in the run.
     """
-    begin = max(open_loop.t[0], fused.t[0], since_s)
-    inside = (target.t >= begin) & (target.t <= min(open_loop.t[-1], fused.t[-1]))
+    inside = (target.t >= since_s) & open_loop.covers(target.t) & fused.covers(target.t)
     if not inside.any():
-        raise ValueError(f"no sample of the {reference} lies in the time of the run")
+        raise ValueError(f"no sample of the {reference} lies where both runs have outputs")
     t, p = target.t[inside], target.p[inside]
     a = np.linalg.norm(open_loop.at(t) - p, axis=1)
     f = np.linalg.norm(fused.at(t) - p, axis=1)

@@ -7,7 +7,9 @@ import pytest
 from ctr_dynamics.cli import demo_command as demo_file
 from ctr_dynamics.errors import InputError
 from ctr_dynamics.io.bag_reader import open_bag
+from ctr_dynamics.io.bag_writer import write_bag
 from ctr_dynamics.io.messages import topics
+from ctr_dynamics.io.messages.encode import encode_joint_state
 from ctr_dynamics.ros import node_processes as processes
 
 pytestmark = pytest.mark.ros
@@ -26,12 +28,12 @@ def test_the_demo_ends_with_tables_picture_and_recorded_outputs(tmp_path, capfd)
     assert "fused" in shown
     figures = json.loads((tmp_path / "out" / "demo.json").read_text())
     compared = {c["reference"] for c in figures["comparisons"]}
-    # on a machine too slow for the live node outputs are too old to be valid, and the settled part of the run may hold none
-    assert compared == {"tracker", "truth"} or (compared == {"tracker"} and figures["timing"]["too_old"])
+    assert compared == {"tracker", "truth"}
+    # on a machine that is too slow for the live node, the figures are those of a replay
+    assert all(c["fused_rms"] < 1e-3 for c in figures["comparisons"])
     assert figures["timing"]["skipped"] == 0
     assert (tmp_path / "out" / "demo.png").read_bytes().startswith(b"\x89PNG")
     bag = open_bag(tmp_path / "out" / "outputs.mcap")
-    # a busy machine makes outputs too old to be valid; every step says whether it is
     assert bag.topics[topics.VALID].messages > 300
     assert bag.topics[topics.TIP_POSE].messages > 0
 
@@ -51,11 +53,13 @@ def test_an_estimator_that_does_not_start_fails_the_demo(tmp_path, capfd, monkey
     assert "no_such_module" in shown
 
 
-def test_outputs_that_do_not_come_fail_the_demo(tmp_path, capfd, bags):
-    # Joints of two tubes cannot drive three.
-    code, shown = run(
-        capfd, output=tmp_path, robot="three_tube", duration=2.0, bag=bags / "clean_release.mcap"
-    )
+def test_outputs_that_do_not_come_fail_the_demo(tmp_path, capfd):
+    bag = tmp_path / "one_tube.mcap"
+    with write_bag(bag, {}) as writer:
+        for stamp_ns in range(10**18, 10**18 + 2 * 10**9, 10**7):
+            joints = encode_joint_state(stamp_ns, ["tube1_rotation", "tube1_translation"], [0.0, -0.25])
+            writer.write(topics.JOINT_STATES, stamp_ns, joints)
+    code, shown = run(capfd, output=tmp_path / "out", bag=bag)
     assert code == 1
     assert "no tip pose came" in shown
 

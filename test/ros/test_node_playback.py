@@ -94,11 +94,12 @@ def test_pace_yields_each_moment_once_it_has_come_and_stops_when_told():
 
 
 def test_comparison_is_over_the_samples_within_the_run():
-    t = np.linspace(0, 1, 11)
+    t = np.r_[0.0:0.3:0.003, 0.5:1.0:0.003]  # in between, outputs were invalid
     straight = np.column_stack([t, 0 * t, 0 * t])
     fused, alone = Trace(t, straight), Trace(t, straight + np.array([0.0, 3e-3, 4e-3]))
     samples = Trace(
-        np.array([-1.0, 0.25, 0.55, 2.0]), np.array([[9, 9, 9], [0.25, 0, 0], [0.55, 1e-3, 0], [9, 9, 9]])
+        np.array([-1.0, 0.25, 0.4, 0.55, 2.0]),
+        np.array([[9, 9, 9], [0.25, 0, 0], [9, 9, 9], [0.55, 1e-3, 0], [9, 9, 9]]),
     )
     found = compare("tracker", samples, alone, fused)
     assert found.samples == 2
@@ -146,9 +147,9 @@ def test_the_tip_that_poses_show_is_that_of_the_robots_registration_lever_arm_an
 
 
 def test_what_does_not_fall_into_the_run_is_not_compared():
-    t = np.linspace(0.0, 1.0, 11)
-    run = Trace(t, np.zeros((11, 3)))
-    late = Trace(t + 5.0, np.zeros((11, 3)))
+    t = np.arange(0.0, 1.0, 0.003)
+    run = Trace(t, np.zeros((len(t), 3)))
+    late = Trace(t + 5.0, np.zeros((len(t), 3)))
     nothing = Trace(np.zeros(0), np.zeros((0, 3)))
     assert comparisons(nothing, [], run, run) == []
     assert comparisons(late, [late], run, run) == []
