@@ -128,8 +128,6 @@ class Estimator:
     def _clear(self) -> None:
         noise = self.robot.tracker.noise.position.value
         self._settling = Settling(noise)
-        # stamp and joints of a start, until they have told whether the robot moves
-        self._watched: tuple[int, Floats] | None = None
         self._no_start: tuple[int, str] | None = None  # step and reason of a start that found no equilibrium
         self._stability = StabilityWatch(self.model)
         self._stability_due = False
@@ -373,8 +371,8 @@ class Estimator:
         self.late.history.restart(k)
         self._modes.clear()
         self._jacobian.clear()
-        self._settling.start(self.timeline.stamp(k))
-        self._watched = self.timeline.stamp(k), self.inputs.joints.at(self.timeline.stamp(k))[0]
+        stamp = self.timeline.stamp(k)
+        self._settling.start(stamp, self.inputs.joints.at(stamp)[0])
         return self._output(k, StepResult(True, "at rest", 0, 0, 0))
 
     # -- outputs --
@@ -449,7 +447,7 @@ class Estimator:
 
     def _look_for_motion(self) -> None:
         """Have outputs wait after a gap of the joints, or after a start, in which the robot moved."""
-        gap, settling, watched = self.inputs.gap, self._settling, self._watched
+        gap, settling = self.inputs.gap, self._settling
         if gap is not None:
             self.inputs.gap = None
             if settling.moved(gap.change.tolist()) and self.runs.running:
@@ -457,15 +455,8 @@ class Estimator:
                 settling.begin(
                     gap.until_ns, f"joint states were missing for {missing:.2f} s while the robot moved"
                 )
-        if watched is None or not self.inputs.joints.stamps:
-            return
-        stamp = self.inputs.joints.stamps[-1]
-        # the first joints behind the watched time still tell of it: a start may take longer
-        if settling.moved((self.inputs.joints.values[-1] - watched[1]).tolist()):
-            self._watched = None
-            settling.begin(watched[0], "the estimate has started while the robot moved")
-        elif stamp > watched[0] + settling.options.watched_s * 1e9:
-            self._watched = None
+        if self.inputs.joints.stamps:
+            settling.watch(self.inputs.joints.stamps[-1], self.inputs.joints.values[-1])
 
     # -- reports --
 

@@ -38,7 +38,7 @@ def test_outputs_count_again_after_measurements_in_a_row():
 @pytest.mark.parametrize(("change", "waits"), [(0.0003, False), (0.003, True)])
 def test_a_residual_that_changes_after_a_start_shows_motion(change, waits):
     settling = Settling(NOISE)
-    settling.start(0)
+    settling.start(0, np.zeros(4))
     settling.take([innovation(10, (0.005, 0.0, 0.0)), innovation(35, (0.005 + change, 0.0, 0.0))])
     assert bool(settling.problem(36 * MS)) == waits
 
@@ -92,3 +92,21 @@ def test_outputs_are_invalid_where_the_tip_is_not_known_well_enough():
     invalid = [out for out in strict.outputs if not out.valid]
     assert invalid
     assert all("is known to" in out.reason and "limit of 0.1 mm" in out.reason for out in invalid)
+
+
+@pytest.mark.parametrize(
+    ("seen", "waits"),
+    [
+        ([(10, 0.011)], True),
+        ([(10, 0.001), (20, 0.002), (60, 0.5)], False),
+        ([(300, 0.3)], True),
+        ([(300, 0.001), (310, 0.3)], False),
+    ],
+    ids=["at once", "later", "at the first look after a long start", "at the second"],
+)
+def test_joints_that_move_at_the_start_have_outputs_wait(seen, waits):
+    settling = Settling(NOISE)
+    settling.start(0, np.zeros(4))
+    for ms, angle in seen:
+        settling.watch(ms * MS, np.array([angle, 0.0, 0.0, 0.0]))
+    assert bool(settling.problem(1 * MS)) == waits

@@ -16,6 +16,7 @@ from ctr_dynamics import chi_square
 from ctr_dynamics.estimation.step_output import Innovation
 
 Floats = NDArray[np.float64]
+STARTED_IN_MOTION = "the estimate has started while the robot moved"
 
 
 @dataclass(frozen=True)
@@ -60,11 +61,29 @@ class Settling:
         self._agreed = 0
         self._start_ns: int | None = None
         self._residual: Floats | None = None
+        # stamp and joints of a start, until they have told whether the robot moves; whether any within the watched time have been looked at
+        self._watched: tuple[int, Floats] | None = None
+        self._looked = False
 
-    def start(self, stamp_ns: int) -> None:
-        """The model starts at rest at ``stamp_ns``."""
+    def start(self, stamp_ns: int, joints: Floats) -> None:
+        """The model starts at rest at ``stamp_ns``, with the ``joints`` (2 N,) of that time."""
         self.clear()
-        self._start_ns = stamp_ns
+        self._start_ns, self._watched, self._looked = stamp_ns, (stamp_ns, joints), False
+
+    def watch(self, stamp_ns: int, joints: Floats) -> None:
+        """Joints of ``stamp_ns`` tell whether the robot moved when the model started."""
+        if self._watched is None:
+            return
+        began, at_start = self._watched
+        beyond = stamp_ns > began + self.options.watched_s * 1e9
+        # where a start took long, the first joints behind the watched time are the only ones that tell
+        tells = not (beyond and self._looked)
+        self._looked = True
+        if tells and self.moved((joints - at_start).tolist()):
+            self._watched = None
+            self.begin(began, STARTED_IN_MOTION)
+        elif beyond:
+            self._watched = None
 
     def begin(self, stamp_ns: int, why: str) -> None:
         """The model does not know how the robot moves at ``stamp_ns``, and ``why``, in words."""
@@ -100,7 +119,7 @@ class Settling:
             return
         change = motion.residual - before
         if float(change @ change) > self._limit and self._since_ns is None:
-            self.begin(innovation.stamp_ns, "the estimate has started while the robot moved")
+            self.begin(innovation.stamp_ns, STARTED_IN_MOTION)
 
     def problem(self, stamp_ns: int) -> str:
         """Why the output of ``stamp_ns`` does not count yet; empty where it does."""
