@@ -75,14 +75,14 @@ class Settling:
         if self._watched is None:
             return
         began, at_start = self._watched
-        beyond = stamp_ns > began + self.options.watched_s * 1e9
+        after = stamp_ns > began + self.options.watched_s * 1e9
         # where a start took long, the first joints behind the watched time are the only ones that tell
-        tells = not (beyond and self._looked)
+        tells = not (after and self._looked)
         self._looked = True
         if tells and self.moved((joints - at_start).tolist()):
             self._watched = None
             self.begin(began, STARTED_IN_MOTION)
-        elif beyond:
+        elif after:
             self._watched = None
 
     def begin(self, stamp_ns: int, why: str) -> None:
