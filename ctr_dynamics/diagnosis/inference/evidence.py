@@ -46,6 +46,7 @@ class WeighedHypotheses:
         sensitivities: at the re-calibrated point. screened: what candidates gain there by the linear estimate.
         pool: all candidates, with the contact plane that was found.
         at_best: sensitivities at the likeliest hypothesis; None where there was no need of them.
+        plane_sought: whether a contact plane has been looked for.
     """
 
     hypotheses: list[Hypothesis]
@@ -55,6 +56,7 @@ class WeighedHypotheses:
     screened: list[Screened]
     pool: list[Candidate]
     at_best: Sensitivities | None = None
+    plane_sought: bool = False
 
     @property
     def best(self) -> Hypothesis:

@@ -64,7 +64,9 @@ def search_hypotheses(
     context.report("once more, with nuisances beyond their tolerances")
     free = replace(problem, reach=math.inf)
     far = fit(free, (), recalibrated.point, polish=False)
-    other = None if far is None else search_once(free, found.pool, far, context)
+    other = (
+        None if far is None else search_once(free, found.pool, far, context, plane_sought=found.plane_sought)
+    )
     if other is None:
         return found
     change = free.offset - problem.offset
@@ -77,12 +79,20 @@ def search_hypotheses(
 
 
 def search_once(
-    problem: Problem, pool: list[Candidate], recalibrated: Fit, context: RunContext
+    problem: Problem,
+    pool: list[Candidate],
+    recalibrated: Fit,
+    context: RunContext,
+    *,
+    plane_sought: bool = False,
 ) -> WeighedHypotheses | None:
-    """One search from a fit without causes; None where the model cannot be simulated there."""
+    """One search from a fit without causes; None where the model cannot be simulated there.
+
+    ``plane_sought``: whether an earlier search of these recordings has looked for a contact plane.
+    """
     o = problem.options.search
     no_cause = Hypothesis((), recalibrated)
-    state = SearchState(problem, pool, recalibrated, context, [no_cause])
+    state = SearchState(problem, pool, recalibrated, context, [no_cause], plane_sought)
     context.report("sensitivities of all candidates")
     near = recalibrated.travelled <= problem.options.calibration.travelled
     known = recalibrated.by_key if near else {}
@@ -92,7 +102,7 @@ def search_once(
     screened = screen(problem, here, recalibrated, (), pool)
     fit_single_causes(state, screened, here)
     if begin_again_without_causes(state):
-        return search_once(problem, state.pool, state.recalibrated, context)
+        return search_once(problem, state.pool, state.recalibrated, context, plane_sought=plane_sought)
     large_misfit = excess(problem, recalibrated) > o.large_misfit
     if large_misfit and excess(problem, state.best.fit) > o.little_left and not context.out_of_time:
         screened, here = try_large_sizes(state, screened, here)
@@ -106,7 +116,14 @@ def search_once(
     refit_contenders(state)
     at_best = add_alternatives(state, screened)
     return WeighedHypotheses(
-        state.found, probabilities(state.found, problem), no_cause, here, screened, state.pool, at_best
+        state.found,
+        probabilities(state.found, problem),
+        no_cause,
+        here,
+        screened,
+        state.pool,
+        at_best,
+        state.plane_sought,
     )
 
 

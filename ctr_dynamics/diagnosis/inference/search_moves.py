@@ -43,6 +43,7 @@ class SearchState:
     Attributes:
         pool: candidates. recalibrated: the fit without causes, from which the search begins.
         found: hypotheses, likeliest first; the one without causes is among them.
+        plane_sought: whether a contact plane has been looked for. Only the data and the nominal model tell of it, whatever the search begins from.
     """
 
     problem: Problem
@@ -50,6 +51,7 @@ class SearchState:
     recalibrated: Fit
     context: RunContext
     found: list[Hypothesis]
+    plane_sought: bool = False
 
     @property
     def best(self) -> Hypothesis:
@@ -131,8 +133,9 @@ def try_large_sizes(
     """Screen and fit single causes at large sizes, and a contact plane that the data show; returns screening and sensitivities with them."""
     problem = state.problem
     state.context.report("large sizes, and a contact plane")
-    if not any(c.sizes for c in state.pool):
+    if not (state.plane_sought or any(c.sizes for c in state.pool)):
         plane = find_contact_plane(problem.even, effect_quantities(problem.robot), state.context)
+        state.plane_sought = True
         state.pool = [*state.pool, *([plane] if plane else [])]
     here = with_large_sizes(problem, here, state.pool, state.context)
     again = screen(problem, here, state.recalibrated, (), state.pool)
