@@ -34,8 +34,8 @@ if TYPE_CHECKING:
 
 SHORTEST_S = 2.0
 """Of a run, below which its errors say nothing: the start is left out."""
-LEAST_VALID = 0.9
-"""Share of valid steps, below which a live run shows the machine and not the robot."""
+MOST_TOO_OLD = 0.1
+"""Share of outputs that were invalid for their age, above which a live run shows the machine and not the robot."""
 START_S = 900.0
 """Longest wait for the estimator: the first start compiles every kernel."""
 
@@ -81,7 +81,7 @@ def demo(
             return 1
         record(output / "outputs.mcap", run.heard)
         show_timing(console, run.timing, len(run.heard[topics.TIP_POSE]))
-        if len(run.heard[topics.TIP_POSE]) < LEAST_VALID * run.timing["steps"]:
+        if run.timing["too_old"] > MOST_TOO_OLD * run.timing["steps"]:
             console.print(
                 f"this machine takes {run.timing['step_ms']['p50']:.1f} ms for a step of 3 ms, so that outputs came too late to be valid: "
                 "what follows is a replay of the same bag, which waits for every step",

@@ -68,7 +68,7 @@ class Settling:
     def start(self, stamp_ns: int, joints: Floats) -> None:
         """The model starts at rest at ``stamp_ns``, with the ``joints`` (2 N,) of that time."""
         self.clear()
-        self._start_ns, self._watched, self._looked = stamp_ns, (stamp_ns, joints), False
+        self._start_ns, self._watched = stamp_ns, (stamp_ns, joints)
 
     def watch(self, stamp_ns: int, joints: Floats) -> None:
         """Joints of ``stamp_ns`` tell whether the robot moved when the model started."""
