@@ -7,8 +7,11 @@ import pytest
 
 from ctr_dynamics.estimation.filter.adapted_variances import (
     FORCE_PART,
+    LARGEST,
+    SHIFT_PART,
     AdaptationOptions,
     AdaptedVariances,
+    Constants,
     ForceRange,
 )
 from ctr_dynamics.kernels.variance_likelihood import (
@@ -335,3 +338,41 @@ def test_a_force_that_has_ended_stays_in_the_covariance_until_it_is_measured():
         pi = pi + sizes.adapt(0.1 * i, np.zeros(3), H, H @ pi @ H.T + sizes.noise * R, R)
     assert sizes.sigma < 0.1 * large
     assert np.linalg.eigvalsh(pi - before)[0] > -1e-9
+
+
+def test_faults_of_the_tracker_make_no_constant_much_less_certain_than_its_tolerance():
+    """A shift of the tracker grows a thousandfold. What earlier randomness of it has left in the constants grows to their tolerances only."""
+    n = 3 + STATES
+    shift = slice(3 + SHIFT.start, 3 + SHIFT.stop)
+    found = []
+    for bounded in (True, False):
+        sizes = AdaptedVariances(ForceRange(1e-3, 2e-3, 1.0), 0.2, 100.0)
+        pi, H, R = np.zeros((n, n)), np.zeros((3, n)), 0.04 * np.eye(3)
+        H[:, :3] = H[:, shift] = np.eye(3)
+        sizes.start(pi, slice(0, 0))
+        random = np.zeros((n, 3))  # a part of the constants' errors comes from the shift
+        random[:3], random[shift] = -0.01 * np.eye(3), 0.03 * np.eye(3)
+        sizes.parts = np.array([np.zeros((n, n)), random @ random.T, np.zeros((n, n))])
+        pi += sizes.parts[SHIFT_PART]
+        pi[:3, :3] += 0.5 * np.eye(3)
+        before = pi.copy()
+        nu = np.array([50.0, 0.0, 0.0])
+        constants = Constants(np.eye(3, n), pi) if bounded else None
+        pi = pi + sizes.adapt(0.025, nu, H, H @ pi @ H.T + R, R, constants)
+        assert np.linalg.eigvalsh(pi - before)[0] > -1e-9
+        assert np.linalg.eigvalsh(pi - sizes.parts.sum(axis=0))[0] > -1e-9
+        found.append((pi.diagonal()[:3].max(), pi.diagonal()[shift].max()))
+    (constant, shifted), (unbounded, as_much) = found
+    assert constant == pytest.approx(LARGEST)
+    assert unbounded > 10.0 * LARGEST
+    assert shifted > 10.0**2
+    assert shifted == pytest.approx(as_much, rel=0.1)
+
+
+def test_the_bound_of_the_constants_changes_nothing_where_it_is_not_reached():
+    rng = np.random.default_rng(5)
+    more = np.cov(rng.normal(size=(4, 20)))
+    constants = Constants(np.eye(2, 4), 0.5 * np.eye(4))
+    assert constants.most(0.1 * more / more.max()) == 1.0
+    share = constants.most(100.0 * np.eye(4))
+    assert share == pytest.approx((LARGEST - 0.5) / 100.0)

@@ -35,6 +35,7 @@ from ctr_dynamics.sensing.tracker import SHIFT, STATES
 
 Floats = NDArray[np.float64]
 FORCE_PART, SHIFT_PART, NOISE_PART = 0, 1, 2  # in the order of the kernels
+LARGEST = 2.0  # variance of a constant, by that of its tolerance, to which faults of the tracker raise it. Above 1: what is not measured has 1.
 
 
 @dataclass(frozen=True)
@@ -91,6 +92,27 @@ class ForceRange(NamedTuple):
     least: float
     most: float
     change_s: float
+
+
+class Constants(NamedTuple):
+    """What does not change with time and has a tolerance: the robot's parameters, registration, lever arm and delay.
+
+    Attributes:
+        rows: (p, n) of which each, times the error of the filter's states, gives that of a constant by its tolerance.
+        pi: (n, n) covariance of the filter's states.
+    """
+
+    rows: Floats
+    pi: Floats
+
+    def most(self, more: Floats) -> float:
+        """The part, up to 1, of an addition ``more`` (n, n) to the covariance that leaves every variance at ``LARGEST`` times its tolerance."""
+        now, added = (
+            np.einsum("ij,jk,ik->i", self.rows, m, self.rows, optimize=True) for m in (self.pi, more)
+        )
+        room = np.maximum(LARGEST - now, 0.0)
+        excess = added > room
+        return float((room[excess] / added[excess]).min()) if excess.any() else 1.0
 
 
 class AdaptedVariances:
@@ -226,13 +248,16 @@ class AdaptedVariances:
         left = remains * (1.0 - self.steady), remains * (1.0 - self.quiet)
         new_randomness(pi, self.parts, len(pi) - STATES + SHIFT.start, self.shift**2, left)
 
-    def adapt(self, stamp: float, nu: Floats, H: Floats, S: Floats, R: Floats) -> Floats:
+    def adapt(
+        self, stamp: float, nu: Floats, H: Floats, S: Floats, R: Floats, constants: Constants | None = None
+    ) -> Floats:
         """Take in an innovation of the time ``stamp`` (s).
 
         Args:
             stamp: s from the first step.
             nu, H, S: (k,), its derivative (k, n) and its covariance (k, k) by the present variances.
             R: (k, k) the measurement noise that the robot file states.
+            constants: what has a tolerance; None for nothing.
 
         Returns:
             The change (n, n) of the filter's covariance that the new variances make.
@@ -273,12 +298,31 @@ class AdaptedVariances:
         larger = S + (change @ parts.reshape(3, -1)).reshape(S.shape)
         fraction = force * largest_variance_fraction(parts[FORCE_PART], larger)
         self.fraction = min(max(fraction, 0.0), 1.0)
-        n = self.parts.shape[1]
-        more = (change @ self.parts.reshape(3, -1)).reshape(n, n)
-        self.parts *= np.array([force, shift, noise])[:, None, None]
+        more = self._grown(change, np.array([force, shift, noise]), constants)
         self.sigma *= math.sqrt(force)
         self.shift *= math.sqrt(shift)
         self.noise *= noise
+        return more
+
+    def _grown(self, change: Floats, ratios: Floats, constants: Constants | None) -> Floats:
+        """The change (n, n) of Pi by the ``change`` (3,) of the parts, which become ``ratios`` (3,) times what they are.
+
+        Of what faults of the tracker would add, the ``constants`` and the fields, which depend on them, get no more than the tolerances allow.
+        What the parts were is then no part of these variances any more.
+        """
+        n = self.parts.shape[1]
+        fault = np.maximum(change, 0.0)
+        fault[FORCE_PART] = 0.0
+        if constants is not None and fault.any():
+            part = constants.most((fault @ self.parts.reshape(3, -1)).reshape(n, n))
+            if part < 1.0:
+                deviations = np.full(n, math.sqrt(part))
+                deviations[n - STATES :][SHIFT] = 1.0
+                limited = fault > 0.0
+                self.parts[limited] *= fault[limited, None, None] * np.multiply.outer(deviations, deviations)
+                change, ratios = np.where(limited, 1.0, change), np.where(limited, 1.0, ratios)
+        more: Floats = (change @ self.parts.reshape(3, -1)).reshape(n, n)
+        self.parts *= ratios[:, None, None]
         return more
 
     @property

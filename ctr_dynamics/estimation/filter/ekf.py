@@ -12,7 +12,7 @@ import numpy as np
 from filterpy.kalman import ExtendedKalmanFilter
 from numpy.typing import NDArray
 
-from ctr_dynamics.estimation.filter.adapted_variances import AdaptedVariances, ForceRange
+from ctr_dynamics.estimation.filter.adapted_variances import AdaptedVariances, Constants, ForceRange
 from ctr_dynamics.estimation.filter.covariance_factor import CovarianceFactor
 from ctr_dynamics.estimation.filter.factor_reduction import reduced
 from ctr_dynamics.estimation.filter.factor_schedule import FactorSchedule
@@ -269,7 +269,8 @@ class RodEkf:
         # 2. What the innovation says of the sizes of tip force, tracker shift and tracker noise.
         if not self.adapted.noisy:
             S = S + (self.adapted.noise - 1.0) * R
-        self.pi += self.adapted.adapt(stamp, nu, H, S, R)
+        constants = Constants(self._tolerances.rows(self.factor.theta), self.pi)
+        self.pi += self.adapted.adapt(stamp, nu, H, S, R, constants)
         if self._sees_position:
             changed = H @ self.pi @ H.T + self.adapted.noise * R
             foretold = position_density(nu, S, R), position_density(nu, changed, R)

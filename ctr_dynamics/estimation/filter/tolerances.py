@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ctr_dynamics import chi_square
 from ctr_dynamics.estimation.filter.adapted_variances import joseph
-from ctr_dynamics.sensing.tracker import DELAY, LEVER, STATE_NAMES
+from ctr_dynamics.sensing.tracker import DELAY, LEVER, STATE_NAMES, STATES
 
 Floats = NDArray[np.float64]
 SHORT = 3.0  # times too small, up to which parameters still follow the robot, and the estimated delay is worth more than its tolerance
@@ -42,6 +42,18 @@ class Tolerances:
 
     def _apart(self, theta: Floats, states: Floats) -> Floats:
         return np.concatenate([theta[self._rows], states[self._states]]) / self._sigma
+
+    def rows(self, factor: Floats) -> Floats:
+        """(k, r + 22) rows that give the errors of what has a tolerance, in units of it, from those of the coefficients and tracker states.
+
+        ``factor`` (p, r): the parameters' rows of the covariance factor.
+        """
+        count, r = len(self._rows), factor.shape[1]
+        rows = np.zeros((len(self._sigma), r + STATES))
+        rows[:count, :r] = factor[self._rows]
+        rows[np.arange(count, len(rows)), r + self._states] = 1.0
+        rows /= self._sigma[:, None]
+        return rows
 
     def refuted(self, theta: Floats, states: Floats, before: bool = False) -> bool:
         """Whether the estimate is all but impossible by the tolerances, or has been ``before`` and is not back where they have it.
