@@ -59,6 +59,17 @@ def test_a_robot_that_is_better_than_its_tolerances_has_no_model_error(departure
     assert beyond.probability(NONE) < 0.01
 
 
+@pytest.mark.parametrize("moves_at", [(160,), (160, 240), (100, 200, 300)])
+def test_a_tracker_that_is_moved_is_no_departure_of_the_robot(moves_at):
+    """It begins at once, stays, and may end at once; however badly a filter foretells that has no state for a turned sensor."""
+    departures = np.zeros((400, 3))
+    for k in moves_at:
+        departures[k:] = 2e-2 * np.random.default_rng(k).standard_normal(3)
+    moved = search(departures, turn=0.3)
+    assert moved.found(NONE) is None
+    assert moved.probability(NONE) < 0.01
+
+
 def test_what_the_filter_counts_on_already_is_not_found_again():
     wanders = search(wandering(2e-3, 1.0, 400))
     found = wanders.found(NONE)

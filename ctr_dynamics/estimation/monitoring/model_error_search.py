@@ -5,7 +5,8 @@ and is worse than the open-loop run. So measurements are also compared with the 
 each of some sizes and times. These and the filter compete by how well each foretells the next position (prequential evidence, Dawid 1984).
 
 A robot that is better than its tolerances is foretold by its open-loop run better than by the filter, which counts on them. So the open-loop run
-with a constant departure, that of a registration within its tolerance, competes too. Where it foretells best, the model does not err.
+with a constant departure, that of a registration within its tolerance, competes too. Where it foretells best, the model does not err. That departure
+may jump: a tracker or sensor that was moved departs suddenly, by any distance, and stays there, which no model does.
 """
 
 from __future__ import annotations
@@ -38,6 +39,8 @@ class ModelErrorSearchOptions:
         learning_s: s after a start that do not count: the filter learns the sizes of force, shift and noise by a factor of ten at each measurement.
         least_s: s of evidence before a model error is believed, ten of the shortest times and one of the longest. A deflection at rest or the
             begin of a vibration is no slow departure yet.
+        sound_s: s, mean time after which a tracker or its sensor is moved; that of the filter
+            (:class:`~ctr_dynamics.estimation.filter.adapted_variances.AdaptationOptions`).
         memory_s: s, for which evidence counts.
         remembered: measurements that may be taken again.
     """
@@ -50,6 +53,7 @@ class ModelErrorSearchOptions:
     believed: float = 0.99
     learning_s: float = 0.5
     least_s: float = 3.0
+    sound_s: float = 1000.0
     memory_s: float = 10.0
     remembered: int = 200
 
@@ -58,8 +62,8 @@ class Evidence(NamedTuple):
     """What the measurements up to ``stamp_ns`` say.
 
     Attributes:
-        level: (h + 1, 3) m, departure of the tip for every hypothesis, as known from the past; the last is constant. variance: (h + 1,) m^2, of it
-            per axis.
+        level: (h + 1, 3) m, departure of the tip for every hypothesis, as known from the past; the last is constant but for jumps.
+        variance: (h + 1,) m^2, of it per axis.
         departures: (h + 1,) logarithm of the evidence of every hypothesis; filter: of what the filter foretold.
         turned: rad^2, mean square of the rotation between measurements and open-loop run, per axis; weight: of how many measurements.
     """
@@ -95,6 +99,7 @@ class ModelErrorSearch:
     ) -> None:
         self.options = options = options or ModelErrorSearchOptions()
         self._noise, self._rotation_noise, self._change_s = position_noise, rotation_noise, change_s
+        self._reach = length
         least = options.smallest * position_noise
         most = max(least, options.largest * length)
         count = 1 + math.ceil(math.log(most / least) / math.log(options.steps))
@@ -142,6 +147,10 @@ class ModelErrorSearch:
         change, total = residual - level, before + noise
         # 2. Density of the position, by that of the stated noise at zero.
         density = -0.5 * ((change**2).sum(axis=1) / total + 3.0 * np.log(total / noise))
+        moved = self._moved(residual, elapsed)
+        if moved > density[-1]:  # the likelier of both goes on
+            density[-1], before[-1], total[-1] = moved, self._reach**2, self._reach**2 + noise
+            level[-1], change[-1] = 0.0, residual
         own = density_of_filter(foretold, elapsed / self._change_s)
         # 3. What is known of the past counts less and less, and what the filter foretold while it learned does not count.
         decay, gain = math.exp(-elapsed / options.memory_s), before / total
@@ -160,6 +169,12 @@ class ModelErrorSearch:
                 weight,
             )
         )
+
+    def _moved(self, residual: Floats, elapsed: float) -> float:
+        """Logarithm of the probability that the tracker was moved in ``elapsed`` s, and of the density of the ``residual`` (3,) m if it was."""
+        total = self._reach**2 + self._noise**2
+        density = -0.5 * (float(residual @ residual) / total + 3.0 * math.log(total / self._noise**2))
+        return math.log(-math.expm1(-elapsed / self.options.sound_s)) + density
 
     def _span(self, stamp_ns: int) -> float:
         """s from the first measurement."""
