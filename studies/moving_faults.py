@@ -34,6 +34,7 @@ from ctr_dynamics.io.bag_reader import RawMessage, open_bag
 from ctr_dynamics.io.bag_writer import write_bag
 from ctr_dynamics.io.messages import cdr, topics
 from ctr_dynamics.io.messages.encode import encode_wrench_stamped
+from ctr_dynamics.kernels.rotations import from_vector, multiply
 from ctr_dynamics.robot_files import load_robot
 from ctr_dynamics.ros.listener import Listener
 from ctr_dynamics.ros.node_processes import ESTIMATOR, NodeProcess, free_domain
@@ -81,6 +82,17 @@ def beside(size_m: float, share: float) -> Edit:
         return in_span(T, pose(off))(messages)
 
     return change
+
+
+def knocked(p: cdr.PoseIn) -> cdr.PoseIn:
+    """A sensor that sits 20 mm further and turned by 0.5 rad."""
+    x, y, z, w = p.quaternion_xyzw
+    turned = multiply(np.array([w, x, y, z]), from_vector(np.array([0.0, 0.5, 0.0])))
+    w, x, y, z = turned.tolist()
+    return p._replace(
+        position=(p.position[0] + 0.02, *p.position[1:]),
+        quaternion_xyzw=(x, y, z, w),
+    )
 
 
 def late(seconds: float) -> Edit:
@@ -151,6 +163,7 @@ FAULTS: dict[str, tuple[Edit, float]] = {  # the change, and when it ends (s); i
     "all poses 5 mm off for 2 s": (beside(0.005, 1.0), END_S),
     "half the poses 3 mm off for 2 s": (beside(0.003, 0.5), END_S),
     "half the poses 50 mm off for 2 s": (beside(0.05, 0.5), END_S),
+    "sensor 20 mm off and turned by 0.5 rad for 2 s": (in_span(T, pose(knocked)), END_S),
     "poses of 1e160 for 2 s": (in_span(T, pose(huge)), END_S),
     "poses 80 ms late, not told": (late(0.08), math.inf),
     "joints silent for 0.25 s": (in_span(J, lambda m: [], BEGIN_S + 0.25), BEGIN_S + 0.25),
