@@ -11,7 +11,6 @@ clean run's rms error, but 0.5 mm at least. Exit code 1 when a promise was broke
 from __future__ import annotations
 
 import argparse
-import contextlib
 import dataclasses
 import json
 import math
@@ -87,12 +86,8 @@ def beside(size_m: float, share: float) -> Edit:
 def knocked(p: cdr.PoseIn) -> cdr.PoseIn:
     """A sensor that sits 20 mm further and turned by 0.5 rad."""
     x, y, z, w = p.quaternion_xyzw
-    turned = multiply(np.array([w, x, y, z]), from_vector(np.array([0.0, 0.5, 0.0])))
-    w, x, y, z = turned.tolist()
-    return p._replace(
-        position=(p.position[0] + 0.02, *p.position[1:]),
-        quaternion_xyzw=(x, y, z, w),
-    )
+    w, x, y, z = multiply(np.array([w, x, y, z]), from_vector(np.array([0.0, 0.5, 0.0]))).tolist()
+    return p._replace(position=(p.position[0] + 0.02, *p.position[1:]), quaternion_xyzw=(x, y, z, w))
 
 
 def late(seconds: float) -> Edit:
@@ -120,11 +115,9 @@ def one_joint_state(edit: Callable[[RawMessage], RawMessage]) -> Edit:
     return change
 
 
-def turned(angle: float) -> Callable[[RawMessage], RawMessage]:
-    def edit(j: cdr.JointStateIn) -> cdr.JointStateIn:
-        return j._replace(positions=(j.positions[0] + angle, *j.positions[1:]))
-
-    return lambda m: joints(edit)(m)[0]
+def turned_on(m: RawMessage) -> RawMessage:
+    """The first joint 1 rad further."""
+    return joints(lambda j: j._replace(positions=(j.positions[0] + 1.0, *j.positions[1:])))(m)[0]
 
 
 def two_drivers(messages: Messages) -> Messages:
@@ -171,7 +164,7 @@ FAULTS: dict[str, tuple[Edit, float]] = {  # the change, and when it ends (s); i
         in_span(J, joints(lambda j: j._replace(positions=(NAN, *j.positions[1:]))), BEGIN_S + 0.6),
         BEGIN_S + 0.6,
     ),
-    "one joint state 1 rad off": (one_joint_state(turned(1.0)), 5.1),
+    "one joint state 1 rad off": (one_joint_state(turned_on), 5.1),
     "one joint state 0.9 s ahead": (
         one_joint_state(lambda m: m._replace(data=shifted(m.data, 900_000_000))),
         5.0,
@@ -298,8 +291,7 @@ def live(messages: Messages, robot: str, fault: str, folder: Path, start_ns: int
         for timer in timers:
             timer.start()
         played = play(listener, messages, 1.0)
-        with contextlib.suppress(Exception):
-            node.stop()
+        node.stop()
         found = {name: [m.data for m in listener.received[name]] for name in names}
     return Poses.of(found[topics.TIP_POSE], found[topics.DIAGNOSTICS], start_ns + played.shift_ns)
 

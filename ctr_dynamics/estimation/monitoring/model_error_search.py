@@ -14,11 +14,12 @@ from __future__ import annotations
 import math
 from collections import deque
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ctr_dynamics.estimation.filter.adapted_variances import AdaptationOptions
 from ctr_dynamics.estimation.filter.filter_records import ModelErrorSize
 from ctr_dynamics.estimation.monitoring.delay_search import density_of_filter
 
@@ -39,8 +40,7 @@ class ModelErrorSearchOptions:
         learning_s: s after a start that do not count: the filter learns the sizes of force, shift and noise by a factor of ten at each measurement.
         least_s: s of evidence before a model error is believed, ten of the shortest times and one of the longest. A deflection at rest or the
             begin of a vibration is no slow departure yet.
-        sound_s: s, mean time after which a tracker or its sensor is moved; that of the filter
-            (:class:`~ctr_dynamics.estimation.filter.adapted_variances.AdaptationOptions`).
+        sound_s: s, mean time after which a tracker or its sensor is moved.
         memory_s: s, for which evidence counts.
         remembered: measurements that may be taken again.
     """
@@ -53,7 +53,7 @@ class ModelErrorSearchOptions:
     believed: float = 0.99
     learning_s: float = 0.5
     least_s: float = 3.0
-    sound_s: float = 1000.0
+    sound_s: float = AdaptationOptions.sound_s
     memory_s: float = 10.0
     remembered: int = 200
 
@@ -146,10 +146,13 @@ class ModelErrorSearch:
         level = remains[:, None] * last.level
         change, total = residual - level, before + noise
         # 2. Density of the position, by that of the stated noise at zero.
-        density = -0.5 * ((change**2).sum(axis=1) / total + 3.0 * np.log(total / noise))
-        moved = self._moved(residual, elapsed)
-        if moved > density[-1]:  # the likelier of both goes on
-            density[-1], before[-1], total[-1] = moved, self._reach**2, self._reach**2 + noise
+        density = _log_density((change**2).sum(axis=1), total, noise)
+        # of a constant departure and one that has jumped to anywhere, the likelier goes on
+        anywhere = self._reach**2 + noise
+        moved = math.log(-math.expm1(-elapsed / options.sound_s))
+        moved += _log_density(residual @ residual, anywhere, noise)
+        if moved > density[-1]:
+            density[-1], before[-1], total[-1] = moved, self._reach**2, anywhere
             level[-1], change[-1] = 0.0, residual
         own = density_of_filter(foretold, elapsed / self._change_s)
         # 3. What is known of the past counts less and less, and what the filter foretold while it learned does not count.
@@ -169,12 +172,6 @@ class ModelErrorSearch:
                 weight,
             )
         )
-
-    def _moved(self, residual: Floats, elapsed: float) -> float:
-        """Logarithm of the probability that the tracker was moved in ``elapsed`` s, and of the density of the ``residual`` (3,) m if it was."""
-        total = self._reach**2 + self._noise**2
-        density = -0.5 * (float(residual @ residual) / total + 3.0 * math.log(total / self._noise**2))
-        return math.log(-math.expm1(-elapsed / self.options.sound_s)) + density
 
     def _span(self, stamp_ns: int) -> float:
         """s from the first measurement."""
@@ -226,3 +223,8 @@ class ModelErrorSearch:
             self._compared = None
             last = self._evidence.pop()
             self._evidence.append(last._replace(filter=float(max(last.filter, last.departures.max()))))
+
+
+def _log_density(square: Any, variance: Any, noise: float) -> Any:
+    """Logarithm of a normal density of three axes, of ``variance`` (m^2) each, at a squared distance ``square`` (m^2), by that of ``noise`` at 0."""
+    return -0.5 * (square / variance + 3.0 * np.log(variance / noise))
