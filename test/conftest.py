@@ -10,7 +10,9 @@ from importlib.util import find_spec
 from pathlib import Path
 
 # Set before anything imports rclpy; child processes inherit both. 0 and the low ids are left to people.
-os.environ["ROS_DOMAIN_ID"] = str(20 + os.getpid() % 200)
+os.environ["ROS_DOMAIN_ID"] = str(
+    20 + os.getpid() % 80
+)  # above 101 its ports are those that Linux gives to clients
 os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
 os.environ.setdefault("MPLBACKEND", "Agg")
 

@@ -272,10 +272,11 @@ class EstimatorNode(Node):
         count, _ = self._undecodable.get(topic, (0, ""))
         self._undecodable[topic] = (count + 1, str(error))
 
-    def _publish(self, out: StepOutput) -> bool:
-        if not out.valid:
-            self._estimator.health.problem = out.reason  # also where it has come too late
-        return self.outputs.step(out)
+    def _publish(self, out: StepOutput, by_now: Callable[[StepOutput], StepOutput]) -> bool:
+        sent = self.outputs.step(out, by_now)
+        if sent and not self.outputs.valid:
+            self._estimator.health.problem = self.outputs.reason  # also where it has come too late
+        return sent
 
     def _prefetch(self) -> None:
         self._estimator.prefetch()

@@ -10,8 +10,9 @@ from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
 
+from ctr_dynamics.estimation.step_output import StepOutput
 from ctr_dynamics.io.messages import topics
-from ctr_dynamics.io.messages.encode import encode_diagnostics
+from ctr_dynamics.io.messages.encode import Encoded, encode_diagnostics
 from ctr_dynamics.ros.qos import QosFaults
 from ctr_dynamics.ros.topic_names import message_class, node_topic
 from ctr_dynamics.runtime.clock_offset import RisingStamps
@@ -41,7 +42,7 @@ class Outputs:
     ) -> None:
         self._node, self._transforms = node, transforms
         self.stamps = RisingStamps()
-        self._last: Any = None  # the last step that was published
+        self._last: StepOutput | None = None  # the last step that was published, as it went out
         self._encoder = encoder
         self._record = record
         self._publishers = {
@@ -54,17 +55,30 @@ class Outputs:
             for topic in topics.OUTPUTS
         }
 
-    def step(self, out: Any) -> bool:
-        """Publish one step; False when its stamp is not later than all that were published."""
+    def step(self, out: StepOutput, by_now: Callable[[StepOutput], StepOutput]) -> bool:
+        """Publish one step; False when its stamp is not later than all that were published.
+
+        Args:
+            out: the step.
+            by_now: gives it as it is at the time of the call, invalid once it is too old. Asked before every message: a process may be held up
+                between any two of them.
+        """
         if not self.stamps.passes(out.stamp_ns):
             return False
-        self._last = out
+        out = self._last = by_now(out)
         for message in self._encoder.encode(out):
-            if message.topic in self._publishers:
-                self._send(*message)
-            elif self._transforms is not None:
-                self._transforms.publish(message.data)  # not recorded here: the node hears it as well
+            self._last = by_now(out)
+            if self._last.valid != out.valid:
+                self._publish(self._encoder.encode(self._last)[-1])
+                break
+            self._publish(message)
         return True
+
+    def _publish(self, message: Encoded) -> None:
+        if message.topic in self._publishers:
+            self._send(*message)
+        elif self._transforms is not None:
+            self._transforms.publish(message.data)  # not recorded here: the node hears it as well
 
     @property
     def valid(self) -> bool | None:

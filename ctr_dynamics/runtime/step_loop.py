@@ -89,7 +89,8 @@ class StepLoop(threading.Thread):
 
     Args:
         estimator: see `Steps`; touched by this thread alone once started.
-        publish: called with every step in order of its stamp; returns False when the stamp was withheld.
+        publish: called with every step in order of its stamp and a function that gives the step as it is by now: invalid once it is too old.
+            Returns False when the stamp was withheld.
         housekeeping: called after each round with the current time and whether there is time to spare; publishes diagnostics when they are due.
         clock: the node's.
         timing: the account of punctuality.
@@ -102,7 +103,7 @@ class StepLoop(threading.Thread):
     def __init__(
         self,
         estimator: Steps,
-        publish: Callable[[Any], bool],
+        publish: Callable[[Any, Callable[[Any], Any]], bool],
         housekeeping: Callable[[int, bool], None],
         clock: Clock,
         timing: StepTiming,
@@ -291,7 +292,7 @@ class StepLoop(threading.Thread):
                 if self._last is not None and step.k <= self._last[0]:
                     self.timing.restarted()  # the estimator has reinitialised itself
                 self._last = (step.k, step.stamp_ns)
-                if self._publish(self._not_too_old(step)):
+                if self._publish(step, self._not_too_old):
                     self.timing.published(step.k, step.stamp_ns, self._now_ns())
                 else:
                     self.timing.withheld += 1
@@ -300,7 +301,7 @@ class StepLoop(threading.Thread):
         self._wake.set()  # there is more to take, after a look at the inbox
 
     def _not_too_old(self, step: Any) -> Any:
-        """The step, invalid where it comes so late that the robot may be elsewhere by now."""
+        """The step, invalid where it comes so late that the robot may be elsewhere by now; the caller asks just before it sends."""
         now_ns = self._now_ns()
         if (
             self.max_age_ns is None

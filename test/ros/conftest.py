@@ -24,6 +24,7 @@ from ctr_dynamics.ros.node_processes import ESTIMATOR, NodeProcess
 from ctr_dynamics.ros.topic_names import message_class
 
 PATIENCE_S = 120.0  # of every wait: nothing is asserted about how long anything takes
+ASK_AGAIN_S = 20.0  # of an answer that was lost
 BAGS = Path(__file__).parents[1] / "data" / "bags"
 
 
@@ -193,15 +194,23 @@ class Live:
         self.wait(there, f"status {name} at level {level} with '{text}'; it is {self.status(name)}")
         return self.status(name, at)
 
-    def done(self, future):
-        self.wait(future.done, "an answer")
-        return future.result()
+    def answer(self, ask):
+        """The result of the future that `ask` returns. A server whose side has not found the client's reader yet drops its answer
+        (rmw_fastrtps: "client will not receive response"), so where none comes, the client asks again."""
+        futures = [ask()]
+        for _ in range(round(PATIENCE_S / ASK_AGAIN_S)):
+            self.listener.wait_for(lambda: futures[-1].done() or self.process.code is not None, ASK_AGAIN_S)
+            assert self.process.code is None, f"the node has ended\n{self.process.output()}"
+            if futures[-1].done():
+                return futures[-1].result()
+            futures.append(ask())
+        pytest.fail(f"waited in vain for an answer\n{self.process.output()}")
 
     def call(self, name: str, request):
         kind = SetBool if isinstance(request, SetBool.Request) else Trigger
         client = self.listener.node.create_client(kind, f"/ctr/estimator/{name}")
         self.wait(client.service_is_ready, f"service {name}")
-        return self.done(client.call_async(request))
+        return self.answer(lambda: client.call_async(request))
 
     def trigger(self, name: str):
         return self.call(name, Trigger.Request())
@@ -209,12 +218,12 @@ class Live:
     def set_parameter(self, name: str, value):
         client = AsyncParameterClient(self.listener.node, "/ctr/estimator")
         self.wait(client.services_are_ready, "parameter services")
-        return self.done(client.set_parameters([Parameter(name, value=value)])).results[0]
+        return self.answer(lambda: client.set_parameters([Parameter(name, value=value)])).results[0]
 
     def get_parameters(self, names: list[str]):
         client = AsyncParameterClient(self.listener.node, "/ctr/estimator")
         self.wait(client.services_are_ready, "parameter services")
-        return self.done(client.get_parameters(names)).values
+        return self.answer(lambda: client.get_parameters(names)).values
 
 
 @pytest.fixture

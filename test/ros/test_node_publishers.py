@@ -1,6 +1,9 @@
-"""Publishers that do not fit the inputs, named from the graph over DDS; and types of poses that do."""
+"""Publishers that do not fit the inputs, named from the graph over DDS; types of poses that do; and what goes out of a step that grows old."""
 
 from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import NamedTuple
 
 import pytest
 
@@ -12,7 +15,10 @@ from std_msgs.msg import String
 
 from ctr_dynamics.io.messages import topics
 from ctr_dynamics.io.messages.cdr import CdrWriter
+from ctr_dynamics.io.messages.encode import Encoded
 from ctr_dynamics.ros.listener import Listener
+from ctr_dynamics.ros.publishers import Outputs
+from ctr_dynamics.ros.topic_names import node_topic
 
 pytestmark = pytest.mark.ros
 
@@ -58,3 +64,42 @@ def test_a_tracker_of_another_type_is_read(start):
         live.wait(lambda: live.count(topics.INNOVATION) > before + 5, "poses that are taken")
         last = live.messages(topics.INNOVATION)[-1]
         assert dict(zip(last.name, last.position, strict=True))["accepted"] == 1.0
+
+
+class Step(NamedTuple):
+    stamp_ns: int = 1
+    valid: bool = True
+    reason: str = ""
+
+
+@pytest.mark.parametrize("sent", range(4))
+def test_of_a_step_that_grows_old_while_it_is_sent_nothing_more_goes_out_but_that_it_is_invalid(sent):
+    """A process that is held up between two messages: the encoder comes first, then pose, twist and validity."""
+    out = []
+    known_as = {node_topic(topic.name): topic.name for topic in topics.OUTPUTS}
+
+    def publisher(kind, name, profile, event_callbacks):
+        return SimpleNamespace(publish=lambda data: out.append((known_as[name], data)))
+
+    def encode(step):
+        names = (topics.TIP_POSE, topics.TIP_TWIST) * step.valid
+        return [Encoded(name, 1, b"") for name in names] + [Encoded(topics.VALID, 1, step.valid)]
+
+    outputs = Outputs(
+        SimpleNamespace(create_publisher=publisher),
+        None,
+        SimpleNamespace(publisher=lambda topic: None),
+        SimpleNamespace(encode=encode),
+    )
+    asked = []
+
+    def by_now(step):
+        asked.append(step)
+        return step if len(asked) <= 1 + sent else step._replace(valid=False, reason="old")
+
+    assert outputs.step(Step(), by_now)
+    names = [topics.TIP_POSE, topics.TIP_TWIST, topics.VALID][: min(sent, 3)]
+    assert [name for name, _ in out] == names + [topics.VALID] * (sent < 3)
+    assert out[-1][1] == outputs.valid == (sent == 3)
+    assert outputs.reason == ("" if sent == 3 else "old")
+    assert not outputs.step(Step(), by_now)

@@ -50,7 +50,7 @@ def test_what_a_stopped_node_catches_up_with_is_invalid():
     published = []
     loop = StepLoop(
         Steady(clock.now),
-        lambda step: published.append(step) is None,
+        lambda step, by_now: published.append(by_now(step)) is None,
         lambda now, idle: None,
         Clock(lambda: clock.now),
         StepTiming("predict", 100 * MS),

@@ -66,7 +66,7 @@ def make_loop(estimator, clock, policy="predict", publish=None, gather_ns=0, pre
     published = []
     errors = []
 
-    def note(step):
+    def note(step, by_now):
         published.append(step.stamp_ns)
         return True
 
@@ -179,7 +179,7 @@ def test_pauses_are_used_after_steps_are_out_and_not_while_inputs_wait(clock):
     loop._round()  # nothing was due
     assert estimator.pauses == 1
     clock.now += STEP_NS
-    loop._publish = lambda step: loop.put(lambda: None) or True  # an input comes meanwhile
+    loop._publish = lambda step, by_now: loop.put(lambda: None) or True  # an input comes meanwhile
     loop._round()
     assert estimator.pauses == 1
 
@@ -419,7 +419,7 @@ def test_under_wait_every_step_is_out_before_the_next_is_taken(clock):
     estimator = Scripted(t0_ns=clock.now - 5 * STEP_NS)
     taken = []
 
-    def publish(step):
+    def publish(step, by_now):
         taken.append((step.k, estimator.k))
         return True
 
