@@ -21,6 +21,7 @@ from ctr_dynamics.io.messages.topics import JOINT_STATES, TRACKER_TIP, accepts_f
 from ctr_dynamics.parameters import Settings, axes_mask, input_mapping, pose_frame
 from ctr_dynamics.robot import Robot
 from ctr_dynamics.sensing.checks import CheckOptions, JointChecks, Kind
+from ctr_dynamics.sensing.encoder_noise import without_noise
 from ctr_dynamics.sensing.interpolation import finite, joint_order
 from ctr_dynamics.sensing.tracker_parameters import with_robot_file
 
@@ -34,7 +35,7 @@ class Recording:
 
     Attributes:
         name: of the bag. sha256: of its files, by name.
-        joints: (k, 1 + 2N) t, alpha rad, beta m. load: (k, 7) t, force N, torque N m in ``ctr_base``; may be empty.
+        joints: (k, 1 + 2N) t, alpha rad without the encoders' noise, beta m. load: (k, 7) t, force N, torque N m in ``ctr_base``; may be empty.
         stamps: (s,) s of the tracker poses; position: (s, 3) m; quaternion: (s, 4) wxyz.
         notes: what was left out or looks odd.
         axes: measured axes of the tracker, as the parameter ``tracker.axes`` has them.
@@ -122,6 +123,9 @@ def read_recording(
             do="cut the bag; ten seconds with motion are enough",
             where=where,
         )
+    moving = _moving(table, robot, o)
+    angles = slice(1, 1 + robot.n_tubes)
+    table[:, angles] = without_noise(table[:, 0], table[:, angles], robot.encoders.noise.value)
     tracker, coarse = _rows(_once(poses), t0, o)
     notes += [f"tracker poses: {coarse}"] if coarse else []
     inside = (tracker[:, 0] >= 0.0) & (tracker[:, 0] <= table[-1, 0])
@@ -132,7 +136,6 @@ def read_recording(
     tracker = tracker[inside]
     unseen, note = _unseen(table[:, 0], tracker[:, 0], o)
     notes += [note] if note else []
-    moving = _moving(table, robot, o)
     if moving:
         notes.append(
             f"the recording begins in motion ({moving}), which the model does not know: tracker poses of the first {o.unsettled_s:g} s were left out"

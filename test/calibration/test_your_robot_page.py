@@ -142,4 +142,4 @@ def test_the_page_leads_from_two_logs_to_fused_poses_and_findings(lab, capsys):
     assert (lab / "report.html").exists()
     findings = json.loads((lab / "findings" / "findings.json").read_text())
     assert findings["inputs"][0]["name"] == "bag.mcap"
-    assert findings["verdict"]
+    assert findings["verdict"] == "clean"  # the robot differs within the tolerances of its file
