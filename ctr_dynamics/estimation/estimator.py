@@ -443,7 +443,8 @@ class Estimator:
         if unsettled:
             return unsettled
         deviations = Deviations(deviation, self._driven_m, self._largest_deviation)
-        return deviations.problem(self.health, unknown_delay=self.runs.fused.late)
+        fused = self.runs.fused
+        return deviations.problem(self.health, fused.delay_search.apart if fused.late else None)
 
     def _look_for_motion(self) -> None:
         """Have outputs wait after a gap of the joints, or after a start, in which the robot moved."""

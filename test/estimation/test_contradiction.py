@@ -46,3 +46,20 @@ def test_a_shift_since_the_start_may_be_one_of_the_registration():
         deviation = np.sqrt(np.trace(covariance, axis1=1, axis2=2))
         assert run.column("valid").all()
         assert np.all((deviation > 4e-3) == deviates)
+
+
+@pytest.mark.parametrize("zeros", [(0.8, 0.8), (0.0, -1.2)])
+def test_joints_with_wrong_zeros_are_not_taken_for_a_late_tracker_when_they_begin_to_move(zeros):
+    """No delay brings tracker and model together, so an unknown one is no excuse for their distance."""
+    messages = []
+    for m in bag_messages("clean_sweep", 3.0):
+        if m.kind == "joints":
+            names, values = m.content
+            shift = dict(zip(("tube1_rotation", "tube2_rotation"), zeros, strict=True))
+            m = replace(
+                m, content=(names, [x + shift.get(n, 0.0) for n, x in zip(names, values, strict=True)])
+            )
+        messages.append(m)
+    run = play(messages)
+    assert not run.column("valid")[run.t > 0.1].any()
+    assert any("tracker and model lie" in out.reason for out in run.outputs)

@@ -179,6 +179,11 @@ class DelaySearch:
         inside = (delays >= 0.0) & (delays <= self.options.longest_s)
         return delays[inside], dense[inside]
 
+    @property
+    def apart(self) -> float:
+        """m between the measurements and the open-loop run with the delay that brings them together most."""
+        return float(np.linalg.norm(self._evidence[-1].level, axis=1).min()) if self._evidence else 0.0
+
     def found(self, present_s: float) -> tuple[float, float] | None:
         """The delay that is believed instead of ``present_s``, beyond the nominal one, and its deviation, s; None where there is none."""
         belief = self.belief(present_s)

@@ -18,8 +18,11 @@ class Deviations(NamedTuple):
     driven: float
     largest: float
 
-    def problem(self, health: Health, *, unknown_delay: bool) -> str:
-        """Why the output cannot be trusted; empty when it can. ``unknown_delay``: the tracker is late by a time that is not known."""
+    def problem(self, health: Health, unknown_delay: float | None = None) -> str:
+        """Why the output cannot be trusted; empty when it can.
+
+        ``unknown_delay``: where the tracker is late by a time that is not known, how far it and the model lie apart at least, m.
+        """
         limit = f"limit {1e3 * self.largest:.1f} mm"
         if self.tip > self.largest and 2.0 * self.driven**2 > self.tip**2:
             return (
@@ -28,9 +31,8 @@ class Deviations(NamedTuple):
             )
         if self.tip > self.largest:
             return f"the tip is known to no better than the limit of {1e3 * self.largest:.1f} mm (output.largest_deviation_m)"
-        compared = health.fusing and health.tracker_alive and not unknown_delay
-        apart = health.apart_m if compared else 0.0
-        if apart > self.largest:
+        apart = health.apart_m if unknown_delay is None else unknown_delay
+        if health.fusing and health.tracker_alive and apart > self.largest:
             return (
                 f"tracker and model lie {1e3 * apart:.1f} mm apart, {limit}: check the tracker's frame and sensor, the joints' "
                 "zeros and the robot file"

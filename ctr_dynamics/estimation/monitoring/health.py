@@ -19,7 +19,10 @@ from ctr_dynamics.model.stability import Stability
 TRACKER_LIMIT_S = 1.0  # without a usable measurement for longer the status says so: 40 are missing at 40 Hz
 RECENT = 40  # measurements that the tracker is judged by: one second at 40 Hz
 FEWEST_RECENT = 20  # of them, below which nothing is said of a contradiction
-APART, FEWEST_APART = 20, 5  # measurements for the distance between tracker and model: half a second at 40 Hz
+APART, FEWEST_APART = (
+    20,
+    3,
+)  # measurements for the distance between tracker and model: half a second at 40 Hz; one of three may be an outlier
 WAITING = "waiting for the first complete joint state"
 
 
