@@ -1,8 +1,10 @@
 """When the estimate refutes the robot file, and updates that leave the delay alone, against dense conditional Gaussians."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
-from estimation_cases import BAGS, Run, estimator
+from estimation_cases import BAGS, Run, bag_messages, estimator, play, truth_error
 
 from ctr_dynamics import chi_square
 from ctr_dynamics.estimation.filter.tolerances import PROBABILITY, SHORT, Tolerances, gain_beside, release
@@ -100,3 +102,17 @@ def test_a_robot_file_with_far_too_small_tolerances_does_not_make_the_filter_cer
     at = len(ekf.pi) - STATES + DELAY
     assert ekf.pi[at, at] == pytest.approx(file.tracker.delay.tolerance**2, rel=0.01)
     assert run.last.valid
+
+
+def test_a_tracker_clock_that_runs_fast_leaves_the_valid_tip_where_it_says_or_the_covariance_large():
+    """Stamps run ahead by 3 ms in a second: the delay that is found grows beyond the file's, and with it the bent parameters refute the file."""
+    messages = [
+        replace(m, stamp=round(m.stamp * 1.003)) if m.kind == "pose" else m
+        for m in bag_messages("clean_sweep", 6.0)
+    ]
+    run = play(messages)
+    error, steps = truth_error(run, "clean_sweep", "p_trk")
+    distance = np.linalg.norm(error, axis=1)
+    deviation = np.sqrt(np.trace(run.column("tip_covariance")[steps, :3, :3], axis1=1, axis2=2))
+    assert run.estimator.health.refutation
+    assert np.all((distance < 3e-3) | (distance < 3.0 * deviation))

@@ -325,7 +325,8 @@ class RodEkf:
         at = len(self.pi) - STATES + DELAY
         if before or not self.refuted or not self.pi[at, at] > 0.0:
             return np.zeros(len(self.pi))
-        gain = release(at, self._delay_sigma, self.pi)
+        # nobody knows which is right: the delay that was expected, or the one that was found
+        gain = release(at, math.hypot(self._delay_sigma, states[DELAY]), self.pi)
         correction: Floats = -states[DELAY] * gain
         nu -= H @ correction
         known = np.zeros((1, len(gain)))
