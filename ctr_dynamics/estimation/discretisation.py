@@ -49,8 +49,9 @@ class VibrationErrors(NamedTuple):
     """How the robot vibrates at rest, and how the model goes astray from it, mode by mode (m).
 
     Attributes:
-        exponent: (m,) complex, 1/s. twist: (m, 6) complex, of the tip by the modal coordinate; by_load: (m, 6) complex, modal coordinate of the
-            equilibrium by force and torque (:class:`~ctr_dynamics.estimation.vibration_modes.ModalBasis`).
+        exponent: (m,) complex, 1/s. twist: (m, 6) complex, of the tip by the modal coordinate
+            (:class:`~ctr_dynamics.estimation.vibration_modes.ModalBasis`).
+        by_load: (m, 6) complex, modal coordinate of the equilibrium by force and torque; by_rotation: (m, N) complex, by the tubes' rotations.
         phase_rate: (m,) rad/s, errors of nodes and steps. tolerance: relative deviation of a frequency by the robot file's tolerances.
         resolved: (m,) whether the steps resolve it.
     """
@@ -58,6 +59,7 @@ class VibrationErrors(NamedTuple):
     exponent: NDArray[np.complex128]
     twist: NDArray[np.complex128]
     by_load: NDArray[np.complex128]
+    by_rotation: NDArray[np.complex128]
     phase_rate: Floats
     tolerance: float
     resolved: NDArray[np.bool_]
@@ -66,7 +68,7 @@ class VibrationErrors(NamedTuple):
     def none(cls) -> VibrationErrors:
         """Of a robot whose modes are not known."""
         no_rows = np.zeros((0, 6), complex)
-        return cls(np.zeros(0, complex), no_rows, no_rows, np.zeros(0), 0.0, np.zeros(0, bool))
+        return cls(np.zeros(0, complex), no_rows, no_rows, no_rows, np.zeros(0), 0.0, np.zeros(0, bool))
 
 
 @dataclass(frozen=True)
@@ -166,12 +168,13 @@ def discretise(robot: Robot, least: int, accuracy_m: float) -> Discretisation:
         Mode(float(f), float(d), float(a), bool(k))
         for f, d, a, k in zip(frequency, damping, np.linalg.norm(amplitude, axis=1), kept, strict=True)
     )
-    by_load = fine.by_inputs[:, 2 * robot.n_tubes :]
-    m = len(fine.frequency_hz)
+    m, n = len(fine.frequency_hz), robot.n_tubes
+    by_inputs = (fine.by_inputs[:m] + 1j * fine.by_inputs[m:])[:count]
     vibration = VibrationErrors(
         np.minimum(fine.exponent[:count].real, 0.0) + 1j * fine.exponent[:count].imag,
         fine.twist[:count],
-        (by_load[:m] + 1j * by_load[m:])[:count],
+        by_inputs[:, 2 * n :],
+        by_inputs[:, :n],
         np.hypot(2 * np.pi * frequency * shift * (COARSE / nodes) ** 4, by_steps),
         frequency_tolerance(robot),
         kept,

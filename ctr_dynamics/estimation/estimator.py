@@ -135,7 +135,7 @@ class Estimator:
         self._jacobian = JacobianTracker(self._modes.coarse, self.options.jacobian_every)
         self._without_idle = 0  # steps since the last idle work
         self._unexpected = UnexpectedInnovation(self._largest_deviation, noise)
-        self._twist_error = TwistError(self.discretisation.vibration)
+        self._twist_error = TwistError(self.discretisation.vibration, self.robot)
         self._driven_m = 0.0  # by which actuators may have moved the tip unknown to the last step
 
     # -- inputs --
@@ -408,7 +408,9 @@ class Estimator:
         )
         fused.inflate_covariance(tip, self.runs.open_loop, self._largest_deviation)
         self._unexpected.inflate(tip.covariance, stamp)
-        self._twist_error.inflate(tip.covariance, stamp, self.runs.open_loop.tips.last, fused.ekf)
+        self._twist_error.inflate(
+            tip, stamp, self.runs.open_loop.tips.last, fused.ekf, self.inputs.joint_period_s
+        )
         self._driven_m = self.inputs.actuator_error.inflate(
             tip.covariance, tip.position, self._length, stamp, late.lag * STEP_NS
         )

@@ -1,10 +1,17 @@
-"""What is added to the covariance of the twist: by the frequency of the motion, and by vibrations that a load has left."""
+"""What is added to the covariance of the twist: by the frequency of the motion, by vibrations that a load has left or that the noise of the encoders
+excites, and by the tracker's frame."""
 
 import numpy as np
 import pytest
 
 from ctr_dynamics.estimation.discretisation import VibrationErrors, discretise
-from ctr_dynamics.estimation.monitoring.twist_error import LoadVibration, MotionFrequency
+from ctr_dynamics.estimation.monitoring.twist_error import (
+    EncoderVibration,
+    FrameError,
+    LoadVibration,
+    MotionFrequency,
+    skew,
+)
 from ctr_dynamics.estimation.vibration_modes import lanes_of, modal_basis, tip_response
 from ctr_dynamics.model.model import Model
 from ctr_dynamics.model.statics import Statics
@@ -15,16 +22,20 @@ MU = np.array([-0.5 + 30.0j, -2.0 + 900.0j])
 FORCE = np.array([0.0, 0.5, 0.0, 0.0, 0.0, 0.0])
 
 
-def vibration(phase_rate=(0.0, 0.0), tolerance=0.0, resolved=(True, True)):
-    """Two modes that a force in y excites, along y and along z."""
+def vibration_errors(phase_rate=(0.0, 0.0), tolerance=0.0, resolved=(True, True)):
+    """Two modes that a force in y excites, along y and along z, and the first of two rotations likewise."""
     along = np.zeros((2, 6), complex)
     along[0, 1] = along[1, 2] = 1.0
     by_load = np.zeros((2, 6), complex)
     by_load[:, 1] = 0.01, 0.001
-    errors = VibrationErrors(
-        MU, along * MU[:, None], by_load, np.array(phase_rate), tolerance, np.array(resolved)
+    by_rotation = np.array([[0.02j, 0.0], [0.001, 0.0]])
+    return VibrationErrors(
+        MU, along * MU[:, None], by_load, by_rotation, np.array(phase_rate), tolerance, np.array(resolved)
     )
-    return LoadVibration(errors)
+
+
+def vibration(*of, **options):
+    return LoadVibration(vibration_errors(*of, **options))
 
 
 def added(found, at_s, lost=(0.0, 0.0)):
@@ -164,3 +175,55 @@ def test_fast_modes_of_a_shipped_robot_are_among_the_errors():
     assert errors.resolved[:4].all()
     assert np.all(errors.exponent.real <= 0.0)
     assert 0.001 < errors.tolerance < 0.05
+
+
+def test_the_noise_of_encoders_makes_the_model_vibrate_as_much_as_said():
+    """Against many runs of both modes, driven by straight lines between noisy readings; the slower mode decays within the runs."""
+    noise, period, readings, runs = 3e-4, 0.01, 400, 4000
+    modes = vibration_errors()
+    turned = np.random.default_rng(0).normal(0.0, noise, (runs, readings))
+    turned[:, [0, -1]] = 0.0  # what a reading turns the tubes itself is no vibration
+    z = np.zeros((runs, 2), complex)
+    for change in np.diff(turned, axis=1, prepend=turned[:, :1]).T:
+        excited = -np.expm1(MU * period) / (MU * period) * modes.by_rotation[:, 0]
+        z = z * np.exp(MU * period) + change[:, None] * excited
+    twist = 2.0 * (z @ modes.twist).real
+    found = EncoderVibration(modes, noise)
+    for k in range(round(readings * period / 0.003)):
+        found.add(round(k * 0.003 * SECOND), period)
+    covariance = np.zeros((12, 12))
+    found.inflate(covariance)
+    assert np.diag(covariance)[7:9] == pytest.approx(twist.var(axis=0)[1:3], rel=0.1)
+    assert np.diag(covariance)[1:3] == pytest.approx(twist.var(axis=0)[1:3] / np.abs(MU) ** 2, rel=0.1)
+
+
+def test_encoders_without_noise_and_robots_without_modes_add_nothing():
+    for modes, noise in ((vibration_errors(), 0.0), (VibrationErrors.none(), 1e-3)):
+        found = EncoderVibration(modes, noise)
+        for k in range(10):
+            found.add(k * SECOND, 0.01)
+        covariance = np.zeros((12, 12))
+        found.inflate(covariance)
+        assert not covariance.any()
+
+
+def test_registration_and_lever_arm_turn_and_move_the_twist():
+    """Against the twist about a frame that is turned, and at a point beside the tip, by many draws of both."""
+    rng = np.random.default_rng(1)
+    rotation, lever = np.array([1e-3, 2e-3, 3e-3]), np.array([2e-4, 5e-4, 1e-4])
+    twist = np.array([0.1, -0.3, 0.2, 1.0, 2.0, -0.5])
+    half = np.array([np.cos(0.4), 0.0, np.sin(0.4), 0.0])  # 0.8 rad about y
+    R = np.array([[np.cos(0.8), 0.0, np.sin(0.8)], [0.0, 1.0, 0.0], [-np.sin(0.8), 0.0, np.cos(0.8)]])
+    turns, moves = rng.normal(size=(20_000, 3)) * rotation, rng.normal(size=(20_000, 3)) * lever
+    linear = np.cross(turns, twist[:3]) + np.cross(twist[3:], moves @ R.T)
+    seen = np.hstack([linear, np.cross(turns, twist[3:])])
+    covariance = np.zeros((12, 12))
+    FrameError(rotation, lever).inflate(covariance, twist, half)
+    expected = np.cov(seen.T)
+    assert covariance[6:, 6:] == pytest.approx(expected, abs=0.03 * np.abs(expected).max())
+    assert not covariance[:6].any()
+
+
+def test_skew_is_the_cross_product():
+    a, b = np.array([1.0, 2.0, 3.0]), np.array([-0.5, 0.7, 0.1])
+    assert skew(a) @ b == pytest.approx(np.cross(a, b))

@@ -13,7 +13,10 @@ from numpy.typing import NDArray
 
 from ctr_dynamics.estimation.discretisation import VibrationErrors
 from ctr_dynamics.estimation.filter.ekf import RodEkf
+from ctr_dynamics.estimation.filter.filter_records import TipEstimate
 from ctr_dynamics.estimation.filter.rational_step import FOLLOWED_S, Stride, error_rates
+from ctr_dynamics.kernels import rotations
+from ctr_dynamics.robot import Robot
 from ctr_dynamics.sensing import Tip
 
 Floats = NDArray[np.float64]
@@ -69,7 +72,7 @@ class LoadVibration:
     """
 
     def __init__(self, modes: VibrationErrors) -> None:
-        self._modes = modes
+        self._modes, self._of_one = modes, of_modes(modes)
         self.clear()
 
     def clear(self) -> None:
@@ -121,22 +124,92 @@ class LoadVibration:
         by_tolerances = np.abs(modes.exponent) * modes.tolerance * age * np.minimum(lost * age, 1.0)
         square = np.minimum((modes.phase_rate * age) ** 2 + by_tolerances**2, MOST)
         square[~modes.resolved] = 1.0  # the model follows the mean
-        variance = 2.0 * size**2 * square
-        twist = modes.twist.T * np.sqrt(variance)
-        pose = twist / modes.exponent
-        whole = np.vstack([pose, twist])
-        covariance += (whole @ whole.conj().T).real
+        covariance += np.tensordot(size**2 * square, self._of_one, 1)
+
+
+class EncoderVibration:
+    """Vibrations that the model has and the robot has not: the noise of the encoders turns its tubes alone.
+
+    Args:
+        modes: how the robot vibrates at rest.
+        noise: deviation of a rotation that is read, rad.
+    """
+
+    def __init__(self, modes: VibrationErrors, noise: float) -> None:
+        self._exponent = modes.exponent
+        self._by_noise = noise**2 * (np.abs(modes.by_rotation) ** 2).sum(axis=1)
+        self._of_one = of_modes(modes)
+        self._stamp_ns: int | None = None
+        self._variance = np.zeros(len(modes.exponent))  # of the modal coordinates
+        self._period_s, self._added = 0.0, np.zeros(len(modes.exponent))  # by one reading
+
+    def add(self, stamp_ns: int, period_s: float) -> None:
+        """Go on to ``stamp_ns``, with readings every ``period_s``. A reading turns the tubes evenly from the one before, and back to the next."""
+        elapsed_s = 0.0 if self._stamp_ns is None else max(stamp_ns - self._stamp_ns, 0) * 1e-9
+        self._stamp_ns = stamp_ns
+        if period_s != self._period_s:
+            angle = self._exponent * period_s
+            self._period_s, self._added = (
+                period_s,
+                self._by_noise * np.abs(np.expm1(angle)) ** 4 / np.abs(angle) ** 2,
+            )
+        self._variance *= np.exp(2.0 * elapsed_s * self._exponent.real)
+        self._variance += self._added * (elapsed_s / period_s)
+
+    def inflate(self, covariance: Floats) -> None:
+        """Add them to the ``covariance`` (12, 12) of the tip, in place."""
+        covariance += np.tensordot(self._variance, self._of_one, 1)
+
+
+def of_modes(modes: VibrationErrors) -> Floats:
+    """(m, 12, 12) covariance of pose and twist of the tip by each modal coordinate of variance 1 and any phase."""
+    whole = np.hstack([modes.twist / modes.exponent[:, None], modes.twist])
+    found: Floats = 2.0 * (whole[:, :, None] * whole[:, None].conj()).real
+    return found
+
+
+class FrameError:
+    """The twist turned by what the registration, and moved by what the lever arm may be off.
+
+    Args:
+        rotation: (3,) rad, deviations of the registration. lever: (3,) m, deviations of the lever arm.
+    """
+
+    def __init__(self, rotation: Floats, lever: Floats) -> None:
+        self._rotation, self._lever = rotation, lever
+        self._errors = np.zeros((6, 6))
+
+    def inflate(self, covariance: Floats, twist: Floats, quaternion: Floats) -> None:
+        """Add it to the ``covariance`` (12, 12) of the tip, in place; ``twist`` (6,) and ``quaternion`` (4,) wxyz are the tip's."""
+        errors, spin = self._errors, skew(twist[3:])
+        errors[:3, :3] = skew(twist[:3]) * self._rotation
+        errors[3:, :3] = spin * self._rotation
+        errors[:3, 3:] = spin @ rotations.matrix(quaternion) * self._lever
+        covariance[6:, 6:] += errors @ errors.T
+
+
+def skew(vector: Floats) -> Floats:
+    """(3, 3) whose product with another vector is the cross product."""
+    x, y, z = vector.tolist()
+    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
 
 
 class TwistError:
-    """Both: errors of the twist by the frequency of the motion, and by vibrations that a load has left.
+    """All: errors of the twist by the frequency of the motion, by vibrations that a load has left, by the noise of the encoders, and by the
+    tracker's frame and sensor.
 
     Args:
         modes: how the robot vibrates at rest, and how well that is followed.
+        robot: has the noise of the encoders, and the tolerances of registration and lever arm.
     """
 
-    def __init__(self, modes: VibrationErrors) -> None:
+    def __init__(self, modes: VibrationErrors, robot: Robot) -> None:
+        tracker = robot.tracker
         self._motion, self._vibration = MotionFrequency(), LoadVibration(modes)
+        self._encoders = EncoderVibration(modes, robot.encoders.noise.value)
+        self._frame = FrameError(
+            np.array(tracker.registration_rotation.tolerance), np.array(tracker.lever_arm.tolerance)
+        )
         self._frequency_hz = modes.exponent.imag / (2 * np.pi)
         self._stride: Stride | None = None  # of the columns, and what they lose by it
         self._lost = np.zeros(len(self._frequency_hz))
@@ -145,8 +218,12 @@ class TwistError:
         """The known load (6,) N, N m has changed evenly by ``difference`` between two stamps."""
         self._vibration.load_changed(from_ns, to_ns, difference)
 
-    def inflate(self, covariance: Floats, stamp_ns: int, open_loop: Tip, ekf: RodEkf) -> None:
-        """Add to the ``covariance`` (12, 12) of pose and twist at ``stamp_ns``, in place; ``open_loop``: the tip that measurements do not move."""
+    def inflate(self, tip: TipEstimate, stamp_ns: int, open_loop: Tip, ekf: RodEkf, period_s: float) -> None:
+        """Add to the covariance of ``tip`` at ``stamp_ns``, in place.
+
+        ``open_loop``: the tip that measurements do not move. ``period_s``: between two joint states.
+        """
+        covariance = tip.covariance
         self._motion.add(stamp_ns, open_loop.mean[:3], open_loop.mean[7:10])
         columns = ekf.tips.last.columns[:6]
         r = columns.shape[1]
@@ -156,3 +233,7 @@ class TwistError:
                 self._stride, over_s = ekf.stride, ekf.stride.steps * ekf.simulator.scheme.dt
                 self._lost = error_rates(ekf.stride.fraction, self._frequency_hz, over_s)
             self._vibration.inflate(covariance, stamp_ns, self._lost)
+        self._frame.inflate(covariance, tip.twist, tip.quaternion)
+        if period_s > 0.0:
+            self._encoders.add(stamp_ns, period_s)
+        self._encoders.inflate(covariance)
