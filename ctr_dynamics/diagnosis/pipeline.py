@@ -17,6 +17,7 @@ from ctr_dynamics.diagnosis.diagnosis_options import DiagnosisOptions
 from ctr_dynamics.diagnosis.diagnosis_result import Diagnosis
 from ctr_dynamics.diagnosis.inference.calibration import calibrate, nuisances_of
 from ctr_dynamics.diagnosis.inference.candidates import candidates
+from ctr_dynamics.diagnosis.inference.discretisation_error import correct_discretisation
 from ctr_dynamics.diagnosis.inference.evidence import weigh_by_prediction, weigh_discrepancy
 from ctr_dynamics.diagnosis.inference.fit_problem import Problem, choose_steps, make_problem
 from ctr_dynamics.diagnosis.inference.fit_quality import is_wrong
@@ -114,9 +115,10 @@ def diagnose_recordings(
     held_out = None
     if validation:
         held_out = problem.on(validation)
-        choose_steps(held_out, found.no_cause.fit.point, context)
+        choose_steps(held_out, found.best.fit.point, context)
         if any(not is_wrong(problem, e) for e in found.hypotheses):
             context.report("evidence of the validation bags")
+            correct_discretisation(held_out, found.best.fit.point, context)
             weigh_by_prediction(found, problem, held_out, context)
     best = hypothesis_for_verdict(found, options)
     result.extended = best.fit

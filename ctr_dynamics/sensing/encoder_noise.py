@@ -12,10 +12,12 @@ from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
 
-HALF_WIDTHS = (2, 3, 4, 6, 8, 11, 16, 23, 32, 45, 64)
+HALF_WIDTHS = (3, 4, 6, 8, 11, 16, 23, 32, 45, 64)
 """Samples on either side: each window holds half as many again as the one before."""
-DEVIATIONS = 2.0
-"""Width of the interval around each estimate. Two neighbouring estimates of one smooth motion differ by more than both in one of 10 000 cases."""
+DEGREE = 4
+"""Of the polynomials. A motion of some Hz bends so much within a window that parabolas would change it by as much as the noise."""
+DEVIATIONS = 1.5
+"""Width of the interval around each estimate. With more, an error that lasts replaces noise that does not; with less, windows stay narrow."""
 _THIRD_DIFFERENCE = np.sqrt(20.0) * 0.6745  # its median size for white noise of one
 
 
@@ -29,9 +31,10 @@ def noise_of(values: Floats) -> Floats:
 def without_noise(t: Floats, values: Floats, deviation: float) -> Floats:
     """Readings (s, n) at the rising times ``t`` (s,) without white noise of standard ``deviation``.
 
-    A parabola through the readings around each, over the widest window that the noise allows: its value must agree with those of all narrower
-    windows within their uncertainties (intersection of confidence intervals, Goldenshluger and Nemirovski 1997). So a slope discontinuity or a
-    step of the motion stays as sharp as the readings show it. Readings with less noise than stated (:func:`noise_of`) are changed less.
+    A polynomial of fourth degree through the readings around each, over the widest window that the noise allows: its value must agree with those
+    of all narrower windows within their uncertainties (intersection of confidence intervals, Goldenshluger and Nemirovski 1997). So a slope
+    discontinuity or a step of the motion stays as sharp as the readings show it. Readings with less noise than stated (:func:`noise_of`) are
+    changed less.
     """
     sigma = np.minimum(noise_of(values), deviation)
     out = values.copy()
@@ -43,7 +46,7 @@ def without_noise(t: Floats, values: Floats, deviation: float) -> Floats:
         width = 2 * half + 1
         if width > len(t):
             break
-        estimate, gain = _parabola(t, values, half)
+        estimate, gain = _polynomial(t, values, half)
         reach = DEVIATIONS * sigma * gain[:, None]
         low, high = np.maximum(low, estimate - reach), np.minimum(high, estimate + reach)
         open_ &= low <= high
@@ -51,15 +54,16 @@ def without_noise(t: Floats, values: Floats, deviation: float) -> Floats:
     return out
 
 
-def _parabola(t: Floats, values: Floats, half: int) -> tuple[Floats, Floats]:
-    """Value at each time of the least-squares parabola through ``2 half + 1`` readings around it, and its deviation (s,) per unit of noise."""
+def _polynomial(t: Floats, values: Floats, half: int) -> tuple[Floats, Floats]:
+    """Value at each time of the least-squares polynomial through ``2 half + 1`` readings around it, and its deviation (s,) per unit of noise."""
     count, width = len(t), 2 * half + 1
     first = np.clip(np.arange(count) - half, 0, count - width)
     around = sliding_window_view(t, width)[first] - t[:, None]
     scaled = around / np.abs(around).max(axis=1, keepdims=True)
-    basis = scaled[:, :, None] ** np.arange(3)
+    basis = scaled[:, :, None] ** np.arange(DEGREE + 1)
     normal = np.einsum("swi,swj->sij", basis, basis)
-    at_centre = np.linalg.solve(normal, np.broadcast_to([[1.0], [0.0], [0.0]], (count, 3, 1)))[:, :, 0]
+    one = np.broadcast_to(np.eye(DEGREE + 1)[:, :1], (count, DEGREE + 1, 1))
+    at_centre = np.linalg.solve(normal, one)[:, :, 0]
     weights = np.einsum("swi,si->sw", basis, at_centre)
     estimate = np.einsum("sw,snw->sn", weights, sliding_window_view(values, width, axis=0)[first])
     return estimate, np.sqrt((weights**2).sum(axis=1))

@@ -251,16 +251,11 @@ def weigh_by_prediction(
 
 
 def log_prediction(held_out: Problem, result: Fit) -> float:
-    """Log likelihood of ``held_out``, up to a constant, with the posterior of ``result``: what fitted bags leave open is no wrong prediction.
-
-    By half the steps where these can be simulated: fits are corrected for their error in time as well. The derivatives need no such care.
-    """
+    """Log likelihood of ``held_out``, up to a constant, with the posterior of ``result``: what fitted bags leave open is no wrong prediction."""
     found = held_out.linearise(result.point, result.active)
     if found is None:
         return IMPOSSIBLE
     residual, columns = found
-    finer = held_out.finer.residual(result.point)
-    residual = residual if finer is None else finer
     size, axes = np.linalg.eigh(result.covariance)
     free = columns @ (axes * np.sqrt(np.maximum(size, 0.0)))  # by coefficients of unit deviation
     _, _, evidence = posterior(residual, free, np.zeros(len(size)), np.ones(len(size)), held_out.numerics)
