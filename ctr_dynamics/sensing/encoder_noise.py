@@ -41,7 +41,7 @@ def without_noise(t: Floats, values: Floats, deviation: float) -> Floats:
     if not np.any(sigma > 0.0):
         return out
     low, high = values - DEVIATIONS * sigma, values + DEVIATIONS * sigma
-    open_ = np.broadcast_to(sigma > 0.0, values.shape).copy()
+    agreeing = np.broadcast_to(sigma > 0.0, values.shape).copy()
     for half in HALF_WIDTHS:
         width = 2 * half + 1
         if width > len(t):
@@ -49,8 +49,8 @@ def without_noise(t: Floats, values: Floats, deviation: float) -> Floats:
         estimate, gain = _polynomial(t, values, half)
         reach = DEVIATIONS * sigma * gain[:, None]
         low, high = np.maximum(low, estimate - reach), np.minimum(high, estimate + reach)
-        open_ &= low <= high
-        out[open_] = estimate[open_]
+        agreeing &= low <= high
+        out[agreeing] = estimate[agreeing]
     return out
 
 
