@@ -64,6 +64,11 @@ class VibrationErrors(NamedTuple):
     tolerance: float
     resolved: NDArray[np.bool_]
 
+    def deflection(self, difference: Floats) -> float:
+        """m, by which a load's ``difference`` (6,) N, N m moves the resting tip."""
+        moved = (self.twist[:, :3] / self.exponent[:, None]).T @ (self.by_load @ difference)
+        return float(np.linalg.norm(2.0 * moved.real))
+
     @classmethod
     def none(cls) -> VibrationErrors:
         """Of a robot whose modes are not known."""

@@ -20,6 +20,7 @@ from ctr_dynamics.estimation.backbone import Backbone
 from ctr_dynamics.estimation.discretisation import discretise
 from ctr_dynamics.estimation.inputs.input_buffer import InputBuffer
 from ctr_dynamics.estimation.inputs.measurement_queue import tracker_of
+from ctr_dynamics.estimation.inputs.unseen_load import UnseenLoad
 from ctr_dynamics.estimation.mode_tracker import ModeTracker
 from ctr_dynamics.estimation.monitoring.consistency_monitor import consistency_monitor
 from ctr_dynamics.estimation.monitoring.deviations import Deviations
@@ -136,6 +137,7 @@ class Estimator:
         self._without_idle = 0  # steps since the last idle work
         self._unexpected = UnexpectedInnovation(self._largest_deviation, noise)
         self._twist_error = TwistError(self.discretisation.vibration, self.robot)
+        self._unseen_load = UnseenLoad(self.discretisation.vibration, noise)
         self._driven_m = 0.0  # by which actuators may have moved the tip unknown to the last step
 
     # -- inputs --
@@ -197,6 +199,7 @@ class Estimator:
             self._twist_error.load_changed(change.begin_ns, change.end_ns, change.difference)
             if change.jumped:
                 self._unexpected.load_jumped(change.from_ns)
+            self._unseen_load.look(self._settling, change=change)
 
     # -- time --
 
@@ -453,6 +456,8 @@ class Estimator:
         gap, settling = self.inputs.gap, self._settling
         if gap is not None:
             self.inputs.gap = None
+            if self.runs.running:
+                self._unseen_load.look(self._settling, gap=gap)
             if settling.moved(gap.change.tolist()) and self.runs.running:
                 missing = (gap.until_ns - gap.from_ns) * 1e-9
                 settling.begin(

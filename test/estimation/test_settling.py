@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from estimation_cases import START_NS, bag_messages, play, rms
+from estimation_cases import START_NS, bag_messages, play, rms, truth_error
 
 from ctr_dynamics.estimation.monitoring.settling import Settling, SettlingOptions
 from ctr_dynamics.estimation.step_output import Innovation, MotionPoint
@@ -110,3 +110,17 @@ def test_joints_that_move_at_the_start_have_outputs_wait(seen, waits):
     for ms, angle in seen:
         settling.watch(ms * MS, np.array([angle, 0.0, 0.0, 0.0]))
     assert bool(settling.problem(1 * MS)) == waits
+
+
+def test_outputs_wait_where_the_known_load_has_changed_in_a_gap_of_everything():
+    """A weight is cut while nothing is recorded, as where a file of a split bag is lost: nobody knows when, so the vibration is not known."""
+    messages = [m for m in bag_messages("clean_release", 3.0) if not 0.99e9 < m.stamp < 1.9e9]
+    run = play(messages)
+    error, steps = truth_error(run, "clean_release", "p_trk")
+    distance = np.linalg.norm(error, axis=1)
+    valid, covariance = run.column("valid")[steps], run.column("tip_covariance")[steps, :3, :3]
+    deviation = np.sqrt(np.trace(covariance, axis1=1, axis2=2))
+    back = valid & (run.t[steps] > 1.9)
+    assert back.any()
+    assert np.all((distance < 3e-3)[back] | (distance < 3.0 * deviation)[back])
+    assert any("known load on the robot changed" in out.reason for out in run.outputs)
