@@ -457,12 +457,9 @@ class Estimator:
         if gap is not None:
             self.inputs.gap = None
             if self.runs.running:
-                self._unseen_load.look(self._settling, gap=gap)
-            if settling.moved(gap.change.tolist()) and self.runs.running:
-                missing = (gap.until_ns - gap.from_ns) * 1e-9
-                settling.begin(
-                    gap.until_ns, f"joint states were missing for {missing:.2f} s while the robot moved"
-                )
+                self._unseen_load.look(settling, gap=gap)
+                if settling.moved(gap.change.tolist()):
+                    settling.begin(gap.until_ns, f"{gap.words} while the robot moved")
         if self.inputs.joints.stamps:
             settling.watch(self.inputs.joints.stamps[-1], self.inputs.joints.values[-1])
 

@@ -31,9 +31,8 @@ def test_noise_goes_where_robots_vibrate_and_the_motion_stays(noise):
     left = without_noise(t, motion(t) + noise, SIGMA) - motion(t)
     assert np.all(spectrum(t, left, 10.0, 50.0) < 0.4 * spectrum(t, noise, 10.0, 50.0))
     assert np.all(left.std(axis=0) < 0.7 * SIGMA)
-    assert (
-        np.abs(left).max() < 6.0 * SIGMA
-    )  # also at the beginning and the end of the turn, and of the recording
+    # also at the beginning and the end of the turn, and of the recording
+    assert np.abs(left).max() < 6.0 * SIGMA
 
 
 def test_stamps_need_not_be_even(noise):

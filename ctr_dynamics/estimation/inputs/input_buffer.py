@@ -39,6 +39,11 @@ class JointGap(NamedTuple):
     until_ns: int
     change: Floats
 
+    @property
+    def words(self) -> str:
+        """That they were missing, and for how long."""
+        return f"joint states were missing for {(self.until_ns - self.from_ns) * 1e-9:.2f} s"
+
 
 class LoadChange(NamedTuple):
     """A load that changes what was known: from the stamp ``from_ns`` on, and whether it has ``jumped``.

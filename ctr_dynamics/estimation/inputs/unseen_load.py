@@ -30,8 +30,4 @@ class UnseenLoad:
             return
         if self._modes.deflection(change.difference) > self._noise:
             self._change = None
-            missing = (gap.until_ns - gap.from_ns) * 1e-9
-            settling.begin(
-                gap.until_ns,
-                f"joint states were missing for {missing:.2f} s while the known load on the robot changed",
-            )
+            settling.begin(gap.until_ns, f"{gap.words} while the known load on the robot changed")

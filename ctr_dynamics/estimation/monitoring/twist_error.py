@@ -124,7 +124,7 @@ class LoadVibration:
         by_tolerances = np.abs(modes.exponent) * modes.tolerance * age * np.minimum(lost * age, 1.0)
         square = np.minimum((modes.phase_rate * age) ** 2 + by_tolerances**2, MOST)
         square[~modes.resolved] = 1.0  # the model follows the mean
-        covariance += np.tensordot(size**2 * square, self._of_one, 1)
+        covariance += ((size**2 * square) @ self._of_one).reshape(12, 12)
 
 
 class EncoderVibration:
@@ -158,14 +158,14 @@ class EncoderVibration:
 
     def inflate(self, covariance: Floats) -> None:
         """Add them to the ``covariance`` (12, 12) of the tip, in place."""
-        covariance += np.tensordot(self._variance, self._of_one, 1)
+        covariance += (self._variance @ self._of_one).reshape(12, 12)
 
 
 def of_modes(modes: VibrationErrors) -> Floats:
-    """(m, 12, 12) covariance of pose and twist of the tip by each modal coordinate of variance 1 and any phase."""
+    """(m, 144) covariance (12, 12) of pose and twist of the tip, row by row, by each modal coordinate of variance 1 and any phase."""
     whole = np.hstack([modes.twist / modes.exponent[:, None], modes.twist])
     found: Floats = 2.0 * (whole[:, :, None] * whole[:, None].conj()).real
-    return found
+    return found.reshape(len(whole), 144)
 
 
 class FrameError:
