@@ -1,6 +1,7 @@
 """Parameters: the table itself, checks of values, parameter files and the generated documents."""
 
 import math
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +19,7 @@ from ctr_dynamics.parameters import (
     parse_assignments,
     read_parameter_file,
 )
+from ctr_dynamics.parameters.settings import GivenTwice
 from tools import tables
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -147,10 +149,20 @@ def test_assignments_of_a_command_line():
     for bad, part in [
         (["tracker.delay_s"], "is not NAME=VALUE"),
         (["delay=3"], "unknown parameter 'delay'"),
-        (["model.nodes=20", "model.nodes=30"], "given twice"),
     ]:
         with pytest.raises(InputError, match=part):
             parse_assignments(bad)
+
+
+def test_of_a_parameter_given_twice_the_last_value_counts_and_that_is_said():
+    with pytest.warns(
+        GivenTwice, match="'output.policy' is given as predict and as wait; the last one counts"
+    ):
+        found = parse_assignments(["output.policy=predict", "model.nodes=20", "output.policy=wait"])
+    assert found == {"output.policy": "wait", "model.nodes": "20"}
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert parse_assignments(["model.nodes=20", "model.nodes=20"]) == {"model.nodes": "20"}
 
 
 @pytest.mark.parametrize(

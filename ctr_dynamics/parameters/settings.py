@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterator, Mapping
 from typing import Any
 
 from ctr_dynamics.errors import InputError
 from ctr_dynamics.parameters.parameter_table import PARAMETERS, parameter
 from ctr_dynamics.parameters.parameter_types import Value
+
+
+class GivenTwice(UserWarning):
+    """A parameter stands twice on one command line, with two values."""
 
 
 class Settings(Mapping[str, Value]):
@@ -67,10 +72,10 @@ class Settings(Mapping[str, Value]):
 
 
 def parse_assignments(assignments: list[str]) -> dict[str, str]:
-    """`NAME=VALUE` texts of a command line by name; the values are checked later.
+    """`NAME=VALUE` texts of a command line by name; the values are checked later. Of two values the last one counts, with a warning.
 
     Raises:
-        InputError: no "=", unknown or repeated name.
+        InputError: no "=", or an unknown name.
     """
     values: dict[str, str] = {}
     for text in assignments:
@@ -79,7 +84,9 @@ def parse_assignments(assignments: list[str]) -> dict[str, str]:
         if not equals or not name:
             raise InputError(f"'{text}' is not NAME=VALUE", do="write for example tracker.delay_s=0.018")
         parameter(name)
-        if name in values:
-            raise InputError(f"parameter '{name}' is given twice", do="give it once")
-        values[name] = value.strip()
+        value = value.strip()
+        if values.get(name, value) != value:
+            message = f"parameter '{name}' is given as {values[name]} and as {value}; the last one counts"
+            warnings.warn(message, GivenTwice, stacklevel=2)
+        values[name] = value
     return values
