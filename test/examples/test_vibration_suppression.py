@@ -173,7 +173,7 @@ def runs(tmp_path_factory):
     }
     return {
         # so slow that what a busy machine takes for a message is little of the robot's time
-        name: example.release(folder / name, domain, seconds=5.0, speed=0.15, **options)
+        name: example.release(folder / name, domain, seconds=4.0, speed=0.15, **options)
         for name, options in cases.items()
     }
 
@@ -187,7 +187,7 @@ def test_tip_settles_at_least_twice_as_fast(runs):
     assert controlled.settled_s < 0.5 * free.settled_s
     assert np.abs(controlled.delta).max() <= 0.15
     assert np.abs(np.diff(controlled.delta)).max() <= 3.0 * 0.003 + 1e-9
-    assert controlled.swing_m(4.0, 5.0) < 0.003
+    assert controlled.swing_m(3.0, 4.0) < 0.003
 
 
 @pytest.mark.ros
@@ -195,10 +195,10 @@ def test_tip_settles_at_least_twice_as_fast(runs):
 @pytest.mark.parametrize("case", ["outage", "killed"])
 def test_nothing_grows_when_the_estimator_fails(runs, case):
     free, failed = runs["free"], runs[case]
-    for begin in np.arange(1.2, 4.9, 0.2):
+    for begin in np.arange(1.2, 3.9, 0.2):
         # the opened loop leaves at most what the fading angle moves
         assert failed.swing_m(begin, begin + 0.2) < 1.05 * free.swing_m(begin, begin + 0.2) + 0.012
     assert np.abs(failed.delta).max() <= 0.15
-    assert np.abs(failed.delta[failed.t > 4.5]).max() < 0.005
+    assert np.abs(failed.delta[failed.t > 3.5]).max() < 0.005
     if case == "outage":  # the loop is closed again and ends what is left
         assert failed.settled_s < free.settled_s
