@@ -15,7 +15,7 @@ from ctr_dynamics.estimation.discretisation import VibrationErrors
 from ctr_dynamics.estimation.filter.ekf import RodEkf
 from ctr_dynamics.estimation.filter.filter_records import TipEstimate
 from ctr_dynamics.estimation.filter.rational_step import FOLLOWED_S, Stride, error_rates
-from ctr_dynamics.kernels import rotations
+from ctr_dynamics.kernels.compiled_rotations import matrix
 from ctr_dynamics.robot import Robot
 from ctr_dynamics.sensing import Tip
 
@@ -40,18 +40,18 @@ class MotionFrequency:
     def clear(self) -> None:
         """Nothing has moved."""
         self._stamp_ns: int | None = None
-        self._mean, self._excursion, self._speed = np.zeros(3), 0.0, 0.0  # m; m^2; m^2/s^2
+        self._mean, self._excursion, self._speed = [0.0, 0.0, 0.0], 0.0, 0.0  # m; m^2; m^2/s^2
 
     def add(self, stamp_ns: int, position: Floats, velocity: Floats) -> None:
         """Take in the tip ``position`` (3,) m and ``velocity`` (3,) m/s of a run that measurements do not move."""
         if self._stamp_ns is None:
-            self._mean = position.copy()
+            self._mean = position.tolist()
         else:
             new = -math.expm1(-max(stamp_ns - self._stamp_ns, 0) * 1e-9 / MEMORY_S)
-            away = position - self._mean
-            self._mean += new * away
-            self._excursion += new * (float(away @ away) - self._excursion)
-            self._speed += new * (float(velocity @ velocity) - self._speed)
+            away = [x - m for x, m in zip(position.tolist(), self._mean, strict=True)]
+            self._mean = [m + new * x for m, x in zip(self._mean, away, strict=True)]
+            self._excursion += new * (sum(x * x for x in away) - self._excursion)
+            self._speed += new * (sum(v * v for v in velocity.tolist()) - self._speed)
         self._stamp_ns = stamp_ns
 
     def square(self, variance: float) -> float:
@@ -141,7 +141,9 @@ class EncoderVibration:
         self._of_one = of_modes(modes)
         self._stamp_ns: int | None = None
         self._variance = np.zeros(len(modes.exponent))  # of the modal coordinates
-        self._period_s, self._added = 0.0, np.zeros(len(modes.exponent))  # by one reading
+        # by one joint state; kept of the variance and added to it in a step of that length
+        self._period_s, self._by_measurement = 0.0, np.zeros(len(modes.exponent))
+        self._elapsed_s, self._kept, self._added = -1.0, np.ones(len(modes.exponent)), self._by_measurement
 
     def add(self, stamp_ns: int, period_s: float) -> None:
         """Go on to ``stamp_ns``, with readings every ``period_s``. A reading turns the tubes evenly from the one before, and back to the next."""
@@ -149,12 +151,14 @@ class EncoderVibration:
         self._stamp_ns = stamp_ns
         if period_s != self._period_s:
             angle = self._exponent * period_s
-            self._period_s, self._added = (
-                period_s,
-                self._by_noise * np.abs(np.expm1(angle)) ** 4 / np.abs(angle) ** 2,
-            )
-        self._variance *= np.exp(2.0 * elapsed_s * self._exponent.real)
-        self._variance += self._added * (elapsed_s / period_s)
+            self._period_s, self._elapsed_s = period_s, -1.0
+            self._by_measurement = self._by_noise * np.abs(np.expm1(angle)) ** 4 / np.abs(angle) ** 2
+        if elapsed_s != self._elapsed_s:  # steps are even: once for many
+            self._elapsed_s = elapsed_s
+            self._kept = np.exp(2.0 * elapsed_s * self._exponent.real)
+            self._added = self._by_measurement * (elapsed_s / period_s)
+        self._variance *= self._kept
+        self._variance += self._added
 
     def inflate(self, covariance: Floats) -> None:
         """Add them to the ``covariance`` (12, 12) of the tip, in place."""
@@ -181,10 +185,9 @@ class FrameError:
 
     def inflate(self, covariance: Floats, twist: Floats, quaternion: Floats) -> None:
         """Add it to the ``covariance`` (12, 12) of the tip, in place; ``twist`` (6,) and ``quaternion`` (4,) wxyz are the tip's."""
-        errors, spin = self._errors, skew(twist[3:])
-        errors[:3, :3] = skew(twist[:3]) * self._rotation
-        errors[3:, :3] = spin * self._rotation
-        errors[:3, 3:] = spin @ rotations.matrix(quaternion) * self._lever
+        errors, crossed = self._errors, (CROSS @ twist).reshape(6, 3)
+        errors[:, :3] = crossed * self._rotation
+        errors[:3, 3:] = crossed[3:] @ matrix(quaternion) * self._lever
         covariance[6:, 6:] += errors @ errors.T
 
 
@@ -192,6 +195,10 @@ def skew(vector: Floats) -> Floats:
     """(3, 3) whose product with another vector is the cross product."""
     x, y, z = vector.tolist()
     return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+
+
+# (18, 6) by which a twist becomes the rows of both skew matrices, of the velocity and of the angular velocity
+CROSS = np.kron(np.eye(2), np.stack([skew(axis).ravel() for axis in np.eye(3)], axis=1))
 
 
 class TwistError:
