@@ -251,7 +251,7 @@ def test_node_draws_what_the_estimator_says(step, tmp_path):
     from ctr_dynamics.ros.node_processes import NodeProcess
     from ctr_dynamics.ros.topic_names import message_class
 
-    _, messages = step
+    out, _ = step
     domain = int(os.environ["ROS_DOMAIN_ID"])
     names = (topics.TIP_POSE, topics.BACKBONE_STATE)
     with (
@@ -271,7 +271,13 @@ def test_node_draws_what_the_estimator_says(step, tmp_path):
             lambda: all(p.get_subscription_count() for p in outputs.values()) or view.code is not None, 60
         )
         deadline = time.monotonic() + 60
+        sent, encoder = 0, StepEncoder()
         while not pictures and time.monotonic() < deadline:
+            # of a stamp of its own each time: one stamp is drawn once, and the first picture may find nobody who listens yet
+            sent += 1
+            messages = {
+                m.topic: m.data for m in encoder.encode(out._replace(stamp_ns=out.stamp_ns + sent * 10**8))
+            }
             for name in names:
                 outputs[name].publish(messages[name])
             time.sleep(0.1)
