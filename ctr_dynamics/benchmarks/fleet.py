@@ -44,8 +44,8 @@ class Consistency(NamedTuple):
     error: float
 
 
-def scenario_for(robot: Robot, seed: int) -> Scenario:
-    """A hung weight that is cut, then all tubes in motion."""
+def scenario_for(robot: Robot, seed: int, end_s: float = END_S) -> Scenario:
+    """A hung weight that is cut, then all tubes in motion until ``end_s``."""
     model, rest = Model(robot), robot.rest
     beta, alpha = np.array(rest.beta.value), np.array(rest.alpha.value)
     gravity = np.array(robot.gravity.value)
@@ -56,13 +56,13 @@ def scenario_for(robot: Robot, seed: int) -> Scenario:
     rng = np.random.default_rng([seed, 1])
     turns = [
         Multisine(
-            kind="multisine", duration_s=END_S - TURN_S, fade_s=0.3, frequencies_hz=list(TURNS_HZ),
+            kind="multisine", duration_s=end_s - TURN_S, fade_s=0.3, frequencies_hz=list(TURNS_HZ),
             amplitudes=[0.9 / (2 * math.pi * f) for f in TURNS_HZ], phases_rad=rng.uniform(0, 2 * math.pi, 3).tolist(),
         )
         for _ in range(robot.n_tubes)
     ]  # fmt: skip
     return Scenario(
-        duration_s=END_S,
+        duration_s=end_s,
         seed=seed,
         tubes=[TubeMotion(rotation=[Hold(kind="hold", duration_s=TURN_S), turn]) for turn in turns],
         loads=[

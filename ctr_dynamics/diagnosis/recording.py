@@ -123,9 +123,8 @@ def read_recording(
             do="cut the bag; ten seconds with motion are enough",
             where=where,
         )
-    moving = _moving(
-        table, robot, o
-    )  # by the readings as they are: without noise, the limits for it would be too wide
+    # by the readings as they are: without noise, the limits for it would be too wide
+    moving = _moving(table, robot, o)
     angles = slice(1, 1 + robot.n_tubes)
     table[:, angles] = without_noise(table[:, 0], table[:, angles], robot.encoders.noise.value)
     tracker, coarse = _rows(_once(poses), t0, o)

@@ -141,22 +141,20 @@ class EncoderVibration:
         self._of_one = of_modes(modes)
         self._stamp_ns: int | None = None
         self._variance = np.zeros(len(modes.exponent))  # of the modal coordinates
-        # by one joint state; kept of the variance and added to it in a step of that length
-        self._period_s, self._by_measurement = 0.0, np.zeros(len(modes.exponent))
-        self._elapsed_s, self._kept, self._added = -1.0, np.ones(len(modes.exponent)), self._by_measurement
+        # between joint states and between steps, s; what such a step keeps of the variance, and adds to it
+        self._lengths = 0.0, 0.0
+        self._kept, self._added = np.ones(len(modes.exponent)), np.zeros(len(modes.exponent))
 
     def add(self, stamp_ns: int, period_s: float) -> None:
         """Go on to ``stamp_ns``, with readings every ``period_s``. A reading turns the tubes evenly from the one before, and back to the next."""
         elapsed_s = 0.0 if self._stamp_ns is None else max(stamp_ns - self._stamp_ns, 0) * 1e-9
         self._stamp_ns = stamp_ns
-        if period_s != self._period_s:
+        if (period_s, elapsed_s) != self._lengths:  # they are even: once for many steps
+            self._lengths = period_s, elapsed_s
             angle = self._exponent * period_s
-            self._period_s, self._elapsed_s = period_s, -1.0
-            self._by_measurement = self._by_noise * np.abs(np.expm1(angle)) ** 4 / np.abs(angle) ** 2
-        if elapsed_s != self._elapsed_s:  # steps are even: once for many
-            self._elapsed_s = elapsed_s
+            by_one = self._by_noise * np.abs(np.expm1(angle)) ** 4 / np.abs(angle) ** 2
             self._kept = np.exp(2.0 * elapsed_s * self._exponent.real)
-            self._added = self._by_measurement * (elapsed_s / period_s)
+            self._added = by_one * (elapsed_s / period_s)
         self._variance *= self._kept
         self._variance += self._added
 
