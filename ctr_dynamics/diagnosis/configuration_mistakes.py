@@ -1,6 +1,8 @@
 """Configuration mistakes: units, signs and orders.
 
 In: a recording and a robot. Out: the mistake that makes a gross misfit, if one does. Each is undone in the data or the robot file, one by one.
+A free vibration whose frequency is a little off also makes a gross misfit, and undoing a mistake can happen to shift it. What the robot's own
+tolerances explain better is none (:mod:`ctr_dynamics.diagnosis.pipeline`).
 """
 
 from __future__ import annotations
@@ -13,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from ctr_dynamics.diagnosis.diagnosis_options import DiagnosisOptions, ForwardModelOptions
-from ctr_dynamics.diagnosis.forward_model import ForwardModel
+from ctr_dynamics.diagnosis.forward_model import ForwardModel, Point
 from ctr_dynamics.diagnosis.recording import Recording
 from ctr_dynamics.diagnosis.run_context import RunContext
 from ctr_dynamics.diagnosis.step_choice import with_chosen_steps
@@ -118,15 +120,19 @@ MISTAKES: dict[str, Callable[[Recording, Robot], Pair]] = {
 
 
 def misfit(
-    recording: Recording, robot: Robot, resolution: ForwardModelOptions, steps: TimeSteps | None = None
+    recording: Recording,
+    robot: Robot,
+    resolution: ForwardModelOptions,
+    steps: TimeSteps | None = None,
+    point: Point | None = None,
 ) -> float:
-    """3-D rms in m of the measurement against the nominal model, infinity where it fails.
+    """3-D rms in m of the measurement against the model at ``point``, the nominal one without; infinity where it fails.
 
     Measured rotations count by the ratio of the noise of positions to theirs.
     """
     try:
         forward_model = ForwardModel(recording, robot, resolution, steps)
-        prediction = forward_model.predict({})
+        prediction = forward_model.predict(point or {})
     except InputError:
         return math.inf
     if prediction.failure:
@@ -143,8 +149,7 @@ def find_mistake(
 ) -> FoundMistake | None:
     """The mistake that leaves least when it is undone, where the misfit is gross and it explains nearly all."""
     o, fine = options.configuration, options.forward_model.fine
-    first = recording.until(o.longest_s)
-    recording = first if len(first.stamps) else recording
+    recording = beginning(recording, options)
     before = misfit(recording, robot, fine)
     if before < o.gross * noise_floor(robot) * math.sqrt(2.0):
         return None
@@ -160,3 +165,9 @@ def find_mistake(
             continue
     best = min(after, key=lambda name: after[name])
     return FoundMistake(best, before, after[best]) if after[best] < o.improvement * before else None
+
+
+def beginning(recording: Recording, options: DiagnosisOptions) -> Recording:
+    """As much of ``recording`` as tells a mistake; all of it where nothing is measured so early."""
+    first = recording.until(options.configuration.longest_s)
+    return first if len(first.stamps) else recording

@@ -126,11 +126,11 @@ class CalibrationOptions:
     parts: int = option(2, COUNT, "lengths of a step that are tried before damping")
     stale: float = option(0.3, "of the step", "error of a prediction from which the Jacobian may be renewed")
     travelled: float = option(3.0, "whitened", "sum of these errors from which it is renewed")
-    parts_of_recording: tuple[float, ...] = option(
-        (0.125, 0.18, 0.25, 0.35, 0.5, 0.7),
-        "of a recording",
-        "fitted before all of it, where a first fit leaves more than noise",
+    first_part: float = option(
+        0.03, "of a recording", "fitted before all of it, where a first fit leaves more than noise"
     )
+    growth: float = option(1.4, "times", "from a part that is explained to the next")
+    least_growth: float = option(1.05, "times", "where that does not help, it is no matter of phases")
     difference: float = option(
         0.02, "of the scale", "for columns of shape parameters of an effect that was off"
     )

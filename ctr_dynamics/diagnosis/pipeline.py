@@ -12,10 +12,10 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ctr_dynamics.diagnosis.configuration_mistakes import find_mistake
+from ctr_dynamics.diagnosis.configuration_mistakes import FoundMistake, beginning, find_mistake, misfit
 from ctr_dynamics.diagnosis.diagnosis_options import DiagnosisOptions
 from ctr_dynamics.diagnosis.diagnosis_result import Diagnosis
-from ctr_dynamics.diagnosis.inference.calibration import calibrate, nuisances_of
+from ctr_dynamics.diagnosis.inference.calibration import calibrate, fit_nuisances, nuisances_of
 from ctr_dynamics.diagnosis.inference.candidates import candidates
 from ctr_dynamics.diagnosis.inference.discretisation_error import correct_discretisation
 from ctr_dynamics.diagnosis.inference.evidence import weigh_by_prediction, weigh_discrepancy
@@ -71,14 +71,16 @@ def diagnose_recordings(
 
     # configuration: units, signs and orders, where the nominal misfit is gross
     context.report("nominal model")
-    result.mistake = find_mistake(recordings[0], robot, options, context)
+    problem = make_problem(robot, recordings, nuisances_of(robot), mask, options)
+    problem.workers = context.workers
+    mistake = find_mistake(recordings[0], robot, options, context)
     result.tested.append("config_mistake")
-    if result.mistake is not None:
-        return _mistaken(result, result.mistake.misfit, context.elapsed_s - begin)
+    if mistake is not None and not _tolerances_explain(problem, mistake, context):
+        result.mistake = mistake
+        return _mistaken(result, mistake.misfit, context.elapsed_s - begin)
 
     # forward model: the nominal robot on every recording
-    problem = result.problem = make_problem(robot, recordings, nuisances_of(robot), mask, options)
-    problem.workers = context.workers
+    result.problem = problem
     result.nominal_rms = rms(np.concatenate(problem.residuals({}))[:, :3])
     if not math.isfinite(result.nominal_rms):
         raise InputError(
@@ -182,6 +184,17 @@ def diagnose_recordings(
 
     result.seconds = context.elapsed_s - begin
     return result
+
+
+def _tolerances_explain(problem: Problem, mistake: FoundMistake, context: RunContext) -> bool:
+    """Whether the nuisances of ``problem`` inside their tolerances leave less of its first recording than ``mistake`` leaves when it is undone."""
+    model, options = problem.forward_models[0], problem.options
+    try:
+        fit = fit_nuisances(problem, context)
+    except InputError:
+        return False
+    recording, fine = beginning(model.recording, options), options.forward_model.fine
+    return misfit(recording, problem.robot, fine, model.steps, fit.point) < mistake.misfit_undone
 
 
 def _mistaken(result: Diagnosis, misfit: float, seconds: float) -> Diagnosis:

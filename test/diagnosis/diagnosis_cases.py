@@ -1,6 +1,7 @@
 """Made-up quantities and problems whose answers are known without a simulation of a robot."""
 
 import math
+from types import SimpleNamespace
 
 import numpy as np
 
@@ -35,3 +36,47 @@ class Vibration:
 
     def residual(self, point):
         return self.predicted(self.truth) - self.predicted(point)
+
+
+class LongVibration:
+    """A problem of one recording: an undamped vibration of about 50 Hz that begins at ``begin_s``, sampled at 40 Hz for 8 s, with noise."""
+
+    reach, options, workers = 4.0, DiagnosisOptions(), 1
+
+    def __init__(self, truth, nuisances, *, begin_s=0.0, noise=1.0, end_s=8.0, spans=None):
+        self.truth, self.nuisances, self.begin_s, self.noise = truth, nuisances, begin_s, noise
+        self.spans = [] if spans is None else spans
+        self.t = np.arange(0.0, 8.0, 0.025)[: round(end_s / 0.025)]
+        self.size = 2 * len(self.t)
+        self.numerics = np.zeros((self.size, 0))
+        self.forward_models = [SimpleNamespace(recording=SimpleNamespace(duration=8.0))]
+        rng = np.random.default_rng(5)
+        self.measured = self.predicted(truth) + noise * rng.normal(size=(2, 320))[:, : len(self.t)].ravel()
+
+    def until(self, ends):
+        self.spans.append(ends[0])
+        return LongVibration(
+            self.truth,
+            self.nuisances,
+            begin_s=self.begin_s,
+            noise=self.noise,
+            end_s=ends[0],
+            spans=self.spans,
+        )
+
+    def predicted(self, point):
+        """(2 k,) of two axes, a quarter of a turn apart."""
+        f, size = (point.get(("made_up", name), 0.0) for name in ("frequency", "size"))
+        t = np.maximum(self.t - self.begin_s, 0.0)
+        angle = 2 * math.pi * 50.0 * (1.0 + f) * t
+        return 30.0 * (1.0 + size) * np.concatenate([np.cos(angle), np.sin(angle)])
+
+    def residual(self, point):
+        return self.measured - self.predicted(point)
+
+    def linearise(self, point, wanted):
+        columns = []
+        for q in wanted:
+            more = {**point, q.key: point.get(q.key, 0.0) + 1e-6}
+            columns.append((self.predicted(more) - self.predicted(point)) / 1e-6)
+        return self.residual(point), np.stack(columns, axis=1)

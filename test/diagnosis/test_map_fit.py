@@ -1,14 +1,15 @@
 """Fits on problems with known answers: the posterior, steps inside bounds, how far nuisances go."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from diagnosis_cases import Vibration, quantity
+from diagnosis_cases import LongVibration, Vibration, quantity
 
 from ctr_dynamics.diagnosis.diagnosis_options import DiagnosisOptions
 from ctr_dynamics.diagnosis.inference import calibration
-from ctr_dynamics.diagnosis.inference.calibration import _from_growing_spans
+from ctr_dynamics.diagnosis.inference.calibration import _from_growing_parts, _grown
 from ctr_dynamics.diagnosis.inference.fit_problem import make_problem
 from ctr_dynamics.diagnosis.inference.gaussian_posterior import posterior
 from ctr_dynamics.diagnosis.inference.map_fit import GaussNewton, fit
@@ -97,12 +98,32 @@ def test_a_frequency_is_found_by_growing_parts(recording, robot, known, monkeypa
     mass = known["payload_mass", "added_kg"]
     problem = make_problem(robot, [recording], [replace(mass, tolerance=mass.scale)], np.ones(6, bool))
     stopped, right = fit(problem, (), {}, iterations=0), fit(problem, (), {})
-    found = _from_growing_spans(problem, stopped, RunContext(workers=1))
+    found = _from_growing_parts(problem, stopped, RunContext(workers=1))
     assert found.cost < stopped.cost - 1.0
     assert found.cost == pytest.approx(right.cost, abs=0.5)
-    assert _from_growing_spans(problem, right, RunContext(workers=1)) is right
+    assert _from_growing_parts(problem, right, RunContext(workers=1)) is right
     monkeypatch.setattr(calibration, "is_acceptable", lambda *_: False)
     monkeypatch.setattr(problem.__class__, "until", lambda *_: problem.on([recording]))
-    on = _from_growing_spans(problem, stopped, RunContext(workers=1))
+    on = _from_growing_parts(problem, stopped, RunContext(workers=1))
     straight = fit(problem, (), stopped.point, polish=False)
     np.testing.assert_array_equal(on.values, straight.values)
+
+
+@pytest.mark.parametrize("off", [-2.7, -1.3, 0.4, 1.9, 2.8])
+@pytest.mark.parametrize("begin_s", [0.0, 3.0])
+def test_growing_parts_follow_a_phase_over_many_turns(off, begin_s):
+    """A frequency of 50 Hz that is up to 3 % off, sampled at 40 Hz for 8 s: a fit to all of it stops where it begins."""
+    nuisances = (quantity("frequency", tolerance=0.01), quantity("size", tolerance=0.05))
+    truth = {("made_up", "frequency"): 0.01 * off, ("made_up", "size"): -0.03}
+    problem = LongVibration(truth, nuisances, begin_s=begin_s)
+    at_once = fit(problem, (), {}, polish=False)
+    grown = _grown(problem, math.inf)
+    assert grown.point[("made_up", "frequency")] == pytest.approx(0.01 * off, abs=1e-4)
+    assert grown.cost < 1.2 * problem.size
+    assert abs(off) < 1.0 or at_once.cost > 3.0 * grown.cost
+
+
+def test_what_no_part_explains_grows_no_further():
+    problem = LongVibration({}, (quantity("frequency", tolerance=0.01),), noise=3.0)
+    assert _grown(problem, math.inf) is None
+    assert len(problem.spans) < 10

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from ctr_dynamics.diagnosis import pipeline
+from ctr_dynamics.diagnosis.configuration_mistakes import FoundMistake
 from ctr_dynamics.diagnosis.output.findings import findings
 from ctr_dynamics.diagnosis.pipeline import diagnose_recordings
 from ctr_dynamics.diagnosis.run_context import RunContext
@@ -61,3 +62,15 @@ def test_an_error_in_time_that_cannot_be_measured_forbids_clean(recording, robot
     assert told["numerics"]["within_noise"] is None
     if found.verdict == "unknown":
         assert told["causes"][0]["probability"] is None
+
+
+@pytest.mark.parametrize(("undone_m", "word"), [(0.02, "config_mistake"), (0.1, None)])
+def test_a_mistake_that_the_tolerances_explain_better_is_none(recording, robot, monkeypatch, undone_m, word):
+    """The recalibrated model leaves about 57 mm of a recording that is moved by that much."""
+    moved = replace(recording, position=recording.position + np.array([0.0, 0.0, 0.057]))
+    monkeypatch.setattr(
+        pipeline, "find_mistake", lambda *_: FoundMistake("gravity_along_plus_y", 0.2, undone_m)
+    )
+    found = diagnose_recordings(robot, [moved], context=RunContext(workers=1, time_budget_s=0.0))
+    assert (found.causes[0].effect if found.mistake else None) == word
+    assert found.problem is None or word is None
