@@ -67,7 +67,7 @@ class OrientationChecks:
             return Verdict("correct", orientation=False)
         text = (
             f"orientation is the same, bit by bit, in {self._equal + 1} poses that differ: it is not measured; "
-            "only positions are used; set tracker.axes to xyz"
+            "set tracker.axes to xyz, so that positions are used"
         )
         early = self._equal if Kind.NO_ORIENTATION not in self.findings else 0
         self.findings.add(Kind.NO_ORIENTATION, at, float(self._equal + 1), "", text, count=1 + early)
@@ -91,7 +91,7 @@ class OrientationChecks:
             return Verdict("correct", orientation=False)
         text = (
             f"orientations are {given:.2f} rad off the expected ones as x, y, z, w, limit {limits.fitting_rad:g} rad, "
-            f"and {reordered:.2f} rad as w, x, y, z: scalar first? ROS wants w last; only positions are used"
+            f"and {reordered:.2f} rad as w, x, y, z: scalar first? ROS wants w last; or set tracker.axes to xyz, so that positions are used"
         )
         early = 1 if Kind.SCALAR_FIRST in self.findings else self._reordered
         self.findings.add(Kind.SCALAR_FIRST, at, given, "rad", text, count=early)
