@@ -7,6 +7,7 @@ size.
 
 from __future__ import annotations
 
+import contextlib
 from array import array
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -20,7 +21,14 @@ from ctr_dynamics.io.bag_reader import INPUT_TOPICS, Bag, open_bag
 from ctr_dynamics.io.inputs.input_decoder import InputDecoder
 from ctr_dynamics.io.inputs.input_mapping import InputMapping, cure
 from ctr_dynamics.io.messages import cdr
-from ctr_dynamics.io.messages.input_types import Decoded, accepts_type, has_stamp
+from ctr_dynamics.io.messages.input_types import (
+    TF_MESSAGE,
+    Decoded,
+    accepts_type,
+    child_frames,
+    has_stamp,
+    own_type,
+)
 from ctr_dynamics.io.messages.topics import JOINT_STATES, TIP_LOAD, TOPIC, TRACKER_TIP
 
 GAP_LIMIT_S = {JOINT_STATES: 0.1, TRACKER_TIP: 0.5}  # the joints' is the default of input_timeout_s
@@ -100,8 +108,17 @@ class _Times:
         if self.stamped:
             self._header(message.stamp_ns, message.frame_id)
 
+    def add_transforms(self, data: bytes, encoding: str) -> None:
+        """Frames of the transforms in a message, each from parent to child."""
+        with contextlib.suppress(cdr.CdrError):
+            for child, pose in child_frames(TF_MESSAGE, encoding, data):
+                self._count(f"{pose.frame_id} > {child}")
+
     def _header(self, stamp_ns: int, frame: str) -> None:
         self.stamp.append(stamp_ns)
+        self._count(frame)
+
+    def _count(self, frame: str) -> None:
         if len(self.frames) < 20 or frame in self.frames:
             self.frames[frame] = self.frames.get(frame, 0) + 1
 
@@ -136,6 +153,8 @@ def inspect(path: str | Path, mapping: InputMapping | None = None, pose_frame: s
             continue
         if topic not in INPUT_TOPICS or (ros_type and not accepts_type(topic, ros_type)):
             entry.add(log_ns, data)
+            if own_type(ros_type) == TF_MESSAGE:
+                entry.add_transforms(data, encoding)
             continue
         inspector = inspectors.setdefault(
             topic, inspector_for(topic, pose_frame if topic == TRACKER_TIP else FRAME)

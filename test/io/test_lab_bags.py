@@ -262,6 +262,16 @@ def test_a_child_frame_of_several(tmp_path, plain):
         inputs(path, tracker__child_frame_id="tip")
 
 
+def test_child_frames_are_listed_before_anybody_knows_them(tmp_path):
+    path = with_poses(tmp_path, lambda k: transform(k, "camera", "coil"), "tf2_msgs/msg/TFMessage", "/tf")
+    report = inspect(path)
+    parents_and_children = next(t for t in report.topics if t.name == "/tf").frames
+    assert [name.split(" > ")[1] for name in parents_and_children] == ["camera", "coil"]
+    advice = next(p.text for p in report.problems if p.topic == "/ctr/tracker/tip")
+    assert "--set tracker.child_frame_id=NAME" in advice
+    assert "--remap" not in advice
+
+
 def test_a_type_that_is_no_pose_is_named_with_what_to_do(tmp_path):
     path = with_poses(tmp_path, pose, "sensor_msgs/msg/Image")
     with pytest.raises(

@@ -104,10 +104,10 @@ def cure(topic: str, topics: Sequence[StoredTopic]) -> str:
     )
     if not fitting:
         return f"record it as one of {', '.join(TYPES[topic])}"
-    options = [f"--remap {name}:={topic}" for name in fitting[:4]]
-    text = f"if {topic.removeprefix('/ctr/')} has another name: {' or '.join(options)}"
+    options = [f"--remap {name}:={topic}" for name in fitting[:4] if name != TF]
+    text = f"if {topic.removeprefix('/ctr/')} has another name: {' or '.join(options)}" if options else ""
     if topic == TRACKER_TIP and any(t.name in fitting and own_type(t.ros_type) == TF_MESSAGE for t in topics):
-        text += ", with --set tracker.child_frame_id=NAME for a transform"
+        text += f"{'; ' if options else ''}if it is a transform: --set tracker.child_frame_id=NAME, of a child frame that `info` lists"
     if topic == JOINT_STATES and any("MultiArray" in t.ros_type for t in topics if t.name in fitting):
         text += ", with joints.rotation_names and joints.translation_names for an array"
     return text
