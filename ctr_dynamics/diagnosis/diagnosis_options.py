@@ -314,6 +314,9 @@ class ValidationOptions:
 class ToleranceOptions:
     """Tolerances: whether those of the robot file are too tight."""
 
+    too_tight: float = option(
+        0.1, "probability", "of tolerances too tight by one factor, as of something outside the catalogue"
+    )
     widest: float = option(5.0, "tolerances", "beyond it a departure is a cause by itself")
     factors: int = option(12, COUNT, "a fifth apart at most, finer than one draw can tell")
     listed: float = option(

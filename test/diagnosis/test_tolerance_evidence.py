@@ -9,7 +9,8 @@ from diagnosis_cases import quantity
 from scipy.stats import multivariate_normal
 
 from ctr_dynamics.diagnosis.diagnosis_options import ToleranceOptions
-from ctr_dynamics.diagnosis.inference.tolerance_evidence import log_evidence, tolerance_evidence
+from ctr_dynamics.diagnosis.inference.gaussian_posterior import posterior_of_information
+from ctr_dynamics.diagnosis.inference.tolerance_evidence import tolerance_evidence
 from ctr_dynamics.diagnosis.output.summary_text import summary
 
 SIZE, COUNT, TOLERANCE, NONE = 300, 12, 0.02, np.zeros((300, 0))
@@ -32,7 +33,7 @@ def fitted(rng, factor, *, at=None, numerics=NONE):
 def test_evidence_is_the_marginal_likelihood_of_the_linear_model():
     rng = np.random.default_rng(1)
     J, y, deviation = rng.normal(size=(8, 3)), rng.normal(size=8), np.array([0.5, 1.0, 2.0])
-    ours = log_evidence(J.T @ J, J.T @ y, deviation)
+    _, _, ours = posterior_of_information(J.T @ J, J.T @ y, deviation)
     with_prior = multivariate_normal(np.zeros(8), np.eye(8) + (J * deviation**2) @ J.T).logpdf(y)
     assert ours == pytest.approx(with_prior - multivariate_normal(np.zeros(8), np.eye(8)).logpdf(y))
 

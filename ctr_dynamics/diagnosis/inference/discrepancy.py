@@ -27,6 +27,7 @@ from ctr_dynamics.diagnosis.inference.gaussian_posterior import (
     within_tolerance,
 )
 from ctr_dynamics.diagnosis.inference.map_fit import Fit, fit, fit_at
+from ctr_dynamics.diagnosis.inference.tolerance_factors import log_gain, under_factors
 from ctr_dynamics.diagnosis.run_context import RunContext
 from ctr_dynamics.effects import EffectQuantity
 
@@ -220,7 +221,7 @@ def discrepancy_of(
     for process in processes:
         model = _Linear(problem, found_fit, process)
         if plain is None:
-            plain = model.log_evidence((0.0, 0.0))[0]
+            plain = model.log_evidence((0.0, 0.0))[0] + model.wider_tolerances((0.0, 0.0))
         found.append((*_best_sizes(model, np.log(o.smallest * floors), np.log(o.largest * floors)), model))
     assert plain is not None
     logs = np.array([log for log, _, _ in found])
@@ -228,7 +229,7 @@ def discrepancy_of(
     time = math.exp(float(weights @ np.log([p.time for p in processes])))
     _, at, model = found[int(np.argmax(logs))]
     sizes = math.exp(at[0]), math.exp(at[1])
-    average = float(logsumexp(logs)) - math.log(among or len(processes))
+    average = float(logsumexp(logs)) - math.log(among or len(processes)) + model.wider_tolerances(sizes)
     return Discrepancy(
         average,
         average - plain,
@@ -311,6 +312,23 @@ class _Linear:
         """(m,) what is left of the residual at the likeliest departures, in the axes in which the discrepancy is diagonal."""
         best, _, _ = self._posterior(self.process.scale(sizes))
         return np.asarray(self.residual - self.columns @ (best - self.departure))
+
+    def wider_tolerances(self, sizes: Sizes) -> float:
+        """Gain in log evidence because tolerances may be too tight."""
+        scale = self.process.scale(sizes)
+        columns, numerics = self.columns * scale[:, None], self.numerics * scale[:, None]
+        causes = {q.key for q in self.fit.causes}
+        return log_gain(
+            under_factors(
+                self.fit.active,
+                causes,
+                self.residual * scale,
+                columns,
+                self.departure,
+                numerics,
+                self.options,
+            )
+        )
 
     def log_evidence(self, sizes: Sizes) -> tuple[float, Floats]:
         """Log evidence up to a constant, and covariance (a, a) of the coordinates, with a discrepancy of ``sizes`` (m, rad)."""

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from joblib import delayed
 from numpy.typing import NDArray
+from scipy.special import logsumexp
 
 from ctr_dynamics.diagnosis.diagnosis_options import DiagnosisOptions
 from ctr_dynamics.diagnosis.forward_model import Key
@@ -29,6 +30,7 @@ from ctr_dynamics.diagnosis.inference.hypotheses import Hypothesis, fit_exactly
 from ctr_dynamics.diagnosis.inference.map_fit import Fit
 from ctr_dynamics.diagnosis.inference.screening import Screened
 from ctr_dynamics.diagnosis.inference.sensitivities import Sensitivities
+from ctr_dynamics.diagnosis.inference.tolerance_factors import log_gain, under_factors
 from ctr_dynamics.diagnosis.run_context import RunContext
 
 Floats = NDArray[np.float64]
@@ -230,7 +232,7 @@ def weigh_by_prediction(
 
     def ask(those: Sequence[Hypothesis]) -> None:
         new = [e for e in those if e.predicted is None]
-        answers = context.run(delayed(log_prediction)(held_out, e.fit) for e in new)
+        answers = context.run(delayed(log_prediction)(held_out, e.fit, problem.numerics) for e in new)
         for e, answer in zip(new, answers, strict=True):
             e.predicted = answer
 
@@ -250,13 +252,26 @@ def weigh_by_prediction(
     found.probabilities = probabilities(every, problem)
 
 
-def log_prediction(held_out: Problem, result: Fit) -> float:
-    """Log likelihood of ``held_out``, up to a constant, with the posterior of ``result``: what fitted bags leave open is no wrong prediction."""
+def log_prediction(held_out: Problem, result: Fit, numerics: Floats) -> float:
+    """Log likelihood of ``held_out``, up to a constant, with the posterior of ``result``: what fitted bags leave open is no wrong prediction.
+
+    Args:
+        numerics: (m, d) of the problem that was fitted.
+    """
     found = held_out.linearise(result.point, result.active)
     if found is None:
         return IMPOSSIBLE
     residual, columns = found
-    size, axes = np.linalg.eigh(result.covariance)
-    free = columns @ (axes * np.sqrt(np.maximum(size, 0.0)))  # by coefficients of unit deviation
-    _, _, evidence = posterior(residual, free, np.zeros(len(size)), np.ones(len(size)), held_out.numerics)
-    return evidence
+    departure = result.values - np.array([q.off for q in result.active])
+    causes = {q.key for q in result.causes}
+    factors = under_factors(
+        result.active, causes, result.residual, result.columns, departure, numerics, held_out.options
+    )
+    logs = []
+    for one in factors:  # a limit of the fit, where it met one, holds for every factor
+        size, axes = np.linalg.eigh(one.covariance)
+        free = columns @ (axes * np.sqrt(np.maximum(size, 0.0)))  # by coefficients of unit deviation
+        there = residual - columns @ (one.departure - factors[0].departure)
+        _, _, evidence = posterior(there, free, np.zeros(len(size)), np.ones(len(size)), held_out.numerics)
+        logs.append(one.log_weight + evidence)
+    return float(logsumexp(logs)) - log_gain(factors)

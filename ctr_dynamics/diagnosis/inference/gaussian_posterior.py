@@ -62,18 +62,27 @@ def posterior(
     """
     count = len(variance)
     J = np.hstack([columns, numerics])
-    prior = np.concatenate([variance, np.ones(J.shape[1] - count)])
+    deviation = np.sqrt(np.concatenate([variance, np.ones(J.shape[1] - count)]))
     target = residual + columns @ departure
-    root = np.sqrt(prior)
-    A = J * root
-    information = np.eye(J.shape[1]) + A.T @ A
-    factor = np.linalg.cholesky(information)
-    rhs = A.T @ target
-    z = np.linalg.solve(factor.T, np.linalg.solve(factor, rhs))
-    log_evidence = -0.5 * float(target @ target - rhs @ z) - float(np.log(np.diag(factor)).sum())
-    inverse = np.linalg.inv(information)
-    covariance = (root[:, None] * inverse * root)[:count, :count]
-    return (root * z)[:count], covariance, log_evidence
+    mean, covariance, gain = posterior_of_information(J.T @ J, J.T @ target, deviation)
+    return mean[:count], covariance[:count, :count], gain - 0.5 * float(target @ target)
+
+
+def posterior_of_information(
+    information: Floats, score: Floats, deviation: Floats
+) -> tuple[Floats, Floats, float]:
+    """Departures (a,) from zero, their covariance (a, a), and the log evidence relative to no departure.
+
+    Args:
+        information: (a, a) of the data. score: (a,) derivatives of the log likelihood, both at no departure.
+        deviation: (a,) of the priors.
+    """
+    A = np.eye(len(deviation)) + deviation[:, None] * information * deviation
+    factor = np.linalg.cholesky(A)
+    half = np.linalg.solve(factor, deviation * score)
+    evidence = 0.5 * float(half @ half) - float(np.log(np.diag(factor)).sum())
+    covariance = deviation[:, None] * np.linalg.inv(A) * deviation
+    return deviation * np.linalg.solve(factor.T, half), covariance, evidence
 
 
 def cost(residual: Floats, departure: Floats, variance: Floats, numerics: Floats) -> float:

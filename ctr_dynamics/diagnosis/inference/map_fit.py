@@ -26,6 +26,7 @@ from ctr_dynamics.diagnosis.inference.gaussian_posterior import (
     variances,
     within_tolerance,
 )
+from ctr_dynamics.diagnosis.inference.tolerance_factors import log_gain, under_factors
 from ctr_dynamics.effects import EffectQuantity
 
 Floats = NDArray[np.float64]
@@ -39,7 +40,7 @@ class Fit:
         causes: quantities that may leave their tolerance. active: all quantities that were free, causes included.
         values: (a,) coordinates. covariance: (a, a) of the Laplace posterior.
         chi2: sum of the squares of ``whitened``.
-        log_evidence: relative to no model at all; only differences count.
+        log_evidence: relative to no model at all; only differences count. The tolerances may be too tight by a factor.
         residual, whitened: (m,) residuals at the best point, with the discretisation error and without.
         columns: (m, a) derivatives of the prediction by the coordinates.
         cost: twice the negative log posterior density, tolerances limited.
@@ -309,6 +310,7 @@ def fit_at(
     evidence = -0.5 * total - 0.5 * float(np.linalg.slogdet(np.eye(J.shape[1]) + J.T @ J)[1])
     evidence += math.log(2.0) * sum(q.one_sided for q in causes)
     within = within_tolerance(active, wide, departure, covariance, o.tolerance_limit)
+    wider = log_gain(under_factors(active, wide, residual, columns, departure, numerics, problem.options))
     left = residual - numerics_part(residual, numerics)
     return Fit(
         causes=causes,
@@ -316,7 +318,7 @@ def fit_at(
         values=values,
         covariance=covariance,
         chi2=float(left @ left),
-        log_evidence=evidence + within,
+        log_evidence=evidence + within + wider,
         residual=residual,
         whitened=left,
         columns=columns,

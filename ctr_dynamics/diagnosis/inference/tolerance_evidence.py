@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctr_dynamics.diagnosis.diagnosis_options import ToleranceOptions
+from ctr_dynamics.diagnosis.inference.gaussian_posterior import posterior_of_information
 from ctr_dynamics.diagnosis.inference.map_fit import Fit
 from ctr_dynamics.effects import EffectQuantity
 
@@ -48,14 +49,6 @@ class ToleranceEvidence:
     wider: tuple[WiderTolerance, ...]
 
 
-def log_evidence(information: Floats, score: Floats, deviation: Floats) -> float:
-    """Of departures with prior ``deviation`` (a,), relative to none: information (a, a) and score (a,) of a linear model at no departure."""
-    A = np.eye(len(deviation)) + deviation[:, None] * information * deviation
-    factor = np.linalg.cholesky(A)
-    half = np.linalg.solve(factor, deviation * score)
-    return 0.5 * float(half @ half) - float(np.log(np.diag(factor)).sum())
-
-
 def tolerance_evidence(fit: Fit, numerics: Floats, options: ToleranceOptions) -> ToleranceEvidence:
     """Weigh wider tolerances against those of the robot file, with the noise that ``fit`` leaves.
 
@@ -74,12 +67,17 @@ def tolerance_evidence(fit: Fit, numerics: Floats, options: ToleranceOptions) ->
     projected = J - numerics @ (inner @ (numerics.T @ J))
     information, score = J.T @ projected / noise, projected.T @ target / noise
     stated = np.array([q.tolerance for q in quantities])
-    before = log_evidence(information, score, stated)
+    before = posterior_of_information(information, score, stated)[2]
     factors = np.geomspace(1.0, options.widest, options.factors)
 
     def of(which: NDArray[np.bool_]) -> Floats:
         return (
-            np.array([log_evidence(information, score, np.where(which, s * stated, stated)) for s in factors])
+            np.array(
+                [
+                    posterior_of_information(information, score, np.where(which, s * stated, stated))[2]
+                    for s in factors
+                ]
+            )
             - before
         )
 

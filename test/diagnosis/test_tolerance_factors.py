@@ -1,0 +1,101 @@
+"""Tolerances that may be too tight by one factor: the mixture of priors against the density of the linear model, and against causes."""
+
+import math
+
+import numpy as np
+import pytest
+from diagnosis_cases import quantity
+from scipy.special import logsumexp, ndtr
+from scipy.stats import multivariate_normal
+
+from ctr_dynamics.diagnosis.diagnosis_options import DiagnosisOptions
+from ctr_dynamics.diagnosis.inference.gaussian_posterior import posterior, within_tolerance
+from ctr_dynamics.diagnosis.inference.tolerance_factors import log_gain, under_factors
+
+OPTIONS = DiagnosisOptions()
+TOLERANCE, SIZE, COUNT = 0.02, 200, 10
+
+
+def density(columns, data, tolerance, scale, factor):
+    """Of ``data`` where every deviation but that of the causes is ``factor`` tolerances."""
+    deviation = np.hypot(factor * tolerance, scale)
+    covariance = np.eye(len(data)) + (columns * deviation**2) @ columns.T
+    return multivariate_normal(np.zeros(len(data)), covariance).logpdf(data)
+
+
+def test_weights_and_departures_are_those_of_the_linear_model():
+    rng = np.random.default_rng(1)
+    columns, numerics = rng.normal(size=(20, 3)), rng.normal(size=(20, 1))
+    tolerance, scale = np.array([0.3, 0.2, 0.0]), np.array([0.0, 0.0, 1.5])
+    active = [quantity(f"p{i}", tolerance=t, scale=1.5) for i, t in enumerate(tolerance)]
+    departure = np.array([0.1, -0.2, 0.5])
+    data = columns @ np.array([0.9, -0.7, 1.0]) + rng.normal(size=20)
+    found = under_factors(
+        active, {active[2].key}, data - columns @ departure, columns, departure, numerics, OPTIONS
+    )
+    factors = np.geomspace(1.0, OPTIONS.tolerances.widest, OPTIONS.tolerances.factors)
+    both = np.hstack([columns, numerics])
+    expected = []
+    for one, factor in zip(found, factors, strict=True):
+        deviation = np.append(np.hypot(factor * tolerance, scale), 1.0)
+        information = both.T @ both + np.diag(deviation**-2.0)
+        mean, covariance = np.linalg.solve(information, both.T @ data), np.linalg.inv(information)
+        assert one.departure == pytest.approx(mean[:3])
+        assert one.covariance == pytest.approx(covariance[:3, :3])
+        log = density(both, data, np.append(factor * tolerance, 0.0), np.append(scale, 1.0), 1.0)
+        for i in (0, 1):  # within so many tolerances
+            limit, sigma = (
+                OPTIONS.calibration.tolerance_limit * factor * tolerance[i],
+                math.sqrt(covariance[i, i]),
+            )
+            log += math.log(ndtr((limit - abs(mean[i])) / sigma)) - math.log(
+                ndtr(OPTIONS.calibration.tolerance_limit)
+            )
+        expected.append(log)
+    share = OPTIONS.tolerances.too_tight / len(factors)
+    priors = np.array([1.0 - OPTIONS.tolerances.too_tight + share] + [share] * (len(factors) - 1))
+    weights = np.array([one.log_weight for one in found])
+    assert weights == pytest.approx(np.array(expected) - expected[0] + np.log(priors), abs=1e-5)
+    assert log_gain(found) == pytest.approx(logsumexp(weights))
+
+
+def departures_explained(values, rng, cause):
+    """Log evidence of ten nuisances at ``values`` without causes, and with the first as a cause of 30 tolerances."""
+    columns = 4.0 / TOLERANCE * rng.normal(size=(SIZE, COUNT)) / math.sqrt(SIZE)
+    data = columns @ values + rng.normal(size=SIZE)
+    active = [quantity(f"p{i}", tolerance=TOLERANCE, scale=30 * TOLERANCE) for i in range(COUNT)]
+    out = []
+    for causes in (set(), {active[cause].key}):
+        scale = np.array([q.scale if q.key in causes else 0.0 for q in active])
+        none = np.zeros((SIZE, 0))
+        stated = density(columns, data, np.full(COUNT, TOLERANCE), scale, 1.0)
+        variance = TOLERANCE**2 + scale**2
+        mean, covariance, _ = posterior(data, columns, np.zeros(COUNT), variance, none)
+        stated += within_tolerance(active, causes, mean, covariance, OPTIONS.calibration.tolerance_limit)
+        found = under_factors(active, causes, data, columns, np.zeros(COUNT), none, OPTIONS)
+        out.append((stated, stated + log_gain(found)))
+    return out
+
+
+def test_many_small_departures_need_no_cause_where_tolerances_may_be_too_tight():
+    rng = np.random.default_rng(2)
+    stated, mixed = [], []
+    for _ in range(40):
+        values = 2.5 * TOLERANCE * rng.normal(size=COUNT)
+        none, one = departures_explained(values, rng, int(np.argmax(np.abs(values))))
+        stated.append(one[0] - none[0])
+        mixed.append(one[1] - none[1])
+    assert np.median(stated) > 4.0  # by the file as stated, the largest of them is a cause
+    assert np.median(mixed) < 0.0
+    assert np.mean(np.array(mixed) > 4.0) < 0.1
+
+
+def test_one_large_departure_among_tolerances_that_hold_stays_a_cause():
+    rng = np.random.default_rng(3)
+    gains = []
+    for _ in range(40):
+        values = TOLERANCE * rng.normal(size=COUNT)
+        values[0] = 15 * TOLERANCE
+        none, one = departures_explained(values, rng, 0)
+        gains.append(one[1] - none[1])
+    assert min(gains) > 4.0
