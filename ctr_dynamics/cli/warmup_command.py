@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 from joblib import Parallel, delayed
 
+from ctr_dynamics.diagnosis.kernel_warm_up import MODELS
 from ctr_dynamics.diagnosis.kernel_warm_up import warm_up as warm_up_diagnosis
 from ctr_dynamics.kernels.compiler import cache_folder
 from ctr_dynamics.parameters import Settings
@@ -26,8 +27,8 @@ def warmup(
     for name in names:
         load_robot(name)
     # the longest first; each compiles in a process of its own
-    parts = (_extended, _plain, _estimator)
-    tasks = [delayed(part)(name) for name in names for part in parts]
+    tasks = [delayed(_diagnosis)(name, model) for name in names for model in reversed(MODELS)]
+    tasks += [delayed(_estimator)(name) for name in names]
     for text in Parallel(2, return_as="generator")(tasks):
         typer.echo(text)
     typer.echo(f"kernels are in {cache_folder()}")
@@ -38,14 +39,6 @@ def _estimator(name: str) -> str:
     for policy in ("predict", "wait"):
         steps = warm_up(load_robot(name), Settings({"robot": name, "output.policy": policy}))
     return f"{name}: estimator, {steps} steps, {time.perf_counter() - begin:.1f} s"
-
-
-def _plain(name: str) -> str:
-    return _diagnosis(name, "plain")
-
-
-def _extended(name: str) -> str:
-    return _diagnosis(name, "extended")
 
 
 def _diagnosis(name: str, model: str) -> str:

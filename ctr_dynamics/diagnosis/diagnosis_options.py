@@ -319,8 +319,8 @@ class ToleranceOptions:
     )
     widest: float = option(5.0, "tolerances", "beyond it a departure is a cause by itself")
     factors: int = option(12, COUNT, "a fifth apart at most, finer than one draw can tell")
-    listed: float = option(
-        1.15, LOG, "half of ln 10, from which Jeffreys (1961) calls evidence for one tolerance substantial"
+    substantial: float = option(
+        1.15, LOG, "half of ln 10, from which Jeffreys (1961) calls evidence for wider tolerances substantial"
     )
 
 

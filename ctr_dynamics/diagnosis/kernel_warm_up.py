@@ -1,4 +1,5 @@
-"""Kernel warm-up: a dry run of what diagnosis compiles, plain and extended simulations with their sensitivities, on a moment of rest."""
+"""Kernel warm-up: a dry run of what diagnosis compiles, on a moment of rest: simulations with their sensitivities, plain, with material damping, and
+with extended physics."""
 
 from __future__ import annotations
 
@@ -12,13 +13,14 @@ from ctr_dynamics.effects import effect_quantities
 from ctr_dynamics.robot import Robot
 
 MOMENT = 0.02  # s
+MODELS = ("plain", "damped", "extended")  # each has kernels of its own
 
 
-def warm_up(robot: Robot, models: Sequence[str] = ("plain", "extended")) -> None:
-    """Compile everything that a diagnosis of ``robot`` needs, or load it from the cache; ``models``: which kernels."""
+def rest_recording(robot: Robot) -> Recording:
+    """A moment of rest with three poses."""
     t = np.array([0.0, 0.5 * MOMENT, MOMENT])
     rest = np.concatenate([robot.rest.alpha.value, robot.rest.beta.value])
-    still = Recording(
+    return Recording(
         "rest",
         "",
         {},
@@ -29,11 +31,19 @@ def warm_up(robot: Robot, models: Sequence[str] = ("plain", "extended")) -> None
         np.tile([1.0, 0.0, 0.0, 0.0], (3, 1)),
         (),
     )
+
+
+def warm_up(robot: Robot, models: Sequence[str] = MODELS) -> None:
+    """Compile everything that a diagnosis of ``robot`` needs, or load it from the cache; ``models``: which kernels."""
     known = {q.key: q for q in effect_quantities(robot)}
-    forward_model = ForwardModel(still, robot)
+    forward_model = ForwardModel(rest_recording(robot), robot)
     if "plain" in models:
         forward_model.predict({})
         forward_model.jacobian({}, [known["youngs_modulus", "tube1.scale"]])
+    if "damped" in models:
+        damping = known["bending_damping", "tube1.B_Nm2s"]
+        forward_model.predict({damping.key: damping.off + damping.scale})
+        forward_model.jacobian({}, [damping])
     if "extended" in models:
         air = known["air_drag", "linear_Ns_per_m2"]
         forward_model.predict({air.key: 0.01})

@@ -179,7 +179,7 @@ def diagnose_recordings(
     # tolerances: without a cause, whether the robot's values scatter more than the robot file says
     if result.verdict == "clean":
         result.tolerances = tolerance_evidence(found.no_cause.fit, problem.numerics, options.tolerances)
-        if result.tolerances.evidence > options.verdict.needed_gain and result.tolerances.wider:
+        if result.tolerances.evidence > options.tolerances.substantial and result.tolerances.wider:
             result.verdict = "tolerances"
 
     result.seconds = context.elapsed_s - begin

@@ -52,8 +52,9 @@ def test_weights_and_departures_are_those_of_the_linear_model():
                 ndtr(OPTIONS.calibration.tolerance_limit)
             )
         expected.append(log)
-    share = OPTIONS.tolerances.too_tight / len(factors)
-    priors = np.array([1.0 - OPTIONS.tolerances.too_tight + share] + [share] * (len(factors) - 1))
+    too_tight = OPTIONS.tolerances.too_tight**OPTIONS.evidence.temperature
+    share = too_tight / len(factors)
+    priors = np.array([1.0 - too_tight + share] + [share] * (len(factors) - 1))
     weights = np.array([one.log_weight for one in found])
     assert weights == pytest.approx(np.array(expected) - expected[0] + np.log(priors), abs=1e-5)
     assert log_gain(found) == pytest.approx(logsumexp(weights))

@@ -40,8 +40,8 @@ class ToleranceEvidence:
     """Evidence that tolerances are too tight.
 
     Attributes:
-        evidence: natural logarithm of the Bayes factor for one factor on all tolerances. Where the robot file is right it exceeds x with
-            a probability below exp(-x) (Markov's inequality).
+        evidence: natural logarithm of the Bayes factor for one factor on all tolerances. Where the robot file is right, it exceeds
+            1.15 with a probability of about 1 %.
         wider: tolerances with substantial evidence of being wider, the most certain first; the first of all where none has.
     """
 
@@ -93,7 +93,7 @@ def tolerance_evidence(fit: Fit, numerics: Floats, options: ToleranceOptions) ->
             wider.append(WiderTolerance(q, float(stated[i]), math.sqrt(square) * float(stated[i]), evidence))
     wider.sort(key=lambda w: -w.evidence)
     return ToleranceEvidence(
-        together, tuple(w for w in wider if w is wider[0] or w.evidence > options.listed)
+        together, tuple(w for w in wider if w is wider[0] or w.evidence > options.substantial)
     )
 
 

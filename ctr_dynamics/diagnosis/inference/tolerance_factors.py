@@ -53,8 +53,11 @@ def under_factors(
     scale = np.array([q.scale if q.key in causes else 0.0 for q in active])
     ones = np.ones(numerics.shape[1])
     factors = np.geomspace(1.0, o.widest, o.factors)
-    priors = np.full(len(factors), o.too_tight / len(factors))
-    priors[0] += 1.0 - o.too_tight
+    too_tight = (
+        o.too_tight**options.evidence.temperature
+    )  # the evidence is tempered later, and a prior is not
+    priors = np.full(len(factors), too_tight / len(factors))
+    priors[0] += 1.0 - too_tight
     found = []
     for factor, prior in zip(factors, priors, strict=True):
         deviation = np.append(np.hypot(factor * tolerance, scale), ones)
