@@ -13,7 +13,7 @@ from ctr_dynamics.effects import effect_quantities
 from ctr_dynamics.robot import Robot
 
 MOMENT = 0.02  # s
-MODELS = ("plain", "damped", "extended")  # each has kernels of its own
+MODELS = ("plain", "damped", "extended", "extended damped")  # each has kernels of its own
 
 
 def rest_recording(robot: Robot) -> Recording:
@@ -36,15 +36,17 @@ def rest_recording(robot: Robot) -> Recording:
 def warm_up(robot: Robot, models: Sequence[str] = MODELS) -> None:
     """Compile everything that a diagnosis of ``robot`` needs, or load it from the cache; ``models``: which kernels."""
     known = {q.key: q for q in effect_quantities(robot)}
+    damping, air = known["bending_damping", "tube1.B_Nm2s"], known["air_drag", "linear_Ns_per_m2"]
     forward_model = ForwardModel(rest_recording(robot), robot)
     if "plain" in models:
         forward_model.predict({})
         forward_model.jacobian({}, [known["youngs_modulus", "tube1.scale"]])
     if "damped" in models:
-        damping = known["bending_damping", "tube1.B_Nm2s"]
         forward_model.predict({damping.key: damping.off + damping.scale})
         forward_model.jacobian({}, [damping])
     if "extended" in models:
-        air = known["air_drag", "linear_Ns_per_m2"]
         forward_model.predict({air.key: 0.01})
         forward_model.jacobian({air.key: 0.01}, [air])
+    if "extended damped" in models:
+        forward_model.predict({air.key: 0.01, damping.key: damping.off + damping.scale})
+        forward_model.jacobian({air.key: 0.01}, [air, damping])
