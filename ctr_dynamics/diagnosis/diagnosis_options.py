@@ -318,6 +318,7 @@ class ToleranceOptions:
         0.1, "probability", "of tolerances too tight by one factor, as of something outside the catalogue"
     )
     widest: float = option(5.0, "tolerances", "beyond it a departure is a cause by itself")
+    refits: int = option(3, COUNT, "of a hypothesis with the likeliest factor, which may then be another")
     factors: int = option(12, COUNT, "a fifth apart at most, finer than one draw can tell")
     substantial: float = option(
         1.15, LOG, "half of ln 10, from which Jeffreys (1961) calls evidence for wider tolerances substantial"

@@ -126,6 +126,8 @@ def _separation_with(
         [(v - q.off) / q.scale if q.key in keys else 0.0 for q, v in zip(fit.active, fit.values, strict=True)]
     )
     wide = {q.key for q in fit.causes} - keys
-    widths = np.array([math.sqrt(prior_variance(q, q.key in wide)) / q.scale for q in fit.active])
+    widths = np.array(
+        [math.sqrt(prior_variance(q, q.key in wide, fit.tolerance_factor)) / q.scale for q in fit.active]
+    )
     J = np.hstack([everything * widths, against])
     return float(left_over(J, (everything @ departure)[:, None])[0])

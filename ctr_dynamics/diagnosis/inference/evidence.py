@@ -264,14 +264,23 @@ def log_prediction(held_out: Problem, result: Fit, numerics: Floats) -> float:
     residual, columns = found
     departure = result.values - np.array([q.off for q in result.active])
     causes = {q.key for q in result.causes}
+    own = result.tolerance_factor
     factors = under_factors(
-        result.active, causes, result.residual, result.columns, departure, numerics, held_out.options
+        result.active,
+        causes,
+        result.residual,
+        result.columns,
+        departure,
+        numerics,
+        held_out.options,
+        relative_to=own,
     )
+    here = min(factors, key=lambda one: abs(one.factor - own)).departure
     logs = []
     for one in factors:  # a limit of the fit, where it met one, holds for every factor
         size, axes = np.linalg.eigh(one.covariance)
         free = columns @ (axes * np.sqrt(np.maximum(size, 0.0)))  # by coefficients of unit deviation
-        there = residual - columns @ (one.departure - factors[0].departure)
+        there = residual - columns @ (one.departure - here)
         _, _, evidence = posterior(there, free, np.zeros(len(size)), np.ones(len(size)), held_out.numerics)
         logs.append(one.log_weight + evidence)
     return float(logsumexp(logs)) - log_gain(factors)

@@ -40,6 +40,7 @@ class Problem:
         numerics: (m, d) whitened directions of the discretisation error.
         offset: (m,) whitened correction of the residual towards the finer solution.
         reach: tolerances by which fits move a nuisance at most.
+        tolerance_factor: by which the fits take all tolerances to be larger than the robot file says.
         options: numbers of all stages. workers: simulations at once, where nothing else runs.
     """
 
@@ -52,6 +53,7 @@ class Problem:
     reach: float
     options: DiagnosisOptions
     workers: int = 1
+    tolerance_factor: float = 1.0
 
     @property
     def size(self) -> int:

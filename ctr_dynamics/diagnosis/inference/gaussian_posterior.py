@@ -19,20 +19,20 @@ from ctr_dynamics.effects import EffectQuantity
 Floats = NDArray[np.float64]
 
 
-def prior_variance(quantity: EffectQuantity, cause: bool) -> float:
-    """Of a coordinate: tolerance^2, plus scale^2 where it may be a cause."""
-    return quantity.tolerance**2 + (quantity.scale**2 if cause else 0.0)
+def prior_variance(quantity: EffectQuantity, cause: bool, factor: float = 1.0) -> float:
+    """Of a coordinate: the square of ``factor`` tolerances, plus scale^2 where it may be a cause."""
+    return (factor * quantity.tolerance) ** 2 + (quantity.scale**2 if cause else 0.0)
 
 
 def variances(
-    nuisances: Sequence[EffectQuantity], causes: Sequence[EffectQuantity]
+    nuisances: Sequence[EffectQuantity], causes: Sequence[EffectQuantity], factor: float = 1.0
 ) -> tuple[tuple[EffectQuantity, ...], Floats]:
-    """Free quantities and their prior variances: nuisances, then causes that are none."""
+    """Free quantities and their prior variances: nuisances, then causes that are none; ``factor`` on all tolerances."""
     active = list(nuisances)
     names = {q.key for q in nuisances}
     active += [q for q in causes if q.key not in names]
     wide = {q.key for q in causes}
-    return tuple(active), np.array([prior_variance(q, q.key in wide) for q in active])
+    return tuple(active), np.array([prior_variance(q, q.key in wide, factor) for q in active])
 
 
 def tail_gain(causes: Sequence[EffectQuantity], departure: Sequence[float]) -> float:
@@ -100,9 +100,14 @@ def numerics_part(residual: Floats, numerics: Floats) -> Floats:
 
 
 def within_tolerance(
-    active: Sequence[EffectQuantity], causes: set[Key], departure: Floats, covariance: Floats, limit: float
+    active: Sequence[EffectQuantity],
+    causes: set[Key],
+    departure: Floats,
+    covariance: Floats,
+    limit: float,
+    factor: float = 1.0,
 ) -> float:
-    """Log probability that the nuisances lie within ``limit`` tolerances, over that before the data.
+    """Log probability that the nuisances lie within ``limit`` times ``factor`` tolerances, over that before the data.
 
     A tolerance is the deviation of normal errors; what lies far outside is no error of tolerance, however little it adds to the evidence.
     """
@@ -110,8 +115,9 @@ def within_tolerance(
     for i, q in enumerate(active):
         if q.key in causes or q.tolerance <= 0.0:
             continue
-        sigma = math.sqrt(max(covariance[i, i], 0.0)) / q.tolerance + 1e-9
-        z = departure[i] / q.tolerance
+        tolerance = factor * q.tolerance
+        sigma = math.sqrt(max(covariance[i, i], 0.0)) / tolerance + 1e-9
+        z = departure[i] / tolerance
         tail = log_ndtr((limit - z) / sigma) if z > 0.0 else log_ndtr((limit + z) / sigma)
         total += float(tail) - before
     return total

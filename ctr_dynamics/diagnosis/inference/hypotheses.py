@@ -225,11 +225,30 @@ def fit_alternative(
 
 def fit_exactly(problem: Problem, hypothesis: Hypothesis) -> None:
     """Fit again, with exact Jacobians."""
-    own = with_form(problem, hypothesis.members)
+    own = replace(with_form(problem, hypothesis.members), tolerance_factor=hypothesis.fit.tolerance_factor)
     better = fit(own, hypothesis.fit.causes, hypothesis.fit.point)
     if better is not None and better.cost <= hypothesis.fit.cost + 1e-6:
         hypothesis.fit = better
     hypothesis.exact = True
+
+
+def fit_with_likeliest_tolerances(problem: Problem, hypothesis: Hypothesis) -> None:
+    """Fit again with the factor on all tolerances that is the likeliest where ``hypothesis`` stands, until it is the one of the fit.
+
+    Far from where the columns are known, other factors promise more evidence than there is: where a fit does not find it, it does not count.
+    """
+    own = with_form(problem, hypothesis.members)
+    for _ in range(problem.options.tolerances.refits):
+        before = hypothesis.fit
+        if before.has_likeliest_tolerances:
+            return
+        found = fit(replace(own, tolerance_factor=before.likeliest_factor), before.causes, before.point)
+        if found is None or found.log_evidence < before.own_evidence:
+            break
+        hypothesis.fit = found
+    last = hypothesis.fit
+    if not last.has_likeliest_tolerances:
+        hypothesis.fit = replace(last, likeliest_factor=last.tolerance_factor, log_evidence=last.own_evidence)
 
 
 def check_time_error(problem: Problem, hypothesis: Hypothesis) -> None:

@@ -15,7 +15,12 @@ from ctr_dynamics.diagnosis.inference.discretisation_error import correct_discre
 from ctr_dynamics.diagnosis.inference.evidence import WeighedHypotheses, probabilities, weigh
 from ctr_dynamics.diagnosis.inference.fit_problem import Problem
 from ctr_dynamics.diagnosis.inference.fit_quality import excess, explains, is_far_from_noise
-from ctr_dynamics.diagnosis.inference.hypotheses import Hypothesis, check_time_error, with_form
+from ctr_dynamics.diagnosis.inference.hypotheses import (
+    Hypothesis,
+    check_time_error,
+    fit_with_likeliest_tolerances,
+    with_form,
+)
 from ctr_dynamics.diagnosis.inference.map_fit import Fit, corrected, fit
 from ctr_dynamics.diagnosis.inference.screening import screen
 from ctr_dynamics.diagnosis.inference.search_moves import (
@@ -92,6 +97,7 @@ def search_once(
     """
     o = problem.options.search
     no_cause = Hypothesis((), recalibrated)
+    fit_with_likeliest_tolerances(problem, no_cause)
     state = SearchState(problem, pool, recalibrated, context, [no_cause], plane_sought)
     context.report("sensitivities of all candidates")
     near = recalibrated.travelled <= problem.options.calibration.travelled

@@ -43,8 +43,10 @@ class Fit:
         log_evidence: relative to no model at all; only differences count. The tolerances may be too tight by a factor.
         residual, whitened: (m,) residuals at the best point, with the discretisation error and without.
         columns: (m, a) derivatives of the prediction by the coordinates.
-        cost: twice the negative log posterior density, tolerances limited.
+        cost: twice the negative log posterior density, tolerances limited. With larger tolerances it holds what their evidence is less for it.
         inflation: of the posterior deviations, for what no model has (docs/diagnosis.md).
+        tolerance_factor: on all tolerances, with which it was fitted. own_evidence: log evidence with that factor alone.
+        likeliest_factor: the likeliest one where it stands, by the linear model.
         travelled: sum of the whitened errors of predictions since ``columns`` were computed exactly.
     """
 
@@ -59,7 +61,15 @@ class Fit:
     columns: Floats
     cost: float
     inflation: float
+    tolerance_factor: float = 1.0
+    likeliest_factor: float = 1.0
+    own_evidence: float = -math.inf
     travelled: float = 0.0
+
+    @property
+    def has_likeliest_tolerances(self) -> bool:
+        """Whether it was fitted with the factor on tolerances that is the likeliest where it stands."""
+        return self.likeliest_factor == self.tolerance_factor
 
     @property
     def sigma(self) -> Floats:
@@ -154,14 +164,15 @@ class GaussNewton:
         self, problem: Problem, causes: Sequence[EffectQuantity], start: Mapping[Key, float]
     ) -> None:
         self.problem, self.causes = problem, tuple(causes)
-        self.active, self.variance = variances(problem.nuisances, causes)
+        self.active, self.variance = variances(problem.nuisances, causes, problem.tolerance_factor)
         self.off = np.array([q.off for q in self.active])
         place = {q.key: i for i, q in enumerate(self.active)}
         self.of_causes = [place[q.key] for q in causes]
         free = {q.key for q in causes}
-        reach = np.array([math.inf if q.key in free else problem.reach * q.tolerance for q in self.active])
-        self.low = np.maximum([q.low for q in self.active], self.off - reach)
-        self.high = np.minimum([q.high for q in self.active], self.off + reach)
+        reach = problem.reach * problem.tolerance_factor
+        most = np.array([math.inf if q.key in free else reach * q.tolerance for q in self.active])
+        self.low = np.maximum([q.low for q in self.active], self.off - most)
+        self.high = np.minimum([q.high for q in self.active], self.off + most)
         self.values = np.clip([start.get(q.key, q.off) for q in self.active], self.low, self.high)
         self.residual, self.columns = np.zeros(0), np.zeros((0, 0))
         self.cost, self.travelled, self.exact = math.inf, 0.0, False
@@ -300,36 +311,51 @@ def fit_at(
     """The fit that stands at ``values`` (a,), with its posterior and evidence."""
     o, numerics = problem.options.calibration, problem.numerics
     wide = {q.key for q in causes}
-    variance = np.array([prior_variance(q, q.key in wide) for q in active])
+    factor = problem.tolerance_factor
+    variance, stated = (
+        np.array([prior_variance(q, q.key in wide, f) for q in active]) for f in (factor, 1.0)
+    )
     departure = values - np.array([q.off for q in active])
     _, covariance, _ = posterior(residual, columns, departure, variance, numerics)
-    J = np.hstack([columns * np.sqrt(variance), numerics])
+    occam, occam_stated = (
+        float(np.linalg.slogdet(np.eye(J.shape[1]) + J.T @ J)[1])
+        for J in (np.hstack([columns * np.sqrt(v), numerics]) for v in (variance, stated))
+    )
     place = {q.key: i for i, q in enumerate(active)}
     tails = tail_gain(causes, [departure[place[q.key]] for q in causes])
     total = cost(residual, departure, variance, numerics) - 2.0 * tails
-    evidence = -0.5 * total - 0.5 * float(np.linalg.slogdet(np.eye(J.shape[1]) + J.T @ J)[1])
+    evidence = -0.5 * total - 0.5 * occam
     evidence += math.log(2.0) * sum(q.one_sided for q in causes)
-    within = within_tolerance(active, wide, departure, covariance, o.tolerance_limit)
-    wider = log_gain(under_factors(active, wide, residual, columns, departure, numerics, problem.options))
+    within = within_tolerance(active, wide, departure, covariance, o.tolerance_limit, factor)
+    factors = under_factors(
+        active, wide, residual, columns, departure, numerics, problem.options, relative_to=factor
+    )
+    wider = log_gain(factors)
+    total -= 2.0 * within
+    if factor != 1.0:
+        total += occam - occam_stated - 2.0 * wider
     left = residual - numerics_part(residual, numerics)
+    evidence += within
     return Fit(
         causes=causes,
         active=active,
         values=values,
         covariance=covariance,
         chi2=float(left @ left),
-        log_evidence=evidence + within + wider,
+        log_evidence=evidence + wider,
+        own_evidence=evidence,
         residual=residual,
         whitened=left,
         columns=columns,
-        cost=total - 2.0 * within,
+        cost=total,
         inflation=o.inflation,
+        tolerance_factor=factor,
+        likeliest_factor=max(factors, key=lambda one: one.log_weight).factor,
     )
 
 
 def corrected(problem: Problem, result: Fit, change: Floats) -> Fit:
     """``result`` after ``problem.offset`` has changed by ``change`` (m,), where it stood."""
-    found = fit_at(
-        problem, result.causes, result.active, result.values, result.residual - change, result.columns
-    )
+    own = replace(problem, tolerance_factor=result.tolerance_factor)
+    found = fit_at(own, result.causes, result.active, result.values, result.residual - change, result.columns)
     return replace(found, travelled=result.travelled)

@@ -26,6 +26,7 @@ from ctr_dynamics.diagnosis.inference.hypotheses import (
     fit_alternative,
     fit_exactly,
     fit_pair,
+    fit_with_likeliest_tolerances,
     fit_without,
 )
 from ctr_dynamics.diagnosis.inference.map_fit import Fit, corrected
@@ -109,6 +110,19 @@ def fit_single_causes(
                 ]
             )
         )
+        settle_tolerances(state)
+
+
+def settle_tolerances(state: SearchState) -> None:
+    """Fits with the likeliest tolerances for what may be the likeliest hypothesis, as long as one wants others than it was fitted with."""
+    o = state.problem.options.search
+    while not state.context.out_of_time:
+        least = state.best.score - o.contender_margin
+        near = [e for e in state.found if e.score > least and not e.fit.has_likeliest_tolerances]
+        if not near:
+            return
+        fit_with_likeliest_tolerances(state.problem, near[0])
+        state.add()
 
 
 def begin_again_without_causes(state: SearchState) -> bool:
@@ -239,6 +253,7 @@ def refit_contenders(state: SearchState) -> None:
             break
         fit_exactly(state.problem, near[0])
         state.add()
+    settle_tolerances(state)
 
 
 def renew_discretisation(state: SearchState) -> None:

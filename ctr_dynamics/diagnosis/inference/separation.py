@@ -35,7 +35,7 @@ def separation(
     )
     wide = {q.key for q in fit.causes}
     parts = [
-        fit.columns[:, i] * math.sqrt(prior_variance(q, q.key in wide))
+        fit.columns[:, i] * math.sqrt(prior_variance(q, q.key in wide, fit.tolerance_factor))
         for i, q in enumerate(fit.active)
         if q.key not in gone
     ]

@@ -23,9 +23,10 @@ Floats = NDArray[np.float64]
 
 
 class UnderFactor(NamedTuple):
-    """One factor on all tolerances: its log weight, prior times evidence, relative to the evidence of the file as stated; and where the fit
-    goes with it, departures (a,) from the file with covariance (a, a)."""
+    """One factor on all tolerances: its log weight, prior times evidence, relative to the evidence of one factor; and where the fit goes with
+    it, departures (a,) from the file with covariance (a, a)."""
 
+    factor: float
     log_weight: float
     departure: Floats
     covariance: Floats
@@ -39,11 +40,14 @@ def under_factors(
     departure: Floats,
     numerics: Floats,
     options: DiagnosisOptions,
+    *,
+    relative_to: float = 1.0,
 ) -> list[UnderFactor]:
     """Every factor of the options, the first of them 1.
 
     Args:
         causes: keys of those of ``active`` that are causes; their plausible sizes do not grow.
+        relative_to: the one of the factors whose evidence counts as 0.
         residual: (m,) whitened, at ``departure`` (a,). columns: (m, a) derivatives of the prediction. numerics: (m, d).
     """
     o, count = options.tolerances, len(active)
@@ -63,14 +67,14 @@ def under_factors(
         deviation = np.append(np.hypot(factor * tolerance, scale), ones)
         mean, covariance, evidence = posterior_of_information(information, score, deviation)
         mean, covariance = mean[:count], covariance[:count, :count]
-        evidence += within_tolerance(
-            active, causes, mean / factor, covariance / factor**2, options.calibration.tolerance_limit
-        )
-        found.append(UnderFactor(evidence + math.log(prior), mean, covariance))
-    stated = found[0].log_weight - math.log(priors[0])
-    return [one._replace(log_weight=one.log_weight - stated) for one in found]
+        limit = options.calibration.tolerance_limit
+        evidence += within_tolerance(active, causes, mean, covariance, limit, factor)
+        found.append(UnderFactor(float(factor), evidence + math.log(prior), mean, covariance))
+    one = int(np.argmin(np.abs(factors - relative_to)))
+    zero = found[one].log_weight - math.log(priors[one])
+    return [item._replace(log_weight=item.log_weight - zero) for item in found]
 
 
 def log_gain(found: Sequence[UnderFactor]) -> float:
-    """By which the log evidence of the mixture exceeds that of the tolerances as stated."""
+    """By which the log evidence of the mixture exceeds that of the factor to which the weights are relative."""
     return float(logsumexp([one.log_weight for one in found]))
