@@ -1,6 +1,7 @@
 """Made-up quantities and problems whose answers are known without a simulation of a robot."""
 
 import math
+from dataclasses import dataclass, field
 from types import SimpleNamespace
 
 import numpy as np
@@ -19,7 +20,7 @@ def quantity(name, low=-math.inf, high=math.inf, *, tolerance=0.0, scale=1.0, of
 class Vibration:
     """A problem whose prediction is a decaying vibration; nuisances reach two tolerances, and there is no discretisation error."""
 
-    reach, options = 2.0, DiagnosisOptions()
+    reach, options, tolerance_factor = 2.0, DiagnosisOptions(), 1.0
 
     def __init__(self, truth, nuisances=()):
         self.t = np.linspace(0.0, 14.0, 500)
@@ -41,7 +42,7 @@ class Vibration:
 class LongVibration:
     """A problem of one recording: an undamped vibration of about 50 Hz that begins at ``begin_s``, sampled at 40 Hz for 8 s, with noise."""
 
-    reach, options, workers = 4.0, DiagnosisOptions(), 1
+    reach, options, workers, tolerance_factor = 4.0, DiagnosisOptions(), 1, 1.0
 
     def __init__(self, truth, nuisances, *, begin_s=0.0, noise=1.0, end_s=8.0, spans=None):
         self.truth, self.nuisances, self.begin_s, self.noise = truth, nuisances, begin_s, noise
@@ -79,4 +80,44 @@ class LongVibration:
         for q in wanted:
             more = {**point, q.key: point.get(q.key, 0.0) + 1e-6}
             columns.append((self.predicted(more) - self.predicted(point)) / 1e-6)
+        return self.residual(point), np.stack(columns, axis=1)
+
+
+@dataclass
+class BentProblem:
+    """Ten nuisances whose prediction is linear up to ``bend`` tolerances of each, and stands still beyond it."""
+
+    data: np.ndarray
+    J: np.ndarray
+    nuisances: tuple
+    bend: float = math.inf
+    reach: float = 4.0
+    tolerance_factor: float = 1.0
+    robot: object = None
+    options: DiagnosisOptions = field(default_factory=DiagnosisOptions)
+
+    @property
+    def numerics(self):
+        return np.zeros((len(self.data), 0))
+
+    @property
+    def size(self):
+        return len(self.data)
+
+    def _bent(self, point):
+        departures = np.array([point.get(q.key, q.off) - q.off for q in self.nuisances])
+        most = self.bend * np.array([q.tolerance for q in self.nuisances])
+        return departures, most
+
+    def residual(self, point):
+        departures, most = self._bent(point)
+        return self.data - self.J @ np.clip(departures, -most, most)
+
+    def linearise(self, point, wanted):
+        departures, most = self._bent(point)
+        keys = [q.key for q in self.nuisances]
+        columns = [
+            self.J[:, keys.index(q.key)] * (abs(departures[keys.index(q.key)]) <= most[keys.index(q.key)])
+            for q in wanted
+        ]
         return self.residual(point), np.stack(columns, axis=1)

@@ -4,12 +4,18 @@ import math
 
 import numpy as np
 import pytest
-from diagnosis_cases import quantity
+from diagnosis_cases import BentProblem, quantity
 from scipy.special import logsumexp, ndtr
 from scipy.stats import multivariate_normal
 
 from ctr_dynamics.diagnosis.diagnosis_options import DiagnosisOptions
 from ctr_dynamics.diagnosis.inference.gaussian_posterior import posterior, within_tolerance
+from ctr_dynamics.diagnosis.inference.hypotheses import (
+    Hypothesis,
+    fit_exactly,
+    fit_with_likeliest_tolerances,
+)
+from ctr_dynamics.diagnosis.inference.map_fit import fit
 from ctr_dynamics.diagnosis.inference.tolerance_factors import log_gain, under_factors
 
 OPTIONS = DiagnosisOptions()
@@ -100,3 +106,53 @@ def test_one_large_departure_among_tolerances_that_hold_stays_a_cause():
         none, one = departures_explained(values, rng, 0)
         gains.append(one[1] - none[1])
     assert min(gains) > 4.0
+
+
+def scattered(rng, factor, bend=math.inf):
+    """A hypothesis without causes, fitted with tolerances as stated to values that scatter ``factor`` times as much, and the problem."""
+    J = 40.0 / TOLERANCE * rng.normal(size=(SIZE, COUNT)) / math.sqrt(SIZE)
+    values = factor * TOLERANCE * np.sign(rng.normal(size=COUNT))
+    nuisances = tuple(quantity(f"p{i}", tolerance=TOLERANCE) for i in range(COUNT))
+    problem = BentProblem(J @ values + rng.normal(size=SIZE), J, nuisances, bend)
+    found = fit(problem, (), {})
+    assert found is not None
+    return problem, Hypothesis((), found), values
+
+
+def test_a_hypothesis_is_fitted_with_the_likeliest_tolerances():
+    problem, hypothesis, values = scattered(np.random.default_rng(4), 6.0)
+    stated = hypothesis.fit
+    assert np.max(np.abs(stated.values)) == pytest.approx(4.0 * TOLERANCE)  # where fits end
+    fit_with_likeliest_tolerances(problem, hypothesis)
+    assert hypothesis.fit.has_likeliest_tolerances
+    assert hypothesis.fit.tolerance_factor > 3.0
+    assert hypothesis.fit.values == pytest.approx(values, abs=0.2 * TOLERANCE)
+    assert hypothesis.fit.cost < stated.cost
+    # an exact fit afterwards keeps the tolerances
+    fit_exactly(problem, hypothesis)
+    assert hypothesis.fit.tolerance_factor > 3.0
+
+
+def test_tolerances_that_hold_are_not_made_larger():
+    problem, hypothesis, _ = scattered(np.random.default_rng(5), 1.0)
+    before = hypothesis.fit
+    fit_with_likeliest_tolerances(problem, hypothesis)
+    assert hypothesis.fit is before
+    assert before.tolerance_factor == 1.0
+
+
+def test_evidence_that_no_fit_finds_does_not_count():
+    problem, hypothesis, _ = scattered(np.random.default_rng(6), 6.0, bend=4.0)
+    promised = hypothesis.fit.log_evidence
+    fit_with_likeliest_tolerances(problem, hypothesis)
+    assert hypothesis.fit.has_likeliest_tolerances
+    assert hypothesis.fit.log_evidence < promised - 100.0
+
+
+def test_costs_with_different_tolerances_compare_as_their_evidence_does():
+    problem, hypothesis, _ = scattered(np.random.default_rng(7), 2.5)
+    stated = hypothesis.fit
+    fit_with_likeliest_tolerances(problem, hypothesis)
+    wide = hypothesis.fit
+    assert wide.tolerance_factor > 1.0
+    assert stated.cost - wide.cost == pytest.approx(2.0 * (wide.log_evidence - stated.own_evidence), abs=1e-6)
