@@ -1,6 +1,6 @@
 """Diagnosis on many robots: effects hidden in bags of the fleet, with tolerances as shipped and as a laboratory has them.
 
-    python -m studies.fleet_diagnosis --output fleet.jsonl --cases 12 --robots tissue,light,long,heavy
+    python -m studies.fleet_diagnosis --output fleet.jsonl --cases 12 --robots tissue,three_tube,random1,random2
     python -m studies.fleet_diagnosis --output fleet.jsonl --table
 
 A case is a true robot drawn from the tolerances of its file, without limits, and two bags of the package's own simulator: a weight is cut, then
@@ -26,7 +26,7 @@ from typing import Any
 import numpy as np
 
 from ctr_dynamics.benchmarks.fleet import record, scenario_for
-from ctr_dynamics.benchmarks.fleet_robots import FLEET, Draw, drawn, fleet_robot
+from ctr_dynamics.benchmarks.fleet_robots import FLEET, Draw, drawn, fleet_robot, seed_of
 from ctr_dynamics.diagnosis.inference.candidates import candidates
 from ctr_dynamics.diagnosis.output.findings import findings
 from ctr_dynamics.diagnosis.pipeline import diagnose_recordings
@@ -82,7 +82,7 @@ def hidden_effect(robot: Robot, rng: np.random.Generator) -> dict[str, dict[str,
 def run_case(name: str, lab: bool, stratum: str, number: int) -> dict[str, Any]:
     """Make a case and diagnose it."""
     robot = fleet_robot(name, lab)
-    rng = np.random.default_rng([number, list(FLEET).index(name), int(lab), STRATA.index(stratum)])
+    rng = np.random.default_rng([number, seed_of(name), int(lab), STRATA.index(stratum)])
     draw = drawn(loosened(robot, TOO_TIGHT) if stratum == "many" else robot, rng)
     hidden = hidden_effect(robot, rng) if stratum == "single" else {}
     true = Draw(robot_from_dict({**robot_to_dict(draw.robot), "extensions": hidden}), draw.offsets)

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
-from ctr_dynamics.benchmarks.fleet_robots import FLEET, Draw, drawn, fleet_robot
+from ctr_dynamics.benchmarks.fleet_robots import FLEET, Draw, drawn, fleet_robot, seed_of
 from ctr_dynamics.estimation.estimator import Estimator
 from ctr_dynamics.io.bag_reader import open_bag
 from ctr_dynamics.model.model import Model
@@ -134,7 +134,7 @@ def fleet(
             robot, found = fleet_robot(name, kind), []
             failures: list[str] = []
             for number in range(draws):
-                rng = np.random.default_rng([seed, number, list(FLEET).index(name), int(kind)])
+                rng = np.random.default_rng([seed, number, seed_of(name), int(kind)])
                 draw = drawn(robot, rng)
                 scenario = scenario_for(robot, int(rng.integers(2**31)))
                 with tempfile.TemporaryDirectory() as folder:

@@ -64,18 +64,72 @@ FLEET: dict[str, tuple[str, Callable[[Data], None] | None]] = {
 }
 """Robots by name: the shipped file that each comes from, and how it differs."""
 
+RANDOM = "random"
+"""With a number behind it: one of endlessly many robots like that of the paper, which nobody has looked at when a method was chosen."""
+
 LAB_STIFFNESS, LAB_PRECURVATURE = (
     0.03,
     0.02,
 )  # of a robot that was built and measured in a laboratory: E 2 to 5 %, precurvature 1 to 3 %
 
 
+def seed_of(name: str) -> int:
+    """A number of its own for each robot.
+
+    Raises:
+        KeyError: no such robot.
+    """
+    if name.startswith(RANDOM):
+        return len(FLEET) + _random_number(name) - 1
+    if name not in FLEET:
+        raise KeyError(name)
+    return list(FLEET).index(name)
+
+
+def _random_number(name: str) -> int:
+    number = name.removeprefix(RANDOM)
+    if not number.isdecimal() or int(number) < 1:
+        raise KeyError(name)
+    return int(number)
+
+
+def _at_random(data: Data, number: int) -> None:
+    """Other radii, lengths, stiffnesses, precurvatures and payload."""
+    rng = np.random.default_rng([77, number])
+    width, length = rng.uniform(0.85, 1.25), rng.uniform(0.75, 1.35)
+    for tube in data["tubes"]:
+        for radius in ("inner_radius", "outer_radius"):
+            tube[radius]["value"] *= width
+        stiffness, curvature = rng.uniform(0.8, 1.2), rng.uniform(0.6, 1.3)
+        tube["youngs_modulus"]["value"] *= stiffness
+        for segment in tube["precurvature"]:
+            segment["length"]["value"] *= length
+            if "curvature" in segment:
+                segment["curvature"]["value"] = [
+                    curvature / length * x for x in segment["curvature"]["value"]
+                ]
+        if "end_body" in tube:
+            payload, body = rng.uniform(0.1, 1.5), tube["end_body"]
+            body["mass"]["value"] *= payload
+            body["mass"]["tolerance"] *= payload
+            body["inertia"]["value"] = [payload * x for x in body["inertia"]["value"]]
+    data["rest"]["beta"]["value"] = [length * x for x in data["rest"]["beta"]["value"]]
+
+
 def fleet_robot(name: str, lab: bool = False) -> Robot:
-    """A robot of the fleet as its file describes it; ``lab``: with the tolerances of a laboratory."""
-    source, change = FLEET[name]
-    data = robot_to_dict(load_robot(source))
-    if change is not None:
-        change(data)
+    """A robot of the fleet, or one at random as ``random7``, as its file describes it; ``lab``: with the tolerances of a laboratory.
+
+    Raises:
+        KeyError: no such robot.
+    """
+    if name.startswith(RANDOM):
+        data = robot_to_dict(load_robot("till2020_tissue"))
+        _at_random(data, _random_number(name))
+    else:
+        source, change = FLEET[name]
+        data = robot_to_dict(load_robot(source))
+        if change is not None:
+            change(data)
     data["name"] = name
     for tube in data["tubes"] if lab else ():
         _tolerate(tube["youngs_modulus"], LAB_STIFFNESS)

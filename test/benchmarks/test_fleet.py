@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from ctr_dynamics.benchmarks.fleet import fleet, interval, table
-from ctr_dynamics.benchmarks.fleet_robots import FLEET, LAB_STIFFNESS, drawn, fleet_robot
+from ctr_dynamics.benchmarks.fleet_robots import FLEET, LAB_STIFFNESS, drawn, fleet_robot, seed_of
 
 
 @pytest.mark.parametrize("name", FLEET)
@@ -25,6 +25,20 @@ def test_draws_scatter_as_the_file_says(name):
     densities = np.array([[tube.density.value for tube in d.robot.tubes] for d in draws])
     assert np.ptp(densities / densities[:, :1], axis=0).max() < 1e-9  # of one alloy
     assert all(np.linalg.norm(d.robot.gravity.value) == pytest.approx(9.81, rel=1e-6) for d in draws)
+
+
+def test_random_robots_differ_and_are_the_same_each_time():
+    robots = [fleet_robot(f"random{number}") for number in range(1, 9)]
+    lengths = [robot.exposed_length for robot in robots]
+    assert len(set(lengths)) == len(lengths)
+    assert all(0.05 < length < 0.3 for length in lengths)
+    assert fleet_robot("random3") == robots[2]
+    assert len({*map(seed_of, FLEET), *(seed_of(robot.name) for robot in robots)}) == len(FLEET) + 8
+    for name in ("random", "random0", "nobody"):
+        with pytest.raises(KeyError):
+            seed_of(name)
+        with pytest.raises(KeyError):
+            fleet_robot(name)
 
 
 def test_two_robots_are_consistent():
