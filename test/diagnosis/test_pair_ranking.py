@@ -1,7 +1,7 @@
 """Pairs of causes on problems that are linear: what a search one by one misses, and what bags that were not fitted say."""
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
@@ -37,14 +37,21 @@ def quantity(effect, *, tolerance=0.0, low=-math.inf):
     )
 
 
+@dataclass
 class Linear:
     """A problem with one column for every quantity; ``data`` (m,) whitened."""
 
-    reach, options = OPTIONS.calibration.reach, OPTIONS
+    columns: dict
+    data: np.ndarray
+    nuisances: tuple
+    numerics: np.ndarray
+    reach: float = OPTIONS.calibration.reach
+    options: DiagnosisOptions = OPTIONS
+    tolerance_factor: float = 1.0
 
-    def __init__(self, columns, data, nuisances, numerics):
-        self.columns, self.data, self.nuisances, self.numerics = columns, data, nuisances, numerics
-        self.size = len(data)
+    @property
+    def size(self):
+        return len(self.data)
 
     def residual(self, point):
         return self.data - sum(self.columns[key] * value for key, value in point.items())
