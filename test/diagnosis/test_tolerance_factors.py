@@ -120,7 +120,7 @@ def scattered(rng, factor, bend=math.inf):
 
 
 def test_a_hypothesis_is_fitted_with_the_likeliest_tolerances():
-    problem, hypothesis, values = scattered(np.random.default_rng(4), 6.0)
+    problem, hypothesis, values = scattered(np.random.default_rng(4), 4.2)
     stated = hypothesis.fit
     assert np.max(np.abs(stated.values)) == pytest.approx(4.0 * TOLERANCE)  # where fits end
     fit_with_likeliest_tolerances(problem, hypothesis)
@@ -142,11 +142,20 @@ def test_tolerances_that_hold_are_not_made_larger():
 
 
 def test_evidence_that_no_fit_finds_does_not_count():
-    problem, hypothesis, _ = scattered(np.random.default_rng(6), 6.0, bend=4.0)
+    problem, hypothesis, _ = scattered(np.random.default_rng(6), 4.2, bend=4.0)
     promised = hypothesis.fit.log_evidence
     fit_with_likeliest_tolerances(problem, hypothesis)
     assert hypothesis.fit.has_likeliest_tolerances
-    assert hypothesis.fit.log_evidence < promised - 100.0
+    assert hypothesis.fit.log_evidence < promised - 5.0
+
+
+def test_what_needs_more_than_the_widest_factor_is_no_matter_of_tolerances():
+    problem, hypothesis, _ = scattered(np.random.default_rng(8), 9.0)
+    before = hypothesis.fit
+    assert before.has_likeliest_tolerances
+    assert before.log_evidence == before.own_evidence
+    fit_with_likeliest_tolerances(problem, hypothesis)
+    assert hypothesis.fit is before
 
 
 def test_costs_with_different_tolerances_compare_as_their_evidence_does():
@@ -155,4 +164,4 @@ def test_costs_with_different_tolerances_compare_as_their_evidence_does():
     fit_with_likeliest_tolerances(problem, hypothesis)
     wide = hypothesis.fit
     assert wide.tolerance_factor > 1.0
-    assert stated.cost - wide.cost == pytest.approx(2.0 * (wide.log_evidence - stated.own_evidence), abs=1e-6)
+    assert stated.cost - wide.cost == pytest.approx(2.0 * (wide.log_evidence - stated.own_evidence), abs=0.1)

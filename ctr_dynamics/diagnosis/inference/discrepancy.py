@@ -27,7 +27,7 @@ from ctr_dynamics.diagnosis.inference.gaussian_posterior import (
     within_tolerance,
 )
 from ctr_dynamics.diagnosis.inference.map_fit import Fit, fit, fit_at
-from ctr_dynamics.diagnosis.inference.tolerance_factors import log_gain, under_factors
+from ctr_dynamics.diagnosis.inference.tolerance_factors import credible, log_gain, under_factors
 from ctr_dynamics.diagnosis.run_context import RunContext
 from ctr_dynamics.effects import EffectQuantity
 
@@ -318,17 +318,10 @@ class _Linear:
         scale = self.process.scale(sizes)
         columns, numerics = self.columns * scale[:, None], self.numerics * scale[:, None]
         causes = {q.key for q in self.fit.causes}
-        return log_gain(
-            under_factors(
-                self.fit.active,
-                causes,
-                self.residual * scale,
-                columns,
-                self.departure,
-                numerics,
-                self.options,
-            )
+        factors = under_factors(
+            self.fit.active, causes, self.residual * scale, columns, self.departure, numerics, self.options
         )
+        return log_gain(credible(factors, factors[0]))
 
     def log_evidence(self, sizes: Sizes) -> tuple[float, Floats]:
         """Log evidence up to a constant, and covariance (a, a) of the coordinates, with a discrepancy of ``sizes`` (m, rad)."""

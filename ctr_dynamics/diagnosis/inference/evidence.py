@@ -30,7 +30,7 @@ from ctr_dynamics.diagnosis.inference.hypotheses import Hypothesis, fit_exactly
 from ctr_dynamics.diagnosis.inference.map_fit import Fit
 from ctr_dynamics.diagnosis.inference.screening import Screened
 from ctr_dynamics.diagnosis.inference.sensitivities import Sensitivities
-from ctr_dynamics.diagnosis.inference.tolerance_factors import log_gain, under_factors
+from ctr_dynamics.diagnosis.inference.tolerance_factors import credible, log_gain, under_factors, with_factor
 from ctr_dynamics.diagnosis.run_context import RunContext
 
 Floats = NDArray[np.float64]
@@ -264,7 +264,6 @@ def log_prediction(held_out: Problem, result: Fit, numerics: Floats) -> float:
     residual, columns = found
     departure = result.values - np.array([q.off for q in result.active])
     causes = {q.key for q in result.causes}
-    own = result.tolerance_factor
     factors = under_factors(
         result.active,
         causes,
@@ -273,14 +272,15 @@ def log_prediction(held_out: Problem, result: Fit, numerics: Floats) -> float:
         departure,
         numerics,
         held_out.options,
-        relative_to=own,
+        relative_to=result.tolerance_factor,
     )
-    here = min(factors, key=lambda one: abs(one.factor - own)).departure
+    own = with_factor(factors, result.tolerance_factor)
+    factors = credible(factors, own)
     logs = []
     for one in factors:  # a limit of the fit, where it met one, holds for every factor
         size, axes = np.linalg.eigh(one.covariance)
         free = columns @ (axes * np.sqrt(np.maximum(size, 0.0)))  # by coefficients of unit deviation
-        there = residual - columns @ (one.departure - here)
+        there = residual - columns @ (one.departure - own.departure)
         _, _, evidence = posterior(there, free, np.zeros(len(size)), np.ones(len(size)), held_out.numerics)
         logs.append(one.log_weight + evidence)
     return float(logsumexp(logs)) - log_gain(factors)

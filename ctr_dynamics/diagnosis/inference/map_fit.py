@@ -26,7 +26,7 @@ from ctr_dynamics.diagnosis.inference.gaussian_posterior import (
     variances,
     within_tolerance,
 )
-from ctr_dynamics.diagnosis.inference.tolerance_factors import log_gain, under_factors
+from ctr_dynamics.diagnosis.inference.tolerance_factors import credible, log_gain, under_factors, with_factor
 from ctr_dynamics.effects import EffectQuantity
 
 Floats = NDArray[np.float64]
@@ -330,6 +330,8 @@ def fit_at(
     factors = under_factors(
         active, wide, residual, columns, departure, numerics, problem.options, relative_to=factor
     )
+    own = with_factor(factors, factor)
+    factors = credible(factors, own)
     wider = log_gain(factors)
     total -= 2.0 * within
     if factor != 1.0:
@@ -343,7 +345,7 @@ def fit_at(
         covariance=covariance,
         chi2=float(left @ left),
         log_evidence=evidence + wider,
-        own_evidence=evidence,
+        own_evidence=evidence + own.log_weight,
         residual=residual,
         whitened=left,
         columns=columns,

@@ -75,6 +75,17 @@ def under_factors(
     return [item._replace(log_weight=item.log_weight - zero) for item in found]
 
 
+def with_factor(found: Sequence[UnderFactor], factor: float) -> UnderFactor:
+    """The one of ``found`` with ``factor``, or the next to it."""
+    return min(found, key=lambda one: abs(one.factor - factor))
+
+
+def credible(found: Sequence[UnderFactor], own: UnderFactor) -> list[UnderFactor]:
+    """``found``, or ``own`` alone where the widest factor is the likeliest: what needs more than that is not a matter of tolerances."""
+    likeliest = max(found, key=lambda one: one.log_weight)
+    return [own] if likeliest is found[-1] else list(found)
+
+
 def log_gain(found: Sequence[UnderFactor]) -> float:
     """By which the log evidence of the mixture exceeds that of the factor to which the weights are relative."""
     return float(logsumexp([one.log_weight for one in found]))
