@@ -217,6 +217,9 @@ class SearchOptions:
     batch: int = option(
         2, COUNT, "first fits, which others must be able to beat; fixed, whatever the workers"
     )
+    first_part_causes: int = option(
+        4, COUNT, "that lead in the first part that nuisances do not explain, and are fitted to the whole"
+    )
     give_up: float = option(8.0, "deviations", "of the cost above the best one's at which a fit is given up")
     enough: float = option(2.0, "times the noise", "what leaves no more ends the trial of other sizes")
     nearby_sizes: tuple[float, float] = option(

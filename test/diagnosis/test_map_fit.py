@@ -1,6 +1,5 @@
 """Fits on problems with known answers: the posterior, steps inside bounds, how far nuisances go."""
 
-import math
 from dataclasses import replace
 
 import numpy as np
@@ -9,9 +8,10 @@ from diagnosis_cases import LongVibration, Vibration, quantity
 
 from ctr_dynamics.diagnosis.diagnosis_options import DiagnosisOptions
 from ctr_dynamics.diagnosis.inference import calibration
-from ctr_dynamics.diagnosis.inference.calibration import _from_growing_parts, _grown
+from ctr_dynamics.diagnosis.inference.calibration import _from_growing_parts
 from ctr_dynamics.diagnosis.inference.fit_problem import make_problem
 from ctr_dynamics.diagnosis.inference.gaussian_posterior import posterior
+from ctr_dynamics.diagnosis.inference.growing_fit import fit_growing
 from ctr_dynamics.diagnosis.inference.map_fit import GaussNewton, fit
 from ctr_dynamics.diagnosis.run_context import RunContext
 
@@ -117,7 +117,7 @@ def test_growing_parts_follow_a_phase_over_many_turns(off, begin_s):
     truth = {("made_up", "frequency"): 0.01 * off, ("made_up", "size"): -0.03}
     problem = LongVibration(truth, nuisances, begin_s=begin_s)
     at_once = fit(problem, (), {}, polish=False)
-    grown = _grown(problem, math.inf)
+    grown = fit_growing(problem)
     assert grown.point[("made_up", "frequency")] == pytest.approx(0.01 * off, abs=1e-4)
     assert grown.cost < 1.2 * problem.size
     assert abs(off) < 1.0 or at_once.cost > 3.0 * grown.cost
@@ -125,5 +125,5 @@ def test_growing_parts_follow_a_phase_over_many_turns(off, begin_s):
 
 def test_what_no_part_explains_grows_no_further():
     problem = LongVibration({}, (quantity("frequency", tolerance=0.01),), noise=3.0)
-    assert _grown(problem, math.inf) is None
+    assert fit_growing(problem) is None
     assert len(problem.spans) < 10

@@ -5,12 +5,10 @@ In: a problem. Out: the re-calibrated fit, against which every gain counts, and 
 
 from __future__ import annotations
 
-import math
-
-from ctr_dynamics.diagnosis.forward_model import Key
 from ctr_dynamics.diagnosis.inference.discretisation_error import correct_discretisation
 from ctr_dynamics.diagnosis.inference.fit_problem import Local, Problem, choose_steps
 from ctr_dynamics.diagnosis.inference.fit_quality import excess, is_acceptable
+from ctr_dynamics.diagnosis.inference.growing_fit import fit_growing
 from ctr_dynamics.diagnosis.inference.map_fit import Fit, fit
 from ctr_dynamics.diagnosis.run_context import RunContext
 from ctr_dynamics.effects import EFFECTS, EffectQuantity, effect_quantities
@@ -65,43 +63,15 @@ def fit_nuisances(problem: Problem, context: RunContext) -> Fit:
 
 
 def _from_growing_parts(problem: Problem, first: Fit, context: RunContext) -> Fit | None:
-    """The fit to which the first steps of ``first`` lead, or a better one that begins with the first part of the recordings and goes on to more and
-    more of them.
+    """The fit to which the first steps of ``first`` lead, or a better one from growing parts of the recordings.
 
-    A frequency that is a little off is out of phase by turns after seconds, and a fit to all of them at once may stop at any of the minima between.
+    A fit to all of them at once may stop at any of the minima between turns of phase.
     """
     if excess(problem, first) < problem.options.search.little_left:
         return first
     context.report("re-calibration of growing parts")
-    grown = _grown(problem, first.cost)
+    grown = fit_growing(problem, limit=first.cost)
     if grown is not None and is_acceptable(problem, grown):
         return grown
     found = fit(problem, (), first.point, polish=False) or first
     return found if grown is None or found.cost <= grown.cost else grown
-
-
-def _grown(problem: Problem, limit: float) -> Fit | None:
-    """The fit to the whole recordings from fits to growing parts of them; None where no part is explained.
-
-    A part grows by as much as fits can follow: by less where the next one is not explained, and again by more where it is. Where the
-    least growth does not help, what is left is no matter of phases. ``limit``: cost beyond which a fit to the whole is given up.
-    """
-    o = problem.options.calibration
-    point: dict[Key, float] = {}
-    reached, part, growth = 0.0, o.first_part, o.growth
-    while growth > o.least_growth:
-        whole = part >= 1.0
-        own = (
-            problem if whole else problem.until([part * m.recording.duration for m in problem.forward_models])
-        )
-        found = fit(own, (), point, polish=False, limit=limit if whole else math.inf) if own.size else None
-        if found is not None and is_acceptable(own, found):
-            if whole:
-                return found
-            point, reached, growth = found.point, part, min(growth**2, o.growth)
-        elif own.size:
-            growth = math.sqrt(growth)
-        else:  # nothing is measured so early
-            reached = part
-        part = min(reached * growth, 1.0) if reached else 0.5 * part
-    return fit(problem, (), point, polish=False) if point else None

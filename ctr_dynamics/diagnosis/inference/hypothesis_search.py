@@ -13,8 +13,9 @@ from ctr_dynamics.diagnosis.inference.candidates import Candidate
 from ctr_dynamics.diagnosis.inference.contact_plane import time_of_divergence
 from ctr_dynamics.diagnosis.inference.discretisation_error import correct_discretisation
 from ctr_dynamics.diagnosis.inference.evidence import WeighedHypotheses, probabilities, weigh
+from ctr_dynamics.diagnosis.inference.first_unexplained import search_first_unexplained
 from ctr_dynamics.diagnosis.inference.fit_problem import Problem
-from ctr_dynamics.diagnosis.inference.fit_quality import excess, explains, is_far_from_noise
+from ctr_dynamics.diagnosis.inference.fit_quality import excess, explains, is_acceptable, is_far_from_noise
 from ctr_dynamics.diagnosis.inference.hypotheses import (
     Hypothesis,
     check_time_error,
@@ -106,10 +107,13 @@ def search_once(
     if here is None:
         return None
     screened = screen(problem, here, recalibrated, (), pool)
-    fit_single_causes(state, screened, here)
+    large_misfit = excess(problem, recalibrated) > o.large_misfit
+    if large_misfit:
+        state.add(search_first_unexplained(state))
+    if not large_misfit or not is_acceptable(problem, state.best.fit):
+        fit_single_causes(state, screened, here)
     if begin_again_without_causes(state):
         return search_once(problem, state.pool, state.recalibrated, context, plane_sought=plane_sought)
-    large_misfit = excess(problem, recalibrated) > o.large_misfit
     if large_misfit and excess(problem, state.best.fit) > o.little_left and not context.out_of_time:
         screened, here = try_large_sizes(state, screened, here)
     if state.best.members and not context.out_of_time:
