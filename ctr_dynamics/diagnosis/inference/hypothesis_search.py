@@ -107,15 +107,19 @@ def search_once(
     if here is None:
         return None
     screened = screen(problem, here, recalibrated, (), pool)
-    large_misfit = excess(problem, recalibrated) > o.large_misfit
-    if large_misfit:
+    out_of_phase = recalibrated.chi2 > o.far_from_noise * problem.size  # and derivatives mislead
+    if out_of_phase:
         state.add(search_first_unexplained(state))
-    if not large_misfit or not is_acceptable(problem, state.best.fit):
+    if not (out_of_phase and is_acceptable(problem, state.best.fit)):
         fit_single_causes(state, screened, here)
     if begin_again_without_causes(state):
         return search_once(problem, state.pool, state.recalibrated, context, plane_sought=plane_sought)
+    large_misfit = excess(problem, recalibrated) > o.large_misfit
     if large_misfit and excess(problem, state.best.fit) > o.little_left and not context.out_of_time:
-        screened, here = try_large_sizes(state, screened, here)
+        if not out_of_phase:
+            state.add(search_first_unexplained(state))
+        if excess(problem, state.best.fit) > o.little_left:
+            screened, here = try_large_sizes(state, screened, here)
     if state.best.members and not context.out_of_time:
         beside = leaders(state)
         add_further_cause(state, beside, here)

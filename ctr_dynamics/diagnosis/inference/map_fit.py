@@ -46,7 +46,7 @@ class Fit:
         cost: twice the negative log posterior density, tolerances limited. With larger tolerances it holds what their evidence is less for it.
         inflation: of the posterior deviations, for what no model has (docs/diagnosis.md).
         tolerance_factor: on all tolerances, with which it was fitted. own_evidence: log evidence with that factor alone.
-        likeliest_factor: the likeliest one where it stands, by the linear model.
+        likeliest_factor: the likeliest one where it stands, by the linear model, if it has substantially more evidence.
         travelled: sum of the whitened errors of predictions since ``columns`` were computed exactly.
     """
 
@@ -333,6 +333,9 @@ def fit_at(
     own = with_factor(factors, factor)
     factors = credible(factors, own)
     wider = log_gain(factors)
+    likeliest = max(factors, key=lambda one: one.log_weight).factor
+    if wider - own.log_weight < problem.options.tolerances.substantial:
+        likeliest = factor
     total -= 2.0 * within
     if factor != 1.0:
         total += occam - occam_stated - 2.0 * wider
@@ -352,7 +355,7 @@ def fit_at(
         cost=total,
         inflation=o.inflation,
         tolerance_factor=factor,
-        likeliest_factor=max(factors, key=lambda one: one.log_weight).factor,
+        likeliest_factor=likeliest,
     )
 
 
