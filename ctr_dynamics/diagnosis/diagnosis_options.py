@@ -318,7 +318,9 @@ class ToleranceOptions:
     """Tolerances: whether those of the robot file are too tight."""
 
     too_tight: float = option(
-        0.1, "probability", "of tolerances too tight by one factor, as of something outside the catalogue"
+        0.02,
+        "probability",
+        "of tolerances too tight by one factor, as of three causes: much is wrong at once",
     )
     widest: float = option(5.0, "tolerances", "beyond it a departure is a cause by itself")
     refits: int = option(3, COUNT, "of a hypothesis with the likeliest factor, which may then be another")
