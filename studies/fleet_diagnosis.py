@@ -118,8 +118,8 @@ def run_case(name: str, lab: bool, stratum: str, number: int) -> dict[str, Any]:
 def table(rows: list[dict[str, Any]]) -> str:
     """Outcomes by robot, and over all, as Markdown."""
     lines = ["| robot | clean called clean | clear singles: likeliest is right | in the set of 95 % "
-             "| all singles in the set | many small: no wrong name above 0.5 | median, longest diagnosis |",
-             "|" + "---|" * 7]  # fmt: skip
+             "| all singles in the set | many small: no wrong name above 0.5 | many small called tolerances | median, longest diagnosis |",
+             "|" + "---|" * 8]  # fmt: skip
     for robot in (*sorted({r["robot"] for r in rows}), "all"):
         own = [r for r in rows if robot in (r["robot"], "all")]
         single = [r for r in own if r["stratum"] == "single"]
@@ -130,6 +130,7 @@ def table(rows: list[dict[str, Any]]) -> str:
             f"| {fraction(truth_of(r) == r['probabilities'][0]['effects'] for r in clear)} "
             f"| {fraction(in_set(r) for r in clear)} | {fraction(in_set(r) for r in single)} "
             f"| {fraction(not wrongly_named(r) for r in own if r['stratum'] == 'many')} "
+            f"| {fraction(r['verdict'] == 'tolerances' for r in own if r['stratum'] == 'many')} "
             f"| {seconds[len(seconds) // 2]:.0f} s, {seconds[-1]:.0f} s |"
         )
     return "\n".join(lines)
