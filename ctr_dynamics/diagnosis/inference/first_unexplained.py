@@ -43,11 +43,15 @@ def search_first_unexplained(state: SearchState) -> list[Hypothesis]:
     ):  # what explains everything leaves the rest to the search for its rivals
         if two and not any(is_acceptable(problem, e.fit) for e in found):
             context.report(f"longer parts with {', '.join(effect for e in two for effect in e.effects)}")
-            found += state.run_fits([delayed(_grow)(problem, e.members, e.fit, part) for e in two])
+            limit = state.cost_limit
+            found += state.run_fits([delayed(_grow)(problem, e.members, e.fit, part, limit) for e in two])
     return found
 
 
-def _grow(problem: Problem, members: tuple[Candidate, ...], begun: Fit, part: float) -> Hypothesis | None:
-    """``members`` fitted to the whole recordings, from their fit to a first part of them."""
-    found = fit_growing(with_form(problem, members), causes_of(members), begun.point, first_part=part)
+def _grow(
+    problem: Problem, members: tuple[Candidate, ...], begun: Fit, part: float, limit: float
+) -> Hypothesis | None:
+    """``members`` fitted to the whole recordings, from their fit to a first part of them; ``limit``: cost beyond which that is given up."""
+    own = with_form(problem, members)
+    found = fit_growing(own, causes_of(members), begun.point, first_part=part, limit=limit)
     return None if found is None else Hypothesis(members, found)
