@@ -65,11 +65,21 @@ class WeighedHypotheses:
         """The likeliest."""
         return self.hypotheses[0]
 
-    def cause_sets(self, options: DiagnosisOptions) -> list[tuple[tuple[str, ...], float]]:
-        """Sets of effects with their probabilities, likeliest first, as few as hold the probability of the options."""
+    def cause_sets(
+        self, options: DiagnosisOptions, needed: Hypothesis | None = None
+    ) -> list[tuple[tuple[str, ...], float]]:
+        """Sets of effects with their probabilities, likeliest first, as few as hold the probability of the options.
+
+        Args:
+            needed: whose causes stand for those of every hypothesis that has more of them without need.
+        """
         total: dict[tuple[str, ...], float] = {}
         for e, p in zip(self.hypotheses, self.probabilities, strict=True):
-            total[e.effects] = total.get(e.effects, 0.0) + float(p)
+            effects = e.effects
+            if needed is not None and needed.members and needed.keys < e.keys:
+                gain = min(e.score - needed.score, e.fitted_score - needed.fitted_score)
+                effects = needed.effects if gain < options.verdict.needed_gain else effects
+            total[effects] = total.get(effects, 0.0) + float(p)
         out, held = [], 0.0
         for effects, p in sorted(total.items(), key=lambda item: -item[1]):
             out.append((effects, p))

@@ -136,7 +136,7 @@ def _without_remainder(
     o = problem.options
     is_noise = evidence.whiteness.p >= o.residual_tests.noise_p
     predicted = evidence.validation is not None and evidence.validation.confirms(o.validation)
-    sets = found.cause_sets(o)
+    sets = found.cause_sets(o, best)
     result = Verdict("clean", cause_sets=list(sets))
     if best.members:
         _separate(result, problem, found, best, context)
