@@ -77,8 +77,7 @@ class WeighedHypotheses:
         for e, p in zip(self.hypotheses, self.probabilities, strict=True):
             effects = e.effects
             if needed is not None and needed.members and needed.keys < e.keys:
-                gain = min(e.score - needed.score, e.fitted_score - needed.fitted_score)
-                effects = needed.effects if gain < options.verdict.needed_gain else effects
+                effects = needed.effects if e.gain_over(needed) < options.verdict.needed_gain else effects
             total[effects] = total.get(effects, 0.0) + float(p)
         out, held = [], 0.0
         for effects, p in sorted(total.items(), key=lambda item: -item[1]):

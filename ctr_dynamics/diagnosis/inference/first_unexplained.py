@@ -35,16 +35,15 @@ def search_first_unexplained(state: SearchState) -> list[Hypothesis]:
         return []
     there = SearchState(short, state.pool, start, context.within("first part"), [Hypothesis((), start)])
     fit_single_causes(there, screen(short, here, start, (), state.pool), here)
-    leading = [e for e in there.found if e.members][: problem.options.search.first_part_causes]
+    s = problem.options.search
+    leading = [e for e in there.found if e.members][: s.first_part_causes]
     found: list[Hypothesis] = []
-    for two in (
-        leading[:2],
-        leading[2:],
-    ):  # what explains everything leaves the rest to the search for its rivals
-        if two and not any(is_acceptable(problem, e.fit) for e in found):
-            context.report(f"longer parts with {', '.join(effect for e in two for effect in e.effects)}")
+    # what explains everything leaves the rest to the search for its rivals
+    for batch in (leading[: s.batch], leading[s.batch :]):
+        if batch and not any(is_acceptable(problem, e.fit) for e in found):
+            context.report(f"longer parts with {', '.join(effect for e in batch for effect in e.effects)}")
             limit = state.cost_limit
-            found += state.run_fits([delayed(_grow)(problem, e.members, e.fit, part, limit) for e in two])
+            found += state.run_fits([delayed(_grow)(problem, e.members, e.fit, part, limit) for e in batch])
     return found
 
 

@@ -60,6 +60,13 @@ class Hypothesis:
         """Free parameters of its causes."""
         return keys_of(self.members)
 
+    def gain_over(self, other: Hypothesis) -> float:
+        """Log posterior that it adds to ``other``, by all bags or by the fitted ones, whichever is less.
+
+        Bags that were not fitted can speak against a cause, but not for one that the others do not show.
+        """
+        return min(self.score - other.score, self.fitted_score - other.fitted_score)
+
     @property
     def has_impacts(self) -> bool:
         """Whether a cause strikes the robot; time steps follow that to a limited degree only."""

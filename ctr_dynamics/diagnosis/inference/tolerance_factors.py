@@ -57,9 +57,8 @@ def under_factors(
     scale = np.array([q.scale if q.key in causes else 0.0 for q in active])
     ones = np.ones(numerics.shape[1])
     factors = np.geomspace(1.0, o.widest, o.factors)
-    too_tight = (
-        o.too_tight**options.evidence.temperature
-    )  # the evidence is tempered later, and a prior is not
+    # the evidence is tempered later, and a prior is not
+    too_tight = o.too_tight**options.evidence.temperature
     priors = np.full(len(factors), too_tight / len(factors))
     priors[0] += 1.0 - too_tight
     found = []

@@ -67,16 +67,9 @@ class Evidence:
 
 
 def needed_hypothesis(hypotheses: Sequence[Hypothesis], needed_gain: float) -> Hypothesis:
-    """The first of ``hypotheses``, likeliest first, without causes that gain less than ``needed_gain`` together.
-
-    By all bags or by the fitted ones: bags that were not fitted can speak against a cause, but not for one that the others do not show.
-    """
+    """The first of ``hypotheses``, likeliest first, without causes that gain less than ``needed_gain`` together."""
     best = hypotheses[0]
-    fewer = [
-        e
-        for e in hypotheses
-        if e.keys <= best.keys and min(best.score - e.score, best.fitted_score - e.fitted_score) < needed_gain
-    ]
+    fewer = [e for e in hypotheses if e.keys <= best.keys and best.gain_over(e) < needed_gain]
     return min(fewer, key=lambda e: (len(e.members), -e.score))
 
 
