@@ -355,7 +355,9 @@ class Estimator:
         if mark is not None:
             self.innovations.discard(mark)
         elif result.ok and (
-            runs.fused.follow_delay(runs.open_loop, k) or runs.fused.follow_model_error(runs.open_loop, k)
+            runs.fused.follow_delay(runs.open_loop, k)
+            or runs.fused.follow_model_error(runs.open_loop, k)
+            or runs.fused.leave_refuted(runs.open_loop, k)
         ):
             late.history.restart(k)
         health.sweeps += result.sweeps

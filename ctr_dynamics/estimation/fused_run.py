@@ -125,6 +125,7 @@ class FusedRun:
                 )
                 self.model_error_search.add(
                     measurement.stamp_ns,
+                    seen,
                     motion.residual,
                     self._turn(quaternion, motion.quaternion),
                     update.foretold,
@@ -218,6 +219,17 @@ class FusedRun:
         self._health.model_error = found
         self.ekf.expect_model_error(found)
         self.model_error_search.begin_again()
+        self.reinitialise(open_loop, k)
+        return True
+
+    def leave_refuted(self, open_loop: OpenLoopRun, k: int) -> bool:
+        """Go on from the open-loop run at step ``k`` where that foretells measurements far better, and the estimate refutes the robot file.
+
+        Inputs that were wrong for a while have bent parameters and registration then, which are certain by now and would not come back for long.
+        """
+        if not self._health.fusing or self.late or not (self.ekf.refuted and self.model_error_search.astray):
+            return False
+        self.model_error_search.forgive()
         self.reinitialise(open_loop, k)
         return True
 

@@ -236,9 +236,10 @@ def test_actuator_jump(jump):
 
 
 @pytest.mark.parametrize(
-    ("bag", "turn", "begin", "end"), [("clean_sweep", 2.2, 1.5, 3.5), ("clean_protocol", 0.8, 6.0, 8.0)]
+    ("bag", "turn", "begin", "end", "limit"),
+    [("clean_sweep", 2.2, 1.5, 3.5, 3e-3), ("clean_protocol", 0.8, 6.0, 8.0, 5e-4)],
 )
-def test_joints_that_are_wrong_for_a_while_beside_a_tracker_that_is_not(bag, turn, begin, end):
+def test_joints_that_are_wrong_for_a_while_beside_a_tracker_that_is_not(bag, turn, begin, end, limit):
     """A tube's angle is reported too large by ``turn`` rad: the tracker contradicts the model, which is said; 2.5 s after the joints are
     right again the outputs are. An estimate of the tracker's delay that measurements have driven away must not shut out the later ones."""
 
@@ -254,9 +255,8 @@ def test_joints_that_are_wrong_for_a_while_beside_a_tracker_that_is_not(bag, tur
     since = end + 2.5
     assert all(out.valid for out, t in zip(run.outputs, run.t, strict=True) if t > since)
     error, _ = truth_error(run, bag, "p_trk", since)
-    assert (
-        np.sqrt(np.mean(np.sum(error**2, axis=1))) < 6e-3
-    )  # m; 7 and 28 mm where measurements were shut out
+    # m; 4 to 9 mm in the protocol where parameters stay that the joints have bent, 7 and 28 mm where measurements are shut out
+    assert np.sqrt(np.mean(np.sum(error**2, axis=1))) < limit
     health = run.estimator.health
     # a new start knows no tip of the time before: at 40 Hz, 12 poses lie in the 0.3 s that a latency may reach back
     assert health.dropped <= 12 * health.restarts

@@ -14,15 +14,21 @@ NONE = ModelErrorSize(0.0, 0.0, 1.0)
 WELL = -1.7  # as a filter foretells whose model is right: 3 ln(1 + 1/4) / 2 and the innovation's square
 
 
-def search(departures, turn=0.0, foretold=(-20.0, -4.0), seed=1):
-    """Positions at 40 Hz that lie ``departures`` (k, 3) m from the open-loop run, beside a filter that has ``foretold`` every one like that."""
+def moving(k):
+    """(3,) m, a tip that goes round in a circle."""
+    return 0.05 * np.array([np.cos(0.05 * k), np.sin(0.05 * k), 0.0])
+
+
+def search(departures, turn=0.0, foretold=(-20.0, -4.0), seed=1, tip=moving):
+    """Positions at 40 Hz that lie ``departures`` (k, 3) m from the open-loop ``tip``, beside a filter that has ``foretold`` every one like that."""
     rng, found = (
         np.random.default_rng(seed),
         ModelErrorSearch(NOISE, ROTATION_NOISE, LENGTH, REGISTERED, 20.0),
     )
     for k, departure_m in enumerate(departures):
         turned = np.array([turn, turn, turn]) + ROTATION_NOISE * rng.standard_normal(3)
-        found.add(25_000_000 * k, departure_m + NOISE * rng.standard_normal(3), turned, foretold)
+        residual = departure_m + NOISE * rng.standard_normal(3)
+        found.add(25_000_000 * k, tip(k) + residual, residual, turned, foretold)
     return found
 
 
@@ -99,7 +105,8 @@ def test_what_the_filter_foretells_while_it_learns_does_not_count():
     assert found.probability(NONE) < 0.02
     rng = np.random.default_rng(4)
     for k in range(16, 200):
-        found.add(25_000_000 * k, departures[k] + NOISE * rng.standard_normal(3), np.zeros(3), (WELL, WELL))
+        residual = departures[k] + NOISE * rng.standard_normal(3)
+        found.add(25_000_000 * k, moving(k) + residual, residual, np.zeros(3), (WELL, WELL))
     assert found.found(NONE) is None
 
 
@@ -110,7 +117,8 @@ def test_measurements_that_are_taken_again_count_once():
     for k, departure_m in enumerate(departures):
         turned, noise = ROTATION_NOISE * rng.standard_normal(3), NOISE * rng.standard_normal(3)
         if k >= 30:
-            twice.add(25_000_000 * k, departure_m + noise, turned, (-20.0, -4.0))
+            residual = departure_m + noise
+            twice.add(25_000_000 * k, moving(k) + residual, residual, turned, (-20.0, -4.0))
     assert twice.probability(NONE) == pytest.approx(once.probability(NONE), abs=1e-9)
 
 
@@ -126,3 +134,30 @@ def test_a_robot_that_departs_from_its_file_is_followed():
     left = left - np.array([departure(t)[0] for t in run.t[steps]])
     assert rms(left) < 0.2 * SHIFT_M * np.sqrt(3.0)
     assert run.estimator.runs.fused.ekf.model_error == error
+
+
+def test_a_filter_that_has_lost_the_robot_is_astray_within_a_second_whatever_was_before():
+    """Ten measurements of the time in which it foretells badly tell it from one that foretells well."""
+    departures = wandering(1e-3, 1.0, 440)
+    found, rng = search(departures[:400], foretold=(WELL, WELL)), np.random.default_rng(5)
+    assert not found.astray
+    taken = 0
+    while not found.astray and taken < 40:
+        residual = departures[400 + taken] + NOISE * rng.standard_normal(3)
+        position = moving(400 + taken) + residual
+        found.add(25_000_000 * (400 + taken), position, residual, np.zeros(3), (-8.0, -8.0))
+        taken += 1
+    assert 3 <= taken <= 12
+    found.forgive()
+    assert not found.astray
+
+
+def test_a_filter_that_foretells_as_it_says_is_never_astray():
+    """Beside a model that departs as far as tolerances have it, for ten minutes."""
+    assert not search(wandering(1e-3, 1.0, 24_000), foretold=(WELL, WELL)).astray
+
+
+def test_a_robot_at_rest_says_nothing_of_the_filter():
+    """Wherever the open-loop run is: a constant departure foretells a robot that rests, as the position before does."""
+    resting = search(np.full((4000, 3), 6e-3), foretold=(-8.0, -8.0), tip=lambda k: np.zeros(3))
+    assert not resting.astray

@@ -24,6 +24,7 @@ from ctr_dynamics.estimation.filter.filter_records import ModelErrorSize
 from ctr_dynamics.estimation.monitoring.delay_search import density_of_filter
 
 Floats = NDArray[np.float64]
+CONSTANT, REST = -2, -1  # rows beyond those of the departures
 
 
 @dataclass(frozen=True)
@@ -62,9 +63,11 @@ class Evidence(NamedTuple):
     """What the measurements up to ``stamp_ns`` say.
 
     Attributes:
-        level: (h + 1, 3) m, departure of the tip for every hypothesis, as known from the past; the last is constant but for jumps.
-        variance: (h + 1,) m^2, of it per axis.
-        departures: (h + 1,) logarithm of the evidence of every hypothesis; filter: of what the filter foretold.
+        level: (h + 2, 3) m, as known from the past: the tip's departure for every size and time, one that is constant but for jumps, and the
+            position itself of a robot that rests.
+        variance: (h + 2,) m^2, of it per axis.
+        departures: (h + 2,) logarithm of the evidence of each; filter: of what the filter foretold.
+        since: (h + 2,) by how much each has foretold better than filter and rest since the time that speaks most for it.
         turned: rad^2, mean square of the rotation between measurements and open-loop run, per axis; weight: of how many measurements.
     """
 
@@ -73,6 +76,7 @@ class Evidence(NamedTuple):
     variance: Floats
     departures: Floats
     filter: float
+    since: Floats
     turned: float
     weight: float
 
@@ -108,8 +112,8 @@ class ModelErrorSearch:
             np.repeat(sizes, len(options.times_s)),
             np.tile(np.array(options.times_s), count),
         )
-        self._variances = np.r_[self.sizes, registered] ** 2
-        self._rates = np.r_[1.0 / self.times, 0.0]
+        self._variances = np.r_[self.sizes, registered, length] ** 2
+        self._rates = np.r_[1.0 / self.times, 0.0, 0.0]
         self.clear()
 
     def clear(self) -> None:
@@ -118,12 +122,14 @@ class ModelErrorSearch:
         self._begin_ns = 0
         self._compared: tuple[ModelErrorSize, Floats] | None = None
 
-    def add(self, stamp_ns: int, residual: Floats, turn: Floats, foretold: tuple[float, float]) -> None:
+    def add(
+        self, stamp_ns: int, position: Floats, residual: Floats, turn: Floats, foretold: tuple[float, float]
+    ) -> None:
         """Take in a measured tip that the filter has met; one of a stamp that is known takes its place.
 
         Args:
             stamp_ns: of its header.
-            residual: (3,) m, measured minus open-loop tip. turn: (a,) rad, rotation between them about the measured axes.
+            position: (3,) m, measured. residual: (3,) m, measured minus open-loop tip. turn: (a,) rad, rotation between them about the measured axes.
             foretold: what the filter foretold; see :class:`~ctr_dynamics.estimation.filter.filter_records.Update`.
         """
         while self._evidence and self._evidence[-1].stamp_ns >= stamp_ns:
@@ -131,12 +137,15 @@ class ModelErrorSearch:
         self._compared = None
         noise, square = self._noise**2, self._variances
         angle = float(turn @ turn) / len(turn) if len(turn) else 0.0
+        observed = np.repeat(residual[None], len(square), axis=0)
+        observed[REST] = position
         if not self._evidence:
             self._begin_ns = stamp_ns
             gain = square / (square + noise)
-            level = gain[:, None] * residual
+            level = gain[:, None] * observed
             none = np.zeros(len(square))
-            self._evidence.append(Evidence(stamp_ns, level, (1.0 - gain) * square, none, 0.0, angle, 1.0))
+            variance = (1.0 - gain) * square
+            self._evidence.append(Evidence(stamp_ns, level, variance, none, 0.0, none, angle, 1.0))
             return
         # 1. The departure decays and gets new randomness.
         last, options = self._evidence[-1], self.options
@@ -144,16 +153,17 @@ class ModelErrorSearch:
         remains = np.exp(-elapsed * self._rates)
         before = remains**2 * last.variance + (1.0 - remains**2) * square
         level = remains[:, None] * last.level
-        change, total = residual - level, before + noise
+        change, total = observed - level, before + noise
         # 2. Density of the position, by that of the stated noise at zero.
         density = _log_density((change**2).sum(axis=1), total, noise)
-        # of a constant departure and one that has jumped to anywhere, the likelier goes on
+        # of what is constant and what has jumped to anywhere, the likelier goes on
         anywhere = self._reach**2 + noise
-        moved = math.log(-math.expm1(-elapsed / options.sound_s))
-        moved += _log_density(residual @ residual, anywhere, noise)
-        if moved > density[-1]:
-            density[-1], before[-1], total[-1] = moved, self._reach**2, anywhere
-            level[-1], change[-1] = 0.0, residual
+        jumps = math.log(-math.expm1(-elapsed / options.sound_s))
+        for row in (CONSTANT, REST):
+            moved = jumps + _log_density(observed[row] @ observed[row], anywhere, noise)
+            if moved > density[row]:
+                density[row], before[row], total[row] = moved, self._reach**2, anywhere
+                level[row], change[row] = 0.0, observed[row]
         own = density_of_filter(foretold, elapsed / self._change_s)
         # 3. What is known of the past counts less and less, and what the filter foretold while it learned does not count.
         decay, gain = math.exp(-elapsed / options.memory_s), before / total
@@ -168,6 +178,7 @@ class ModelErrorSearch:
                 before * (1.0 - gain),
                 decay * last.departures + density,
                 decay * last.filter + own,
+                np.maximum(last.since + density - max(own, density[REST]), 0.0),
                 last.turned + (angle - last.turned) / weight,
                 weight,
             )
@@ -199,8 +210,8 @@ class ModelErrorSearch:
         if not tried.any():
             return none
         prior = math.log(options.prior / len(self.sizes))
-        likely = np.where(tried, last.departures[:-1] + prior, -np.inf)
-        file_right = np.logaddexp(last.filter, last.departures[-1])
+        likely = np.where(tried, last.departures[:CONSTANT] + prior, -np.inf)
+        file_right = np.logaddexp(last.filter, last.departures[CONSTANT])
         most = max(file_right, float(likely.max()))
         weights: Floats = np.exp(likely - most)
         return weights / (weights.sum() + math.exp(file_right - most))
@@ -217,12 +228,32 @@ class ModelErrorSearch:
         rotation = max(math.sqrt(max(turned, 0.0)), present.rotation)
         return ModelErrorSize(float(self.sizes[best]), rotation, float(self.times[best]))
 
+    @property
+    def astray(self) -> bool:
+        """Whether the filter has foretold the motion far worse than the open-loop run with one of the departures, since whenever that began.
+
+        That is a CUSUM of the logarithm of their densities' ratio (Page 1954). Its mean time between false alarms is at least the odds, in
+        measurements (Lorden 1971).
+        """
+        if not self._evidence:
+            return False
+        options, since = self.options, self._evidence[-1].since
+        odds = options.believed / (1.0 - options.believed) / options.prior
+        return float(since.max()) > math.log(odds * len(since))
+
+    def forgive(self) -> None:
+        """The filter goes on from the open-loop run; how it has foretold before is no sign of how it will."""
+        if self._evidence:
+            last = self._evidence.pop()
+            self._evidence.append(last._replace(since=np.zeros_like(last.since)))
+
     def begin_again(self) -> None:
         """The filter goes on from the open-loop run with the model error that was found, and foretells as well as that has done."""
+        self.forgive()
         if self._evidence:
             self._compared = None
             last = self._evidence.pop()
-            self._evidence.append(last._replace(filter=float(max(last.filter, last.departures.max()))))
+            self._evidence.append(last._replace(filter=float(max(last.filter, last.departures[:REST].max()))))
 
 
 def _log_density(square: Any, variance: Any, noise: float) -> Any:
