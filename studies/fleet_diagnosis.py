@@ -9,6 +9,8 @@ all tubes turn. One is fitted, the other only predicted. Each robot has its turn
 - ``clean``: nothing is hidden.
 - ``single``: one effect of the catalogue, of 1 to 3 plausible sizes.
 - ``many``: every tolerance is 2.5 times too tight, and no effect is hidden.
+- ``pair``: two effects of the catalogue, each of 1 to 3 plausible sizes.
+- ``outside``: someone pushes the tip three times, which nothing in the catalogue is.
 
 Each outcome is one line of the output; a run that is stopped goes on where it was.
 """
@@ -20,12 +22,13 @@ import json
 import math
 import tempfile
 import time
+from collections.abc import Container
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ctr_dynamics.benchmarks.fleet import record, scenario_for
+from ctr_dynamics.benchmarks.fleet import TURN_S, record, scenario_for
 from ctr_dynamics.benchmarks.fleet_robots import FLEET, Draw, drawn, fleet_robot, seed_of
 from ctr_dynamics.diagnosis.inference.candidates import candidates
 from ctr_dynamics.diagnosis.output.findings import findings
@@ -33,15 +36,23 @@ from ctr_dynamics.diagnosis.pipeline import diagnose_recordings
 from ctr_dynamics.diagnosis.recording import read_recording
 from ctr_dynamics.diagnosis.run_context import RunContext
 from ctr_dynamics.effects import effect_quantities
+from ctr_dynamics.estimation.filter.parameter_priors import tip_compliance
 from ctr_dynamics.robot import Robot
 from ctr_dynamics.robot_files import robot_from_dict, robot_to_dict
+from ctr_dynamics.simulation.scenario import Load, Scenario
 from studies.diagnosis_study import fraction, named_effects, true_separations
 
-STRATA = ("clean", "single", "many")
+STRATA = ("clean", "single", "many", "pair", "outside")
+HIDDEN = {"single": 1, "pair": 2}  # effects of the catalogue
 FIT_S, HELD_OUT_S = 8.0, 5.0  # the bags' lengths
 SIZES = (1.0, 3.0)  # of a hidden effect, in plausible departures
 TOO_TIGHT = 2.5  # true deviations by those of the file, where many are too tight
 CLEAR = 8.0  # separation from the nearest rival, in standard deviations, that shows plainly
+PUSHES, PUSH_S, PUSHED = (
+    3,
+    (0.2, 0.6),
+    (0.02, 0.05),
+)  # number, length of each, and deflection by the exposed length
 NOT_SHOWN = {"contact", "tip_spring", "insertion_velocity"}  # need a place in reach, or translations
 KEPT = ("verdict", "causes", "cause_set95", "probabilities", "residual", "numerics", "seconds")
 
@@ -61,9 +72,12 @@ def loosened(robot: Robot, factor: float) -> Robot:
     return robot_from_dict(walk(robot_to_dict(robot)))
 
 
-def hidden_effect(robot: Robot, rng: np.random.Generator) -> dict[str, dict[str, float]]:
-    """One effect of the catalogue with its parameters, of a size that is plausible for ``robot``."""
+def hidden_effect(
+    robot: Robot, rng: np.random.Generator, besides: Container[str] = ()
+) -> dict[str, dict[str, float]]:
+    """One effect of the catalogue with its parameters, of a size that is plausible for ``robot``; none of those ``besides``."""
     pool = [c for c in candidates(effect_quantities(robot), np.zeros((1, 3))) if c.effect not in NOT_SHOWN]
+    pool = [c for c in pool if c.effect not in besides]
     effects = sorted({c.effect for c in pool})
     name = effects[int(rng.integers(len(effects)))]
     forms = [c for c in pool if c.effect == name]
@@ -79,17 +93,37 @@ def hidden_effect(robot: Robot, rng: np.random.Generator) -> dict[str, dict[str,
     return {name: {key: float(value) for key, value in values.items() if math.isfinite(value)}}
 
 
+def pushed(scenario: Scenario, robot: Robot, rng: np.random.Generator) -> Scenario:
+    """``scenario`` with pushes at the tip that its bag does not tell of, while the tubes turn."""
+    most = robot.exposed_length / tip_compliance(robot)
+    loads = list(scenario.loads)
+    for _ in range(PUSHES):
+        direction = rng.standard_normal(3)
+        size = rng.uniform(*PUSHED) * most / np.linalg.norm(direction)
+        begin, length = rng.uniform(TURN_S, scenario.duration_s - 1.0), rng.uniform(*PUSH_S)
+        loads.append(
+            Load(
+                start_s=begin, end_s=begin + length, rise_s=0.1, fall_s=0.1, force_N=(size * direction).tolist(), known=False,
+            )
+        )  # fmt: skip
+    return scenario.model_copy(update={"loads": loads})
+
+
 def run_case(name: str, lab: bool, stratum: str, number: int) -> dict[str, Any]:
     """Make a case and diagnose it."""
     robot = fleet_robot(name, lab)
     rng = np.random.default_rng([number, seed_of(name), int(lab), STRATA.index(stratum)])
     draw = drawn(loosened(robot, TOO_TIGHT) if stratum == "many" else robot, rng)
-    hidden = hidden_effect(robot, rng) if stratum == "single" else {}
+    hidden: dict[str, dict[str, float]] = {}
+    for _ in range(HIDDEN.get(stratum, 0)):
+        hidden |= hidden_effect(robot, rng, hidden)
     true = Draw(robot_from_dict({**robot_to_dict(draw.robot), "extensions": hidden}), draw.offsets)
     with tempfile.TemporaryDirectory() as folder:
         recordings = []
         for duration_s in (FIT_S, HELD_OUT_S):
             scenario = scenario_for(robot, int(rng.integers(2**31)), duration_s)
+            if stratum == "outside":
+                scenario = pushed(scenario, robot, rng)
             bag = Path(folder) / f"{duration_s:g}.mcap"
             record(robot, true, scenario, bag)
             recordings.append(read_recording(bag, robot))
@@ -117,22 +151,32 @@ def run_case(name: str, lab: bool, stratum: str, number: int) -> dict[str, Any]:
 
 def table(rows: list[dict[str, Any]]) -> str:
     """Outcomes by robot, and over all, as Markdown."""
-    lines = ["| robot | clean called clean | clear singles: likeliest is right | in the set of 95 % "
-             "| all singles in the set | many small: no wrong name above 0.5 | many small called tolerances | median, longest diagnosis |",
-             "|" + "---|" * 8]  # fmt: skip
-    for robot in (*sorted({r["robot"] for r in rows}), "all"):
-        own = [r for r in rows if robot in (r["robot"], "all")]
-        single = [r for r in own if r["stratum"] == "single"]
-        clear = [r for r in single if r["separations"] and min(r["separations"].values()) >= CLEAR]
+
+    def cells(own: list[dict[str, Any]]) -> dict[str, str]:
+        by = {stratum: [r for r in own if r["stratum"] == stratum] for stratum in STRATA}
+        clear = [r for r in by["single"] if r["separations"] and min(r["separations"].values()) >= CLEAR]
         seconds = sorted(r["cpu_s"] for r in own)
-        lines.append(
-            f"| {robot} | {fraction(r['verdict'] == 'clean' for r in own if r['stratum'] == 'clean')} "
-            f"| {fraction(truth_of(r) == r['probabilities'][0]['effects'] for r in clear)} "
-            f"| {fraction(in_set(r) for r in clear)} | {fraction(in_set(r) for r in single)} "
-            f"| {fraction(not wrongly_named(r) for r in own if r['stratum'] == 'many')} "
-            f"| {fraction(r['verdict'] == 'tolerances' for r in own if r['stratum'] == 'many')} "
-            f"| {seconds[len(seconds) // 2]:.0f} s, {seconds[-1]:.0f} s |"
-        )
+        return {
+            "clean: called clean": fraction(r["verdict"] == "clean" for r in by["clean"]),
+            "clear singles: likeliest is right": fraction(
+                truth_of(r) == r["probabilities"][0]["effects"] for r in clear
+            ),
+            "in the set of 95 %": fraction(in_set(r) for r in clear),
+            "all singles in the set": fraction(in_set(r) for r in by["single"]),
+            "pairs in the set": fraction(in_set(r) for r in by["pair"]),
+            "outside: unknown": fraction(is_unknown(r) for r in by["outside"]),
+            "no wrong name above 0.5": fraction(not wrongly_named(r) for r in by["outside"]),
+            "many small: tolerances": fraction(r["verdict"] == "tolerances" for r in by["many"]),
+            "no wrong name above 0.5 ": fraction(not wrongly_named(r) for r in by["many"]),
+            "median, longest diagnosis": f"{seconds[len(seconds) // 2]:.0f} s, {seconds[-1]:.0f} s",
+        }
+
+    lines = []
+    for robot in (*sorted({r["robot"] for r in rows}), "all"):
+        found = cells([r for r in rows if robot in (r["robot"], "all")])
+        if not lines:
+            lines += ["| robot | " + " | ".join(found) + " |", "|" + "---|" * (len(found) + 1)]
+        lines.append(f"| {robot} | " + " | ".join(found.values()) + " |")
     return "\n".join(lines)
 
 
@@ -144,6 +188,11 @@ def truth_of(row: dict[str, Any]) -> list[str]:
 def in_set(row: dict[str, Any]) -> bool:
     """Whether what was hidden is among the listed sets of causes."""
     return truth_of(row) in [sorted(s) for s in row["cause_set95"]]
+
+
+def is_unknown(row: dict[str, Any]) -> bool:
+    """Whether it is said that something outside the catalogue is there."""
+    return row["verdict"] == "unknown" or "unknown" in named_effects(row)
 
 
 def wrongly_named(row: dict[str, Any]) -> bool:
@@ -158,6 +207,7 @@ def main() -> None:
     parser.add_argument("--cases", type=int, default=4, help="of each stratum, robot and kind of tolerances")
     parser.add_argument("--first", type=int, default=0, help="number of the first case")
     parser.add_argument("--robots", default=",".join(FLEET))
+    parser.add_argument("--strata", default=",".join(STRATA))
     parser.add_argument("--table", action="store_true", help="print the table, and run nothing")
     options = parser.parse_args()
     rows = (
@@ -168,7 +218,7 @@ def main() -> None:
     done = {(r["robot"], r["lab"], r["stratum"], r["number"]) for r in rows}
     for number in range(options.first, options.first + (0 if options.table else options.cases)):
         for lab in (True, False):
-            for stratum in STRATA:
+            for stratum in options.strata.split(","):
                 for robot in options.robots.split(","):
                     if (robot, lab, stratum, number) in done:
                         continue
