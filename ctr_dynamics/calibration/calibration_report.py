@@ -32,6 +32,9 @@ def lines(found: Calibration) -> list[str]:
     return out
 
 
+PARAMETERS_INSIDE = "The given tracker.delay_s, lever_arm_m, mount and registration parameters are part of this file: do not give them with it."
+
+
 def robot_text(found: Calibration, with_parameters: bool) -> str:
     """Text of the new robot file. ``with_parameters``: whether parameters of the tracker have become part of it."""
     head = [
@@ -40,7 +43,5 @@ def robot_text(found: Calibration, with_parameters: bool) -> str:
         f"Held-out tips after: {found.after.text()}",
     ]
     if with_parameters:
-        head.append(
-            "The given tracker.delay_s, lever_arm_m, mount and registration parameters are part of this file: do not give them with it."
-        )
+        head.append(PARAMETERS_INSIDE)
     return "".join(f"# {line}\n" for line in head) + robot_to_yaml(found.robot)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import Annotated
 
@@ -45,7 +46,7 @@ def calibrate(
     tolerance and moves the static tip, and the lag of a bag's tracker. Exit code 1 when the held-out error
     has not become smaller.
     """
-    from ctr_dynamics.calibration.calibration_report import lines, robot_text
+    from ctr_dynamics.calibration.calibration_report import PARAMETERS_INSIDE, lines, robot_text
     from ctr_dynamics.calibration.reading import mount_of
     from ctr_dynamics.calibration.robot_calibration import calibrate as calibrate_robot
 
@@ -62,4 +63,6 @@ def calibrate(
     with atomic_file(output) as temporary:
         temporary.write_text(robot_text(found, read.robot != read.file), encoding="utf-8")
     print(f"output  {output}")
+    if read.robot != read.file:
+        print(f"ctr-dynamics: note: {output}: {PARAMETERS_INSIDE}", file=sys.stderr)
     return 0 if found.after.rms < found.before.rms else 1

@@ -171,13 +171,16 @@ def test_statics_measured_on_a_table(robot, true, tmp_path, capsys):
 def test_calibrate_a_table_by_the_command(robot, true, tmp_path, capsys):
     (tmp_path / "r.yaml").write_text(robot_to_yaml(robot))
     write_table(tmp_path / "poses.csv", tips_of(true, noise=NOISE), oriented=False)
-    code = main(
-        ["calibrate", str(tmp_path / "poses.csv"), "--robot", str(tmp_path / "r.yaml"), "--output", str(tmp_path / "n.yaml")]
-    )  # fmt: skip
-    assert code == 0
+    arguments = ["--robot", str(tmp_path / "r.yaml"), "--output", str(tmp_path / "n.yaml")]
+    assert main(["calibrate", str(tmp_path / "poses.csv"), *arguments]) == 0
     curve = load_robot(tmp_path / "n.yaml").tubes[0].precurvature[-1].curvature.array
     assert np.allclose(curve, SCALE * robot.tubes[0].precurvature[-1].curvature.array, rtol=0.02)
-    assert "held out       80" in capsys.readouterr().out
+    shown = capsys.readouterr()
+    assert "held out       80" in shown.out
+    assert not shown.err
+    moved = "tracker.registration_translation_m=0,0,1e-5"
+    assert main(["calibrate", str(tmp_path / "poses.csv"), *arguments, "--set", moved]) == 0
+    assert "do not give them with it" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
