@@ -125,9 +125,11 @@ def _separation_with(
     departure = np.array(
         [(v - q.off) / q.scale if q.key in keys else 0.0 for q, v in zip(fit.active, fit.values, strict=True)]
     )
-    wide = {q.key for q in fit.causes} - keys
+    wide = {q.key for q in fit.causes}
     widths = np.array(
         [math.sqrt(prior_variance(q, q.key in wide, fit.tolerance_factor)) / q.scale for q in fit.active]
     )
-    J = np.hstack([everything * widths, against])
+    others = np.array([q.key not in keys for q in fit.active])
+    numerics = np.vstack([problem.numerics, np.zeros((len(columns), problem.numerics.shape[1]))])
+    J = np.hstack([(everything * widths)[:, others], against, numerics])
     return float(left_over(J, (everything @ departure)[:, None])[0])

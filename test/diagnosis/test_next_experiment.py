@@ -1,0 +1,62 @@
+"""What a proposed experiment is worth: the same separation as that of the bags at hand, with rows that it adds."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from ctr_dynamics.diagnosis import next_experiment
+from ctr_dynamics.diagnosis.diagnosis_options import DiagnosisOptions
+from ctr_dynamics.diagnosis.inference.candidates import candidates
+from ctr_dynamics.diagnosis.inference.separation import separation
+from ctr_dynamics.effects import effect_quantities
+from ctr_dynamics.robot_files import load_robot
+from ctr_dynamics.simulation.scenario import load_scenario
+
+TISSUE = load_robot("till2020_tissue")
+ROWS = 60
+
+
+@pytest.fixture
+def case(monkeypatch):
+    """A payload and a stiffness inside its tolerance, fitted to random columns; density is the rival. ``added`` are the rows of the experiment."""
+    rng = np.random.default_rng(1)
+    pool = candidates(effect_quantities(TISSUE), np.zeros((1, 3)))
+    own, rival = (next(c for c in pool if c.effect == name) for name in ("payload_mass", "density"))
+    stiffness = next(q for q in effect_quantities(TISSUE) if q.effect == "youngs_modulus" and q.tolerance > 0)
+    active = (*own.quantities, stiffness)
+    fit = SimpleNamespace(
+        active=active, causes=own.quantities, values=np.array([2.0 * own.quantities[0].scale, 1.0]), tolerance_factor=1.0,
+        columns=3e3 * rng.normal(size=(ROWS, 2)), point={},
+    )  # fmt: skip
+    sensitivities = SimpleNamespace(by_candidate={rival: 30.0 * rng.normal(size=(ROWS, 1))})
+    problem = SimpleNamespace(
+        robot=TISSUE, options=DiagnosisOptions(), numerics=rng.normal(size=(ROWS, 1)), whiteners=[SimpleNamespace(mask=None)],
+        forward_models=[SimpleNamespace(options=None)],
+    )  # fmt: skip
+    made = SimpleNamespace(added=np.zeros((ROWS, 3)))
+    scales = np.array([q.scale for q in (*active, *rival.quantities)])
+    model = SimpleNamespace(
+        jacobian=lambda point, of: (SimpleNamespace(failure=""), made.added * scales)  # by coordinates
+    )
+    monkeypatch.setattr(next_experiment, "ForwardModel", lambda *given: model)
+    monkeypatch.setattr(next_experiment, "with_chosen_steps", lambda model, *given: model)
+    monkeypatch.setattr(next_experiment, "Whitener", lambda *given: lambda rows: rows)
+    made.before = separation(problem, fit, (own,), rival, sensitivities)
+    made.after = lambda: next_experiment._separation_with(
+        load_scenario("turns"), problem, fit, sensitivities, (own, rival)
+    )
+    return made
+
+
+def test_an_experiment_that_shows_nothing_changes_nothing(case):
+    assert case.before > 1.0
+    assert case.after() == pytest.approx(case.before, rel=1e-9)
+
+
+def test_more_data_never_tell_less(case):
+    """However much of the cause its own tolerance would explain."""
+    rng = np.random.default_rng(2)
+    for size in (0.1, 1.0, 10.0):
+        case.added = size * rng.normal(size=(ROWS, 3))
+        assert case.after() > case.before
