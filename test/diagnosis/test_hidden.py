@@ -103,7 +103,10 @@ def test_findings_are_plain_json_without_nan_and_files_are_there(outcomes):
         assert stored["verdict"] == findings["verdict"]
         for key in ("extended_robot", "recalibrated_robot"):
             assert (folder / stored[key]).is_file()
-        assert "<script src" not in (folder / "report.html").read_text()
+        report = (folder / "report.html").read_text()
+        assert "<script src" not in report
+        assert "mathdefault" not in report  # ticks of an axis as TeX that nobody typesets
+        assert ">nominal<" in report
 
 
 def test_extended_robot_predicts_better_through_the_same_door(outcomes):

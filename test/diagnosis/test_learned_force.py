@@ -20,7 +20,7 @@ from ctr_dynamics.diagnosis.output.robot_export import robot_with
 from ctr_dynamics.diagnosis.recording import read_recording
 from ctr_dynamics.diagnosis.run_context import RunContext
 from ctr_dynamics.diagnosis.verdict.residual_tests import rms
-from ctr_dynamics.diagnosis.verdict.validation import Validation
+from ctr_dynamics.diagnosis.verdict.validation import BagErrors, Validation
 from ctr_dynamics.diagnosis.whitening import noise_floor
 
 STEP_S = 2.5e-3
@@ -76,6 +76,8 @@ def test_hidden_force_is_learned(tmp_path, robot):
     ],
 )
 def test_a_force_that_does_not_predict_is_not_kept(interval, bags, said):
-    found = rejection(Validation(1e-3, 1e-3, 0.4, interval, 1.0, 1.0, bags), "other bags")
+    found = rejection(
+        Validation(1e-3, 1e-3, 0.4, interval, 1.0, 1.0, [BagErrors(*bag) for bag in bags]), "other bags"
+    )
     assert said in found if said else not found
     assert "cannot be simulated" in rejection(None, "other bags")

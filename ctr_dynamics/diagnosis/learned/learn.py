@@ -125,7 +125,7 @@ def rejection(gain: Validation | None, held_out: str) -> str:
     low, high = gain.interval
     if not low > 0.0:
         return f"a learned force does not predict {held_out}: gain {gain.gain:.2f} [{low:.2f}, {high:.2f}]"
-    worse = [name for name, before, after in gain.bags if after > before]
+    worse = [bag.name for bag in gain.bags if bag.extended > bag.recalibrated]
     return f"a learned force makes the prediction of {', '.join(worse)} worse" if worse else ""
 
 

@@ -16,6 +16,7 @@ from ctr_dynamics.diagnosis.inference.candidates import Candidate
 from ctr_dynamics.diagnosis.inference.map_fit import Fit
 from ctr_dynamics.diagnosis.inference.tolerance_evidence import WiderTolerance
 from ctr_dynamics.diagnosis.learned.dictionary import EFFECT
+from ctr_dynamics.diagnosis.output.cause_text import cause_text
 from ctr_dynamics.diagnosis.output.robot_export import robot_with
 from ctr_dynamics.diagnosis.verdict.residual_tests import rms
 from ctr_dynamics.diagnosis.verdict.separability import Cause
@@ -103,10 +104,12 @@ def findings(diagnosis: Diagnosis, command: str, experiment: dict[str, Any] | No
             "validation": None
             if v is None
             else {
+                "rms_nominal_m": v.rms_nominal,
                 "rms_recalibrated_m": v.rms_recalibrated,
                 "rms_extended_m": v.rms_extended,
                 "gain": v.gain,
                 "ci95": list(v.interval),
+                "gain_over_nominal": v.gain_over_nominal,
                 "nis_before": v.nis_before,
                 "nis_after": v.nis_after,
             },
@@ -151,6 +154,7 @@ def _cause(d: Diagnosis, cause: Cause) -> dict[str, Any]:
         "probability": cause.probability,
         "separation": cause.separation,
         "not_separable_from": cause.rivals,
+        "text": cause_text(d.robot, cause.effect, values),
     }
 
 

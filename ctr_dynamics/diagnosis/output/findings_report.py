@@ -23,6 +23,7 @@ from ctr_dynamics.reporting.page import Page
 
 Floats = NDArray[np.float64]
 AXES = "xyz"
+NOMINAL = "#8250df"
 
 
 def write_report(path: Path, diagnosis: Diagnosis, content: dict[str, Any]) -> None:
@@ -55,9 +56,12 @@ def write_report(path: Path, diagnosis: Diagnosis, content: dict[str, Any]) -> N
 
 
 def _traces(page: Page, d: Diagnosis) -> None:
-    for recording, left, rest in zip(d.recordings, d.residual_recalibrated, d.residual_extended, strict=True):
+    assert d.problem is not None
+    nominal = d.problem.residuals({})
+    models = zip(d.recordings, nominal, d.residual_recalibrated, d.residual_extended, strict=True)
+    for recording, first, left, rest in models:
         t = recording.stamps
-        before, after = (recording.position - r[:, :3] for r in (left, rest))
+        as_in_file, before, after = (recording.position - r[:, :3] for r in (first, left, rest))
         band = np.full(len(t), 2e3 * noise_floor(d.robot) / np.sqrt(3.0))
         page.heading(f"Measured and simulated: {recording.name}")
         panels, errors = [], []
@@ -65,6 +69,7 @@ def _traces(page: Page, d: Diagnosis) -> None:
             panels.append(
                 Panel(f"{axis} (mm)")
                 .line(t, 1e3 * recording.position[:, i], "tracker", "tracker", dots=True)
+                .line(t, 1e3 * as_in_file[:, i], "nominal", NOMINAL)
                 .line(t, 1e3 * before[:, i], "re-calibrated", "open_loop")
                 .line(t, 1e3 * after[:, i], "extended", "fused", band=band)
             )
@@ -84,7 +89,7 @@ def _traces(page: Page, d: Diagnosis) -> None:
             _loops(recording.joints, t, left, rest),
             "Residual length over each tube's angle: loops point to friction and backlash.",
         )
-        page.figure(_envelope(t, left, rest), "Residual length, averaged over half a second.")
+        page.figure(_envelope(t, first, left, rest), "Residual length, averaged over half a second.")
 
 
 def _unexplained(page: Page, d: Diagnosis) -> None:
@@ -134,17 +139,24 @@ def _loops(joints: Floats, t: Floats, left: Floats, rest: Floats):  # type: igno
         ax.set_xlabel(f"tube {i + 1} angle (deg)")
         ax.set_ylabel("residual (mm)")
         ax.grid(alpha=0.25)
-    axes[0].legend(fontsize=8, frameon=False)
+    figure.legend(
+        *axes[0].get_legend_handles_labels(), fontsize=8, frameon=False, ncols=2, loc="outside upper right"
+    )
     return to_svg(figure)
 
 
-def _envelope(t: Floats, left: Floats, rest: Floats):  # type: ignore[no-untyped-def]
+def _envelope(t: Floats, nominal: Floats, left: Floats, rest: Floats):  # type: ignore[no-untyped-def]
     block = np.floor(t / 0.5).astype(int)
     groups = np.unique(block, return_inverse=True)[1]
     panel = Panel("residual (mm)", log=True)
     count = np.bincount(groups)
     centre = np.bincount(groups, t) / count
-    for values, label, colour in ((left, "re-calibrated", "open_loop"), (rest, "extended", "fused")):
+    models = (
+        (nominal, "nominal", NOMINAL),
+        (left, "re-calibrated", "open_loop"),
+        (rest, "extended", "fused"),
+    )
+    for values, label, colour in models:
         squares = np.bincount(groups, np.sum(values[:, :3] ** 2, axis=1)) / count
         panel.line(centre, 1e3 * np.sqrt(squares), label, colour)
     return figure_svg([panel])
@@ -155,7 +167,12 @@ def _evidence(page: Page, d: Diagnosis) -> None:
         return
     page.heading("Evidence")
     most = d.options.report.shown
-    shown = d.search.hypotheses[:most]
+    # likeliest first; of those that have no probability left, those that explain most
+    ranked = sorted(
+        zip(d.search.probabilities, d.search.hypotheses, strict=True),
+        key=lambda x: (-round(x[0], 3), -x[1].score),
+    )
+    probabilities, shown = zip(*ranked[:most], strict=True)
     no_cause = next(e for e in d.search.hypotheses if not e.members)
     labels = [" + ".join(c.label for c in e.members) or "no cause" for e in shown]
     values = [max(e.score - no_cause.score, -5.0) for e in shown]
@@ -165,12 +182,13 @@ def _evidence(page: Page, d: Diagnosis) -> None:
     ax.set_yticks(range(len(shown)), labels, fontsize=8)
     ax.invert_yaxis()
     ax.set_xscale("symlog", linthresh=5)
+    ax.xaxis.set_major_formatter("{x:g}")
     ax.set_xlabel("log posterior over that of no cause")
     ax.grid(axis="x", alpha=0.25)
     page.figure(to_svg(figure), "Hypotheses that were fitted in full.")
     rows = [
         (label, f"{p:.3f}", f"{e.fit.chi2 / max(d.problem.size, 1):.3f}" if d.problem else "-")
-        for label, p, e in zip(labels, d.search.probabilities, shown, strict=False)
+        for label, p, e in zip(labels, probabilities, shown, strict=True)
     ]
     page.table(rows, ("hypothesis", "probability", "squares over noise"))
     linear = [(s.candidate.label, s.gain) for s in d.search.screened[:most] if np.isfinite(s.gain)]
@@ -195,12 +213,12 @@ def _rivals(page: Page, d: Diagnosis) -> None:
                 k = names.index(rival.effect)
                 value = separation(d.problem, best.fit, (member,), rival, d.sensitivities)
                 table[i, k] = np.nanmin([table[i, k], value])
-    figure = Figure(figsize=(10, 1.8 + 0.3 * len(members)), layout="constrained")
+    figure = Figure(figsize=(10, 2.6 + 0.3 * len(members)), layout="constrained")
     ax = figure.subplots()
     image = ax.imshow(np.log10(np.maximum(table, 0.1)), aspect="auto", cmap="viridis")
     ax.set_xticks(range(len(names)), names, rotation=90, fontsize=7)
     ax.set_yticks(range(len(members)), [m.label for m in members], fontsize=8)
-    figure.colorbar(image, ax=ax, label="log10 of separation")
+    figure.colorbar(image, ax=ax).set_label("log10 of separation", fontsize=8)
     page.heading("What these data cannot tell apart")
     page.figure(
         to_svg(figure),
@@ -216,14 +234,21 @@ def _validation(page: Page, d: Diagnosis) -> None:
     figure = Figure(figsize=(10, 2.2), layout="constrained")
     ax = figure.subplots()
     x = np.arange(len(v.bags))
-    ax.bar(x - 0.2, [1e3 * b[1] for b in v.bags], 0.4, label="re-calibrated", color="#0969da")
-    ax.bar(x + 0.2, [1e3 * b[2] for b in v.bags], 0.4, label="extended", color="#cf222e")
+    for shift, label, colour in (
+        (-0.27, "nominal", NOMINAL),
+        (0.0, "recalibrated", "#0969da"),
+        (0.27, "extended", "#cf222e"),
+    ):
+        heights = [1e3 * getattr(bag, label) for bag in v.bags]
+        ax.bar(x + shift, heights, 0.27, label=label.replace("recal", "re-cal"), color=colour)
     ax.axhline(1e3 * noise_floor(d.robot), color="#bf8700", ls="--", label="noise floor")
-    ax.set_xticks(x, [b[0] for b in v.bags])
+    ax.set_xticks(x, [bag.name for bag in v.bags])
     ax.set_ylabel("rms (mm)")
-    ax.legend(fontsize=8, frameon=False)
+    ax.legend(fontsize=8, frameon=False, loc="upper left", bbox_to_anchor=(1.0, 1.0))
+    over = f" Over the nominal model {v.gain_over_nominal:.3f}." if np.isfinite(v.gain_over_nominal) else ""
     page.figure(
-        to_svg(figure), f"Gain {v.gain:.3f}, 95 % interval {v.interval[0]:.3f} to {v.interval[1]:.3f}."
+        to_svg(figure),
+        f"Gain over the re-calibrated model {v.gain:.3f}, 95 % interval {v.interval[0]:.3f} to {v.interval[1]:.3f}.{over}",
     )
     page.table([("NIS per degree of freedom", v.nis_before, v.nis_after)], ("", "re-calibrated", "extended"))
 
@@ -245,7 +270,9 @@ def _whiteness(page: Page, d: Diagnosis, recalibrated: Fit, extended: Fit) -> No
     left.axhspan(-bound, bound, color="#8c959f", alpha=0.3)
     left.set_xlabel("lag (samples)")
     left.set_ylabel("autocorrelation")
-    left.legend(fontsize=8, frameon=False)
+    figure.legend(
+        *left.get_legend_handles_labels(), fontsize=8, frameon=False, ncols=2, loc="outside upper right"
+    )
     right.plot([0, right.get_xlim()[1]], [0, 1], color="#8c959f", ls="--")
     right.set_xlabel("frequency (Hz)")
     right.set_ylabel("cumulative periodogram, y")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from ctr_dynamics.diagnosis.output.cause_text import shown
 from ctr_dynamics.effects import EFFECTS
 
 VERDICTS = {
@@ -15,22 +16,6 @@ VERDICTS = {
     "not_excited": "These bags hardly move the robot: they cannot show what is wrong.",
     "tolerances": "No cause is needed, but values of the robot scatter more than the tolerances of the robot file say.",
 }
-# Units for people: factor and text.
-SHOWN = {
-    "kg": (1e3, "g"),
-    "m": (1e3, "mm"),
-    "s": (1e3, "ms"),
-    "rad": (57.29577951, "deg"),
-    "m/s": (1e3, "mm/s"),
-}
-
-
-def shown(value: float | None, unit: str) -> str:
-    """A value with a unit for people."""
-    if value is None:
-        return "-"
-    factor, text = SHOWN.get(unit, (1.0, "" if unit == "1" else unit))
-    return f"{value * factor:.4g}{' ' + text if text else ''}"
 
 
 def cause(entry: dict[str, Any]) -> str:
@@ -38,18 +23,8 @@ def cause(entry: dict[str, Any]) -> str:
     effect = entry["effect"]
     if effect == "unknown":
         return "Cause: outside the catalogue."
-    parts = []
-    for name, p in entry["parameters"].items():
-        if isinstance(p["value"], str):
-            parts.append(p["value"])
-            continue
-        low, high = p["ci90"]
-        parts.append(
-            f"{name} {shown(p['value'], p['unit'])} [{shown(low, p['unit'])}, {shown(high, p['unit'])}], robot file {shown(p['nominal'], p['unit'])}"
-        )
-    sentence = f"Cause: {effect.replace('_', ' ')}, {'; '.join(parts)}" + (
-        f"; probability {entry['probability']:.2f}." if entry["probability"] is not None else "."
-    )
+    sentence = f"Cause: {entry['text']}"
+    sentence += f"; probability {entry['probability']:.2f}." if entry["probability"] is not None else "."
     if entry["not_separable_from"]:
         sentence += (
             f" Not separable from: {', '.join(x.replace('_', ' ') for x in entry['not_separable_from'])}."
@@ -82,8 +57,9 @@ def summary(content: dict[str, Any]) -> list[str]:
     v = content["validation"]
     if v is not None:
         lines.append(
-            f"On bags that were not fitted: {_mm(v['rms_recalibrated_m'])} -> {_mm(v['rms_extended_m'])}, "
-            f"gain {v['gain']:.3f} [{v['ci95'][0]:.3f}, {v['ci95'][1]:.3f}]."
+            f"On bags that were not fitted: nominal {_mm(v['rms_nominal_m'])}, re-calibrated {_mm(v['rms_recalibrated_m'])}, "
+            f"extended {_mm(v['rms_extended_m'])}; gain over re-calibrated {v['gain']:.3f} (95 % interval {v['ci95'][0]:.3f} to "
+            f"{v['ci95'][1]:.3f}){_over_nominal(v)}."
         )
     force = content["learned"]
     if force is not None:
@@ -106,6 +82,11 @@ def summary(content: dict[str, Any]) -> list[str]:
             worth = f" (separation {e['separation_before']:.1f} -> {e['separation_after']:.1f})"
         lines.append(f"Next experiment: {e['description']}{worth}; scenario in {e['scenario_file']}.")
     return lines
+
+
+def _over_nominal(validation: dict[str, Any]) -> str:
+    gain = validation["gain_over_nominal"]
+    return "" if gain is None else f", over nominal {gain:.3f}"
 
 
 def _mm(value: float | None) -> str:

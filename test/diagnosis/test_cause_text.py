@@ -1,0 +1,76 @@
+"""Sentences of causes: part, value, what the file has, change, interval and its level."""
+
+import pytest
+
+from ctr_dynamics.diagnosis.output.cause_text import cause_text
+from ctr_dynamics.effects import effect_quantities
+from ctr_dynamics.robot_files import load_robot
+
+TISSUE = load_robot("till2020_tissue")
+
+
+def entry(value, low, high, unit, nominal):
+    return {"value": value, "ci90": [low, high], "unit": unit, "nominal": nominal}
+
+
+@pytest.mark.parametrize(
+    ("effect", "parameters", "text"),
+    [
+        (
+            "youngs_modulus",
+            {"tube2.scale": entry(0.92, 0.9, 0.94, "1", 1.0)},
+            "outer tube: E = 69 GPa instead of 75 (-8 %), 90 % interval 67.5 to 70.5",
+        ),
+        (
+            "youngs_modulus",
+            {"all.scale": entry(1.05, 1.0, 1.1, "1", 1.0)},
+            "all tubes: factor on the youngs modulus = 1.05 instead of 1 (+5 %), 90 % interval 1 to 1.1",
+        ),
+        (
+            "payload_mass",
+            {"added_kg": entry(4e-4, 3e-4, 5e-4, "kg", 0.0)},
+            "payload mass, added = 0.4 g instead of 0, 90 % interval 0.3 to 0.5",
+        ),
+        (
+            "tracker_latency",
+            {"delay_s": entry(0.0202, 0.02, 0.0204, "s", 0.0)},
+            "tracker latency, delay = 20.2 ms instead of 0, 90 % interval 20 to 20.4",
+        ),
+        (
+            "encoder_offset",
+            {"tube1.offset_rad": entry(0.0174533, 0.0, 0.0349066, "rad", 0.0)},
+            "inner tube: encoder offset = 1 deg instead of 0, 90 % interval 0 to 2",
+        ),
+        (
+            "base_coulomb",
+            {"mu_base": entry(0.763, 0.7, 0.8, "1", 1.09)},
+            "base coulomb, mu = 0.763 instead of 1.09 (-30 %), 90 % interval 0.7 to 0.8",
+        ),
+        (
+            "drivetrain_compliance",
+            {"tube1.stiffness_Nm_per_rad": entry(0.5, 0.4, None, "N m/rad", None)},
+            "inner tube: drivetrain compliance, stiffness = 0.5 N m/rad instead of no limit, 90 % interval 0.4 to no limit",
+        ),
+        (
+            "tip_force",
+            {"Fx_N": entry(0.01, 0.0, 0.02, "N", 0.0), "Fz_N": entry(-0.01, -0.02, 0.0, "N", 0.0)},
+            "tip force, Fx = 10 mN instead of 0, 90 % interval 0 to 20; tip force, Fz = -10 mN instead of 0, 90 % interval -20 to 0",
+        ),
+        ("config_mistake", {"which": entry("degrees", None, None, "name", "none")}, "configuration: degrees"),
+        ("unknown", {}, "outside the catalogue"),
+    ],
+)
+def test_sentence(effect, parameters, text):
+    assert cause_text(TISSUE, effect, parameters) == text
+
+
+@pytest.mark.parametrize("name", ["till2020_tissue", "three_tube"])
+def test_every_parameter_of_the_catalogue_has_a_sentence_of_its_own(name):
+    """Two parameters of one cause are told apart, and no name of a unit is left in a sentence."""
+    robot, said = load_robot(name), {}
+    for q in effect_quantities(robot):
+        value = entry(1.0, 0.5, 2.0, q.parameter.unit, 1.0)
+        text = cause_text(robot, q.effect, {q.name: value}).split(" = ")[0]
+        assert text not in said, (q.name, said[text])
+        assert "_" not in text
+        said[text] = q.name
