@@ -48,11 +48,8 @@ FIT_S, HELD_OUT_S = 8.0, 5.0  # the bags' lengths
 SIZES = (1.0, 3.0)  # of a hidden effect, in plausible departures
 TOO_TIGHT = 2.5  # true deviations by those of the file, where many are too tight
 CLEAR = 8.0  # separation from the nearest rival, in standard deviations, that shows plainly
-PUSHES, PUSH_S, PUSHED = (
-    3,
-    (0.2, 0.6),
-    (0.02, 0.05),
-)  # number, length of each, and deflection by the exposed length
+PUSHES, PUSH_S = 3, (0.2, 0.6)  # number, and length of each
+PUSHED = (0.02, 0.05)  # deflection by the exposed length
 NOT_SHOWN = {"contact", "tip_spring", "insertion_velocity"}  # need a place in reach, or translations
 KEPT = ("verdict", "causes", "cause_set95", "probabilities", "residual", "numerics", "seconds")
 

@@ -40,7 +40,7 @@ class Diagnosis:
         numerics: rms of the discretisation error in m, ``time_error_m`` and ``space_error_m``.
         nominal_rms: m, of the model as the robot file has it.
         recalibrated, extended: fits without and with the causes; None where a configuration mistake ended the diagnosis.
-        residual_recalibrated, residual_extended: (s, 6) of every recording, m and rad.
+        residual_nominal, residual_recalibrated, residual_extended: (s, 6) of every recording, m and rad.
         whiteness_recalibrated, whiteness_extended: tests of what the fits leave.
         mistake: of the configuration, with the misfit that it makes.
         sensitivities: at the extended fit, where causes are named.
@@ -71,6 +71,7 @@ class Diagnosis:
     notes: list[str] = field(default_factory=list)
     seconds: float = 0.0
     tolerances: ToleranceEvidence | None = None
+    residual_nominal: list[Floats] = field(default_factory=list)
     residual_recalibrated: list[Floats] = field(default_factory=list)
     residual_extended: list[Floats] = field(default_factory=list)
     sensitivities: Sensitivities | None = None

@@ -15,10 +15,9 @@ from ctr_dynamics.diagnosis.diagnosis_result import Diagnosis
 from ctr_dynamics.diagnosis.forward_model import ForwardModel
 from ctr_dynamics.diagnosis.inference.candidates import Candidate
 from ctr_dynamics.diagnosis.inference.fit_problem import Problem
-from ctr_dynamics.diagnosis.inference.gaussian_posterior import prior_variance
 from ctr_dynamics.diagnosis.inference.map_fit import Fit
 from ctr_dynamics.diagnosis.inference.sensitivities import Sensitivities
-from ctr_dynamics.diagnosis.inference.separation import left_over, separation
+from ctr_dynamics.diagnosis.inference.separation import separation, separation_in
 from ctr_dynamics.diagnosis.recording import Recording
 from ctr_dynamics.diagnosis.step_choice import with_chosen_steps
 from ctr_dynamics.diagnosis.whitening import Whitener
@@ -115,21 +114,10 @@ def _separation_with(
         return None
     columns = whiten(jacobian)
     a = len(fit.active)
-    old = fit.columns * [q.scale for q in fit.active]
     old_rival = sensitivities.by_candidate[rival]
     chosen = [i for i, q in enumerate(rival.quantities) if q.key in {x.key for x in rivals}]
     old_rival = old_rival[:, chosen] * [rival.quantities[i].scale for i in chosen]
-    everything = np.vstack([old, columns[:, :a]])
+    everything = np.vstack([fit.columns, columns[:, :a] / [q.scale for q in fit.active]])
     against = np.vstack([old_rival, columns[:, a:]])
-    keys = {q.key for q in own.quantities}
-    departure = np.array(
-        [(v - q.off) / q.scale if q.key in keys else 0.0 for q, v in zip(fit.active, fit.values, strict=True)]
-    )
-    wide = {q.key for q in fit.causes}
-    widths = np.array(
-        [math.sqrt(prior_variance(q, q.key in wide, fit.tolerance_factor)) / q.scale for q in fit.active]
-    )
-    others = np.array([q.key not in keys for q in fit.active])
     numerics = np.vstack([problem.numerics, np.zeros((len(columns), problem.numerics.shape[1]))])
-    J = np.hstack([(everything * widths)[:, others], against, numerics])
-    return float(left_over(J, (everything @ departure)[:, None])[0])
+    return separation_in(fit, everything, (own,), against, numerics)

@@ -81,7 +81,8 @@ def diagnose_recordings(
 
     # forward model: the nominal robot on every recording
     result.problem = problem
-    result.nominal_rms = rms(np.concatenate(problem.residuals({}))[:, :3])
+    result.residual_nominal = problem.residuals({})
+    result.nominal_rms = rms(np.concatenate(result.residual_nominal)[:, :3])
     if not math.isfinite(result.nominal_rms):
         raise InputError(
             "the nominal model cannot be simulated on this bag",

@@ -28,6 +28,21 @@ def separation(
     sensitivities: Sensitivities,
 ) -> float:
     """d_sep of a cause, or of several together: the whitened size of what they do beside nuisances, other causes and the rival."""
+    against = np.zeros((len(fit.columns), 0))
+    if rival is not None and rival in sensitivities.by_candidate:
+        against = sensitivities.by_candidate[rival] * [q.scale for q in rival.quantities]
+    return separation_in(fit, fit.columns, members, against, problem.numerics)
+
+
+def separation_in(
+    fit: Fit, columns: Floats, members: Sequence[Candidate], against: Floats, numerics: Floats
+) -> float:
+    """:func:`separation` of ``members`` of ``fit`` where its values have other sensitivities, such as with one more bag.
+
+    Args:
+        columns: (m, a) whitened, of the active values.
+        against: (m, k) of a rival, by its scales. numerics: (m, j) of the error of the solver.
+    """
     own = {q.key for c in members for q in c.quantities}
     gone = keys_of(members)
     departure = np.array(
@@ -35,14 +50,12 @@ def separation(
     )
     wide = {q.key for q in fit.causes}
     parts = [
-        fit.columns[:, i] * math.sqrt(prior_variance(q, q.key in wide, fit.tolerance_factor))
+        columns[:, i] * math.sqrt(prior_variance(q, q.key in wide, fit.tolerance_factor))
         for i, q in enumerate(fit.active)
         if q.key not in gone
     ]
-    if rival is not None and rival in sensitivities.by_candidate:
-        parts += [sensitivities.by_candidate[rival][:, k] * q.scale for k, q in enumerate(rival.quantities)]
-    J = np.hstack([np.stack(parts, axis=1), problem.numerics])
-    return float(left_over(J, (fit.columns @ departure)[:, None])[0])
+    J = np.hstack([np.stack(parts, axis=1) if parts else np.zeros((len(columns), 0)), against, numerics])
+    return float(left_over(J, (columns @ departure)[:, None])[0])
 
 
 def observable_sizes(problem: Problem, sensitivities: Sensitivities) -> dict[str, float]:

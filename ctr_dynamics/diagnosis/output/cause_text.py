@@ -22,19 +22,8 @@ SCALED = {
     "shear_modulus": Scaled("G", lambda tube: tube.shear.value, "Pa"),
     "density": Scaled("density", lambda tube: tube.density.value, "kg/m^3"),
 }
-UNITS = {
-    "rad",
-    "N",
-    "m",
-    "kg",
-    "s",
-    "1",
-    "Nm",
-    "Nm2s",
-    "kgm2",
-    "Ns",
-    "Ns2",
-}  # with which names of parameters end
+# With which a parameter's name ends.
+UNITS = ("rad", "N", "m", "kg", "s", "1", "Nm", "Nm2s", "kgm2", "Ns", "Ns2")
 # Units for people: factor and text.
 SHOWN = {
     "kg": (1e3, "g"),

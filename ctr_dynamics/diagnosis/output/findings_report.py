@@ -56,9 +56,7 @@ def write_report(path: Path, diagnosis: Diagnosis, content: dict[str, Any]) -> N
 
 
 def _traces(page: Page, d: Diagnosis) -> None:
-    assert d.problem is not None
-    nominal = d.problem.residuals({})
-    models = zip(d.recordings, nominal, d.residual_recalibrated, d.residual_extended, strict=True)
+    models = zip(d.recordings, d.residual_nominal, d.residual_recalibrated, d.residual_extended, strict=True)
     for recording, first, left, rest in models:
         t = recording.stamps
         as_in_file, before, after = (recording.position - r[:, :3] for r in (first, left, rest))
