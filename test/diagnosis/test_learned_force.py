@@ -1,6 +1,6 @@
 """A force outside the catalogue, hidden by the simulator of the tests: the learned one removes the error of another bag, or none is kept.
 
-Learning is asked for directly, as after a verdict `unknown`. A whole diagnosis after which nothing is learned is in test_hidden.py.
+Learning is asked for directly, as after a verdict `unknown`. A whole diagnosis after which nothing is learned is in test_nothing_hidden.py.
 """
 
 from dataclasses import replace
