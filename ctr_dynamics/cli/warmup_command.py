@@ -8,11 +8,12 @@ from typing import Annotated
 import typer
 from joblib import Parallel, delayed
 
-from ctr_dynamics.diagnosis.kernel_warm_up import MODELS
+from ctr_dynamics.diagnosis.kernel_warm_up import EXTENDED, PLAIN
 from ctr_dynamics.diagnosis.kernel_warm_up import warm_up as warm_up_diagnosis
 from ctr_dynamics.kernels.compiler import cache_folder
 from ctr_dynamics.parameters import Settings
 from ctr_dynamics.robot_files import load_robot
+from ctr_dynamics.runtime.garbage_collection import rare_garbage_collection
 from ctr_dynamics.runtime.warm_up import warm_up
 
 
@@ -26,22 +27,24 @@ def warmup(
     names = robot or ["till2020_tissue", "three_tube"]
     for name in names:
         load_robot(name)
-    # the longest first; each compiles in a process of its own
-    tasks = [delayed(_diagnosis)(name, model) for name in names for model in reversed(MODELS)]
-    tasks += [delayed(_estimator)(name) for name in names]
+    # two processes for a robot: kernels of one physics have much in common, which each process translates for itself
+    tasks = [delayed(task)(name) for name in names for task in (_plain, _extended)]
     for text in Parallel(2, return_as="generator")(tasks):
         typer.echo(text)
     typer.echo(f"kernels are in {cache_folder()}")
 
 
-def _estimator(name: str) -> str:
-    begin, steps = time.perf_counter(), 0
-    for policy in ("predict", "wait"):
-        steps = warm_up(load_robot(name), Settings({"robot": name, "output.policy": policy}))
-    return f"{name}: estimator, {steps} steps, {time.perf_counter() - begin:.1f} s"
+def _plain(name: str) -> str:
+    begin, steps, robot = time.perf_counter(), 0, load_robot(name)
+    with rare_garbage_collection():
+        for policy in ("predict", "wait"):
+            steps = warm_up(robot, Settings({"robot": name, "output.policy": policy}))
+        warm_up_diagnosis(robot, PLAIN)
+    return f"{name}: estimator, {steps} steps, and diagnosis, {time.perf_counter() - begin:.1f} s"
 
 
-def _diagnosis(name: str, model: str) -> str:
+def _extended(name: str) -> str:
     begin, robot = time.perf_counter(), load_robot(name)
-    warm_up_diagnosis(robot, (model,))
-    return f"{name}: diagnosis with the {model} model, {robot.n_tubes} tubes, {time.perf_counter() - begin:.1f} s"
+    with rare_garbage_collection():
+        warm_up_diagnosis(robot, EXTENDED)
+    return f"{name}: diagnosis with extended physics, {time.perf_counter() - begin:.1f} s"

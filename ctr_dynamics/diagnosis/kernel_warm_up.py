@@ -13,7 +13,7 @@ from ctr_dynamics.effects import effect_quantities
 from ctr_dynamics.robot import Robot
 
 MOMENT = 0.02  # s
-MODELS = ("plain", "damped", "extended", "extended damped")  # each has kernels of its own
+PLAIN, EXTENDED = ("plain", "damped"), ("extended", "extended damped")  # each has kernels of its own
 
 
 def rest_recording(robot: Robot) -> Recording:
@@ -33,7 +33,7 @@ def rest_recording(robot: Robot) -> Recording:
     )
 
 
-def warm_up(robot: Robot, models: Sequence[str] = MODELS) -> None:
+def warm_up(robot: Robot, models: Sequence[str] = PLAIN + EXTENDED) -> None:
     """Compile everything that a diagnosis of ``robot`` needs, or load it from the cache; ``models``: which kernels."""
     known = {q.key: q for q in effect_quantities(robot)}
     damping, air = known["bending_damping", "tube1.B_Nm2s"], known["air_drag", "linear_Ns_per_m2"]

@@ -297,13 +297,14 @@ def prepare_stages(kind, lanes, mesh, scheme, solver, g, parameters, inputs, ban
         section_lengths(mesh.bp_tube, mesh.bp_offset, parameters[beta : beta + n], lengths)
         for k in range(len(lengths)):
             b.section_lengths[k * L + first + q] = lengths[k]
-    shares = scheme.C.sum(axis=1)
-    for r in range(main):
-        for q in range(STAGES):
-            b.history[r * L + first + q] = -shares[q] * y[r]
-    for r in range(len(y) - main):
-        for q in range(STAGES):
-            b.base_history[r * L + first + q] = -shares[q] * y[main + r]
+    for q in range(STAGES):
+        share = 0.0
+        for j in range(STAGES):
+            share += scheme.C[q, j]
+        for r in range(main):
+            b.history[r * L + first + q] = -share * y[r]
+        for r in range(len(y) - main):
+            b.base_history[r * L + first + q] = -share * y[main + r]
 
 
 @njit(nogil=True, error_model="numpy")

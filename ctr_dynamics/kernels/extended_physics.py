@@ -21,7 +21,7 @@ from ctr_dynamics.kernels.sincos import sincos
 SOFTENING_ITERATIONS = 8
 
 
-@njit(nogil=True, error_model="numpy")
+@njit(forceinline=True, error_model="numpy")
 def start_motion(kind, W, c0, base_history, base_fields):
     """Rates and accelerations of every tube's beta, times ``insertion_velocity``; their history moves on."""
     n = kind.tubes
@@ -37,7 +37,7 @@ def start_motion(kind, W, c0, base_history, base_fields):
         W[r] = 0.0
 
 
-@njit(nogil=True, error_model="numpy")
+@njit(forceinline=True, error_model="numpy")
 def start_section(kind, W, section_ends, section_lengths, k):
     """Grid speed and acceleration at both ends of section ``k``, and its rate of stretching; ``section_ends`` (sections,) tubes that end it."""
     n = kind.tubes
@@ -51,7 +51,7 @@ def start_section(kind, W, section_ends, section_lengths, k):
     W[at.stretching] = where_above(length, 1e-9, (W[at.speed_far] - W[at.speed_near]) / length, 0.0)
 
 
-@njit(nogil=True, error_model="numpy")
+@njit(forceinline=True, error_model="numpy")
 def move_grid(kind, W, fraction):
     """Grid speed and acceleration at the ``fraction`` of the section."""
     at = workspace_rows(kind.tubes)
@@ -61,7 +61,7 @@ def move_grid(kind, W, fraction):
     )
 
 
-@njit(nogil=True, error_model="numpy")
+@njit(forceinline=True, error_model="numpy")
 def curvature(kind, W, present, ust, u0, c0):
     """Strains from moments with oval cross-sections and moments that fall behind the curvature (softening).
 
@@ -231,7 +231,7 @@ def derivative(kind, W, present, ust, u0, c0):
     moving_derivative(kind, W, present, ust, u0, c0)
 
 
-@njit(nogil=True, error_model="numpy")
+@njit(forceinline=True, error_model="numpy")
 def bending_moments(kind, W, present, target):
     """Bending moments of the tubes, as :func:`curvature` has left them, into rows ``target``; zero for tubes that have ended."""
     n = kind.tubes
@@ -248,14 +248,14 @@ def _stribeck(excess, inverse, rate):
     return 1.0 + excess * math.exp(-x * x)
 
 
-@njit(nogil=True, error_model="numpy")
+@njit(forceinline=True, error_model="numpy")
 def coulomb(kind, W, rate):
     """Factor on the Coulomb coefficients at a relative speed."""
     at = workspace_rows(kind.tubes)
     return _stribeck(W[at.stribeck_excess], W[at.stribeck_inverse_speed], rate)
 
 
-@njit(nogil=True, error_model="numpy")
+@njit(forceinline=True, error_model="numpy")
 def drive(kind, W, c0, i, torque, angle, rate, base_history, base_fields):
     """(psi, psi_t) of tube ``i`` at its actuator: the drive gives way by compliance times (internal moment - inertia times psi_tt)."""
     n = kind.tubes
@@ -272,13 +272,13 @@ def drive(kind, W, c0, i, torque, angle, rate, base_history, base_fields):
     return angle + give, rate + c0 * give + h
 
 
-@njit(nogil=True, error_model="numpy")
+@njit(forceinline=True, error_model="numpy")
 def base_stretch(kind, W, i, beta, u):
     """Twist rate that the stretching of the grid behind the plate adds, (beta_t / beta) u_z."""
     return where_above(-1e-9, beta, W[workspace_rows(kind.tubes).tube_speed + i] / beta * u, 0.0)
 
 
-@njit(nogil=True, error_model="numpy")
+@njit(forceinline=True, error_model="numpy")
 def tilt(kind, W, c0, i, base_history, base_fields):
     """Clearance at the end of tube ``i``: the tubes inside tilt about the moment that passes, and the state is taken to their frame.
 
@@ -330,7 +330,7 @@ def tilt(kind, W, c0, i, base_history, base_fields):
     W[Y + O + 1] += c0 * ty + base_history[row + 1]
 
 
-@njit(nogil=True, error_model="numpy")
+@njit(forceinline=True, error_model="numpy")
 def tip_forces(kind, W, force, c0, base_history, base_fields):
     """Add the forces of spring, damper and contact, and the learned one, on the tip (base axes) to the rows ``force``."""
     n = kind.tubes

@@ -27,7 +27,7 @@ from typing import Any
 from llvmlite import ir
 from numba import types
 from numba.core.imputils import lower_constant
-from numba.core.typing.templates import AttributeTemplate
+from numba.core.typing.templates import AbstractTemplate, AttributeTemplate, infer_global
 from numba.extending import (
     NativeValue,
     infer_getattr,
@@ -132,10 +132,18 @@ def by_physics(plain: Any, extended: Any) -> Callable[..., Any]:
     def for_compiled_code(*args: Any) -> Any:
         raise NotImplementedError("for compiled code only")
 
-    @overload(for_compiled_code, strict=False, jit_options={"error_model": "numpy", "forceinline": True})
-    def choose(*args: Any) -> Any:
-        return (extended if args[0].physics is Physics.EXTENDED else plain).py_func
+    class Choice(AbstractTemplate):
+        key = for_compiled_code
 
+        def generic(self, args: Any, kws: Any) -> Any:
+            kernel = extended if args[0].physics is Physics.EXTENDED else plain
+            return types.Dispatcher(kernel).get_call_type(self.context, args, kws)
+
+        def get_impl_key(self, sig: Any) -> Any:
+            kernel = extended if sig.args[0].physics is Physics.EXTENDED else plain
+            return kernel.get_overload(sig)
+
+    infer_global(for_compiled_code, types.Function(Choice))
     return for_compiled_code
 
 

@@ -176,44 +176,44 @@ def bending_moments(kind, W, present, target):
             W[D], W[D + 1] = 0.0, 0.0
 
 
-@njit(forceinline=True)
+@njit(forceinline=True, error_model="numpy")
 def start_motion(kind, W, c0, base_history, base_fields):
     """The grid does not move."""
 
 
-@njit(forceinline=True)
+@njit(forceinline=True, error_model="numpy")
 def start_section(kind, W, section_ends, section_lengths, k):
     """The grid does not move."""
 
 
-@njit(forceinline=True)
+@njit(forceinline=True, error_model="numpy")
 def move_grid(kind, W, fraction):
     """The grid does not move."""
 
 
-@njit(forceinline=True)
+@njit(forceinline=True, error_model="numpy")
 def coulomb(kind, W, rate):
     """The Coulomb coefficients do not depend on the relative speed."""
     return 1.0
 
 
-@njit(forceinline=True)
+@njit(forceinline=True, error_model="numpy")
 def drive(kind, W, c0, i, torque, angle, rate, base_history, base_fields):
     """(psi, psi_t) of tube ``i`` at its actuator: rigid drives."""
     return angle, rate
 
 
-@njit(forceinline=True)
+@njit(forceinline=True, error_model="numpy")
 def base_stretch(kind, W, i, beta, u):
     """The grid behind the plate does not stretch."""
     return 0.0
 
 
-@njit(forceinline=True)
+@njit(forceinline=True, error_model="numpy")
 def tilt(kind, W, c0, i, base_history, base_fields):
     """Tubes have no clearance."""
 
 
-@njit(forceinline=True)
+@njit(forceinline=True, error_model="numpy")
 def tip_forces(kind, W, force, c0, base_history, base_fields):
     """No spring, no contact and nothing learned at the tip."""

@@ -301,7 +301,8 @@ def _warm_estimator(robot: Robot, settings: Settings) -> MakeEstimator:
     from ctr_dynamics.estimation.estimator import Estimator
     from ctr_dynamics.runtime.warm_up import warm_up
 
-    warm_up(robot, settings)
+    with rare_garbage_collection():
+        warm_up(robot, settings)
     return Estimator
 
 

@@ -15,7 +15,7 @@ from types import FunctionType
 
 import pytest
 
-from ctr_dynamics.kernels import compiler, rotations
+from ctr_dynamics.kernels import callees, compiler, rotations
 
 FILES = {
     "__init__.py": "",
@@ -71,7 +71,8 @@ class Checkout:
         for name, text in FILES.items():
             (self.package / name).parent.mkdir(parents=True, exist_ok=True)
             (self.package / name).write_text(text)
-        shutil.copy(compiler.__file__, self.package / "kernels")
+        for module in (compiler, callees):
+            shutil.copy(module.__file__, self.package / "kernels")
 
     def replace(self, name: str, old: str, new: str) -> None:
         text = (self.package / name).read_text()
@@ -109,6 +110,12 @@ LOADED = {"outer": "loaded", "first": "loaded", "apply": "loaded"}
 def test_a_second_start_and_a_second_checkout_compile_nothing(checkout, tmp_path):
     assert checkout.run()[1] == LOADED
     assert Checkout(tmp_path / "two", checkout.cache).run()[1] == LOADED
+
+
+def test_machine_code_is_kept_of_what_python_calls_alone(checkout):
+    assert {folder.name.split("-")[0] for folder in checkout.cache.iterdir()} == {
+        "ctr_dynamics.kernels.outer"
+    }
 
 
 def test_a_change_elsewhere_compiles_nothing(checkout):
@@ -158,7 +165,7 @@ def test_caches_that_nobody_uses_go(checkout):
         folder.mkdir(exist_ok=True)
         os.utime(folder, (old, old))
     assert checkout.run()[1] == LOADED  # dates what it uses
-    checkout.replace("functions.py", "- 1.0", "- 3.0")  # something new: time to look for what is old
+    checkout.replace("kernels/inner.py", "1.0", "3.0")  # something new: time to look for what is old
     checkout.run()
     left = {folder.name for folder in checkout.cache.iterdir()}
     assert mine.name not in left
