@@ -29,9 +29,10 @@ class _Linked(codegen.JITCodeLibrary):
         """Link the callees in, and optimise unless one is large."""
         self._raise_if_finalized()
         left = False
+        to_run = getattr(self, "_reload_init", set())  # when it is loaded; older numba has none
         for library in dict.fromkeys(self._linking_libraries):
             left |= getattr(library, "large", False)
-            self._reload_init.update(library._reload_init)
+            to_run |= getattr(library, "_reload_init", set())
             self._final_module.link_in(library._get_module_for_linking(), preserve=True)
         if left:
             self.large = True
