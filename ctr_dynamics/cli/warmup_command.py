@@ -27,7 +27,7 @@ def warmup(
     names = robot or ["till2020_tissue", "three_tube"]
     for name in names:
         load_robot(name)
-    # two processes for a robot: kernels of one physics have much in common, which each process translates for itself
+    # two processes for a robot: kernels of one physics call the same ones, which every process lowers once
     tasks = [delayed(task)(name) for name in names for task in (_plain, _extended)]
     for text in Parallel(2, return_as="generator")(tasks):
         typer.echo(text)
@@ -36,9 +36,9 @@ def warmup(
 
 def _plain(name: str) -> str:
     begin, steps, robot = time.perf_counter(), 0, load_robot(name)
+    for policy in ("predict", "wait"):
+        steps = warm_up(robot, Settings({"robot": name, "output.policy": policy}))
     with rare_garbage_collection():
-        for policy in ("predict", "wait"):
-            steps = warm_up(robot, Settings({"robot": name, "output.policy": policy}))
         warm_up_diagnosis(robot, PLAIN)
     return f"{name}: estimator, {steps} steps, and diagnosis, {time.perf_counter() - begin:.1f} s"
 

@@ -17,7 +17,7 @@ from typing import Any
 from numba.core import codegen, compiler, registry, typed_passes
 from numba.core.compiler_machinery import PassManager, register_pass
 
-_largest: set[Callable[..., Any]] = set()  # functions whose callers are optimised with what calls them
+_large: set[Callable[..., Any]] = set()  # functions whose callers are not optimised by themselves
 
 
 class _Linked(codegen.JITCodeLibrary):
@@ -49,7 +49,7 @@ class _CalleeLowering(typed_passes.NativeLowering):
         """Lower the function of ``state`` into a library of its own."""
         target = state.targetctx
         state.library = _Linked(target.codegen(), state.func_id.func_qualname)
-        state.library.large = state.func_id.func in _largest
+        state.library.large = state.func_id.func in _large
         state.flags.no_compile = state.flags.no_cpython_wrapper = state.flags.no_cfunc_wrapper = True
         super().run_pass(state)
         entry = object()  # by which callers find it
@@ -84,15 +84,15 @@ class _Callee(registry.CPUDispatcher):
 
 
 def call_without_machine_code(
-    compiled: Any, function: Callable[..., Any], options: dict[str, Any], largest: bool
+    compiled: Any, function: Callable[..., Any], options: dict[str, Any], large: bool
 ) -> None:
     """Have other kernels call ``function`` as this module says. Python goes on to call its dispatcher ``compiled``.
 
     Args:
         options: of numba, as ``compiled`` has them.
-        largest: whether callers are left to what calls them.
+        large: whether callers of it are left to the outermost kernel.
     """
-    if largest:
-        _largest.add(function)
+    if large:
+        _large.add(function)
     callee = _Callee(function, targetoptions={"nopython": True, **options}, pipeline_class=_CalleeCompiler)
     compiled.get_call_template, compiled.get_overload = callee.get_call_template, callee.get_overload

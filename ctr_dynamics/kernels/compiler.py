@@ -231,25 +231,24 @@ class _KernelCache(caching.FunctionCache):
         return hashlib.sha256(text.encode()).hexdigest()[:24]
 
 
-def njit(*, cache: bool = True, largest: bool = False, **options: Any) -> Callable[[Callable[..., Any]], Any]:
+def njit(*, cache: bool = True, large: bool = False, **options: Any) -> Callable[[Callable[..., Any]], Any]:
     """:func:`numba.njit` with the cache of this module, for functions that call each other (:mod:`ctr_dynamics.kernels.callees`).
 
     What a cached kernel uses stands in its module or in one that it imports.
 
     Args:
         cache: False compiles in every process.
-        largest: whether callers of the function are not optimised by themselves.
+        large: whether callers of the function are left to the outermost kernel, with which they are optimised.
         options: of numba.
 
     Raises:
         TypeError: the function is a closure or has other globals than its module: the cache would not see what it is made of.
     """
-
     options["no_cfunc_wrapper"] = True  # nobody calls them from C
 
     def decorate(function: Callable[..., Any]) -> Any:
         compiled = numba.njit(**options)(function)
-        call_without_machine_code(compiled, function, options, largest)
+        call_without_machine_code(compiled, function, options, large)
         if cache and Path(function.__code__.co_filename).is_file():
             module = sys.modules.get(function.__module__)
             if function.__closure__ or (module is not None and function.__globals__ is not vars(module)):

@@ -132,16 +132,17 @@ def by_physics(plain: Any, extended: Any) -> Callable[..., Any]:
     def for_compiled_code(*args: Any) -> Any:
         raise NotImplementedError("for compiled code only")
 
+    def kernel(kind: Any) -> Any:
+        return extended if kind.physics is Physics.EXTENDED else plain
+
     class Choice(AbstractTemplate):
         key = for_compiled_code
 
         def generic(self, args: Any, kws: Any) -> Any:
-            kernel = extended if args[0].physics is Physics.EXTENDED else plain
-            return types.Dispatcher(kernel).get_call_type(self.context, args, kws)
+            return types.Dispatcher(kernel(args[0])).get_call_type(self.context, args, kws)
 
         def get_impl_key(self, sig: Any) -> Any:
-            kernel = extended if sig.args[0].physics is Physics.EXTENDED else plain
-            return kernel.get_overload(sig)
+            return kernel(sig.args[0]).get_overload(sig)
 
     infer_global(for_compiled_code, types.Function(Choice))
     return for_compiled_code

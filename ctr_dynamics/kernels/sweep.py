@@ -203,7 +203,7 @@ def sweep_batch(kind, W, c0, mesh, v):
     tip_residual(kind, W, v.residual, c0, v.base_history, v.base_fields)
 
 
-@njit(nogil=True, error_model="numpy", largest=True)
+@njit(nogil=True, error_model="numpy", large=True)
 def sweep(kind, lanes, c0, mesh, b):
     """Integrate (18), (19), (13), (20)-(24) from the actuators to the tip with the unknowns in the buffers ``b``; the residual stays there.
 

@@ -1,4 +1,4 @@
-"""Rare garbage collection while steps are taken."""
+"""Rare garbage collection while kernels are compiled and steps are taken."""
 
 from __future__ import annotations
 

@@ -301,8 +301,7 @@ def _warm_estimator(robot: Robot, settings: Settings) -> MakeEstimator:
     from ctr_dynamics.estimation.estimator import Estimator
     from ctr_dynamics.runtime.warm_up import warm_up
 
-    with rare_garbage_collection():
-        warm_up(robot, settings)
+    warm_up(robot, settings)
     return Estimator
 
 

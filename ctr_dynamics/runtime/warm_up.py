@@ -8,6 +8,7 @@ from ctr_dynamics.estimation.estimator import Estimator
 from ctr_dynamics.estimation.monitoring.statuses import all_statuses
 from ctr_dynamics.parameters import Settings
 from ctr_dynamics.robot import Robot
+from ctr_dynamics.runtime.garbage_collection import rare_garbage_collection
 from ctr_dynamics.runtime.step_encoder import StepEncoder
 
 START_NS = 1_000_000_000_000
@@ -24,6 +25,7 @@ def _no_time() -> float:
     return 0.0
 
 
+@rare_garbage_collection()  # compiling makes millions of objects and keeps them
 def warm_up(robot: Robot, settings: Settings) -> int:
     """Run another estimator near the robot's rest position with every kind of input; returns how many steps.
 
