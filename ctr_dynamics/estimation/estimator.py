@@ -204,7 +204,11 @@ class Estimator:
     # -- time --
 
     def advance(
-        self, now_ns: int | None = None, spare_s: Callable[[], float] | None = None, most: int | None = None
+        self,
+        now_ns: int | None = None,
+        spare_s: Callable[[], float] | None = None,
+        most: int | None = None,
+        too_old: Callable[[int], str] = lambda stamp_ns: "",
     ) -> list[StepOutput]:
         """Take the steps that are due; once their outputs are on their way, :meth:`do_idle_work` does what they need not wait for.
 
@@ -213,6 +217,8 @@ class Estimator:
             spare_s: tells the time (s) until the next step is due. Given it, a correction of late inputs goes only as far as there is time.
                 Steps on time are then taken uncorrected, and later calls go on with the correction.
             most: steps to take at most.
+            too_old: tells, by its stamp, why an output is of no use any more; empty where it is. A step of no use is taken, and goes out invalid
+                without an estimate: that makes catching up after a hold-up a quarter faster.
 
         Returns:
             One output for each step.
@@ -230,7 +236,7 @@ class Estimator:
                 self._correct(spare_s)
             # 2. Propagate, update, publish.
             self.timeline.k += 1
-            outputs.append(self._step(self.k))
+            outputs.append(self._step(self.k, too_old))
             if self.step_times_s is not None:
                 self.step_times_s.append(time.perf_counter() - begin)
             self._without_idle += 1
@@ -337,7 +343,7 @@ class Estimator:
             self._modes.clear()
             self._jacobian.clear()
 
-    def _step(self, k: int) -> StepOutput:
+    def _step(self, k: int, too_old: Callable[[int], str]) -> StepOutput:
         """Take step ``k`` and describe it."""
         runs, late, health = self.runs, self.late, self.health
         health.steps += 1
@@ -361,7 +367,9 @@ class Estimator:
         ):
             late.history.restart(k)
         health.sweeps += result.sweeps
-        return self._output(k, result) if result.ok else self._invalid(k, f"step failed: {result.reason}")
+        if not result.ok:
+            return self._invalid(k, f"step failed: {result.reason}")
+        return self._output(k, result, too_old(self.timeline.stamp(k)))
 
     def _start(self, k: int) -> StepOutput:
         """Both runs at rest at step ``k``, unless there is no equilibrium."""
@@ -382,8 +390,8 @@ class Estimator:
 
     # -- outputs --
 
-    def _output(self, k: int, result: StepResult) -> StepOutput:
-        """The output of a step that both runs have taken; invalid where it says nothing of the robot."""
+    def _output(self, k: int, result: StepResult, of_no_use: str = "") -> StepOutput:
+        """The output of a step that both runs have taken; invalid where it says nothing of the robot, or is ``of_no_use``: the reason."""
         fused, health, options, late = self.runs.fused, self.health, self.options, self.late
         assert fused.state is not None
         tip = fused.ekf.tip_estimate()
@@ -411,6 +419,13 @@ class Estimator:
         self._unexpected.take(
             innovations, fused.ekf.refuted, fused.agreed or bool(unsettled) or not health.fusing
         )
+        if unsettled:  # measurements tell nothing of the model's error either
+            fused.model_error_search.clear()
+            self.innovations.pass_over()
+        self._stability_due |= k % options.stability_every == 0
+        if of_no_use:
+            health.problem = of_no_use
+            return StepOutput.invalid(stamp, k, of_no_use, innovations)
         fused.inflate_covariance(tip, self.runs.open_loop, self._largest_deviation)
         self._unexpected.inflate(tip.covariance, stamp)
         self._twist_error.inflate(
@@ -422,11 +437,7 @@ class Estimator:
         deviation = tip.position_deviation
         since = fused.measured_ns if fused.measured_ns is not None else self.t0_ns
         health.tracker_age_s = max(0.0, (stamp - (since or stamp)) * 1e-9)
-        if unsettled:  # measurements tell nothing of the model's error either
-            fused.model_error_search.clear()
-            self.innovations.pass_over()
         problem = health.problem = self._problem(stamp, deviation, unsettled)
-        self._stability_due |= k % options.stability_every == 0
         return StepOutput(
             stamp, k, not problem, problem, tip.position, tip.quaternion, tip.covariance[:6, :6], tip.twist, tip.covariance[6:, 6:],
             predicted[:3], predicted[3:], self._backbone.rows(fused.state), self._modes.measure(fused.state, k), fused.ekf.force,

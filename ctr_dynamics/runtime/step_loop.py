@@ -53,7 +53,11 @@ class Steps(Protocol):
     @property
     def correcting(self) -> bool: ...
     def advance(
-        self, now_ns: int | None = None, spare_s: Callable[[], float] | None = None, most: int | None = None
+        self,
+        now_ns: int | None = None,
+        spare_s: Callable[[], float] | None = None,
+        most: int | None = None,
+        too_old: Callable[[int], str] = ...,
     ) -> Sequence[Any]: ...
     def do_idle_work(self) -> None: ...
     def reset(self) -> None: ...
@@ -280,7 +284,7 @@ class StepLoop(threading.Thread):
             corrects = self.estimator.correcting
             due_ns = self._next_due_ns()
             begin = time.perf_counter_ns()
-            steps = self.estimator.advance(until_ns, self._spare_s, None if predicting else 1)
+            steps = self.estimator.advance(until_ns, self._spare_s, None if predicting else 1, self._useless)
             spent_ns = time.perf_counter_ns() - begin
             self._starved = not steps and due_ns is not None and until_ns is not None and until_ns >= due_ns
             if steps:
@@ -302,18 +306,17 @@ class StepLoop(threading.Thread):
 
     def _not_too_old(self, step: Any) -> Any:
         """The step, invalid where it comes so late that the robot may be elsewhere by now; the caller asks just before it sends."""
+        reason = self._useless(step.stamp_ns) if step.valid else ""
+        return step._replace(valid=False, reason=reason) if reason else step
+
+    def _useless(self, stamp_ns: int) -> str:
+        """Why an output of that stamp comes too late for anyone to act on it; empty where it does not. Counts those that do."""
         now_ns = self._now_ns()
-        if (
-            self.max_age_ns is None
-            or now_ns <= 0
-            or not step.valid
-            or now_ns - step.stamp_ns <= self.max_age_ns
-        ):
-            return step
+        if self.max_age_ns is None or now_ns <= 0 or now_ns - stamp_ns <= self.max_age_ns:
+            return ""
         self.timing.too_old += 1
-        age_s, limit_s = (now_ns - step.stamp_ns) * 1e-9, self.max_age_ns * 1e-9
-        reason = f"output is {age_s:.3f} s old when it goes out, limit {limit_s:g} s (output.max_age_s): the node is held up, or joints come late"
-        return step._replace(valid=False, reason=reason)
+        age_s, limit_s = (now_ns - stamp_ns) * 1e-9, self.max_age_ns * 1e-9
+        return f"output is {age_s:.3f} s old when it goes out, limit {limit_s:g} s (output.max_age_s): the node is held up, or joints come late"
 
     def _gathering_ns(self) -> int:
         """How much longer the first inputs are gathered before the model starts; 0 once it may."""

@@ -3,6 +3,7 @@
 from types import SimpleNamespace
 from typing import NamedTuple
 
+import numpy as np
 import pytest
 
 from ctr_dynamics.estimation.estimator import Estimator
@@ -30,7 +31,7 @@ class Steady:
     def __init__(self, t0_ns):
         self.t0_ns, self.k = t0_ns, 0
 
-    def advance(self, now_ns=None, spare_s=None, most=None):
+    def advance(self, now_ns=None, spare_s=None, most=None, too_old=None):
         steps = []
         while self.t0_ns + self.k * STEP_NS <= now_ns and (most is None or len(steps) < most):
             steps.append(Out(self.k, self.t0_ns + self.k * STEP_NS))
@@ -85,3 +86,25 @@ def test_a_joint_state_that_is_stamped_ahead_does_not_take_the_outputs_with_it(p
         for out in estimator.advance(now_ns):
             assert out.stamp_ns <= now_ns
     assert out.stamp_ns > now_ns - STEP_NS - (10 * MS if policy == "wait" else 0)
+
+
+def test_a_step_that_is_too_old_moves_the_model_and_has_no_estimate():
+    names = [f"tube{i}_{kind}" for i in (1, 2) for kind in ("rotation", "translation")]
+    start_ns, held_up, steps = 1_000_000 * MS, range(10, 20), 30
+    outputs = []
+    for too_old in (
+        lambda stamp_ns: "",
+        lambda stamp_ns: "late" * ((stamp_ns - start_ns) // STEP_NS in held_up),
+    ):
+        estimator = Estimator(load_robot("till2020_tissue"), Settings({"output.policy": "wait"}))
+        for k in range(steps + 1):
+            estimator.add_joint_state(start_ns + k * STEP_NS, names, [0.02 * k, -0.2521, 0.02 * k, -0.1977])
+        outputs.append(estimator.advance(too_old=too_old))
+    for a, b in zip(*outputs, strict=True):
+        if a.k in held_up:
+            assert (b.valid, b.reason) == (False, "late")
+            assert not np.isfinite(b.tip_position).any()
+        else:
+            assert b.valid
+            np.testing.assert_array_equal(a.tip_position, b.tip_position)
+            np.testing.assert_allclose(a.tip_covariance, b.tip_covariance, rtol=1e-2, atol=1e-9)

@@ -42,7 +42,7 @@ class Scripted:
     def do_idle_work(self):
         self.pauses += 1
 
-    def advance(self, now_ns=None, spare_s=None, most=None):
+    def advance(self, now_ns=None, spare_s=None, most=None, too_old=None):
         self.asked.append(now_ns)
         self.spare_s = spare_s()
         if self.fault is not None:
@@ -286,8 +286,8 @@ def test_a_step_that_falls_due_during_a_correction_is_taken_at_once(clock):
     loop._round()
     take = estimator.advance
 
-    def correct(now_ns=None, spare_s=None, most=None):
-        steps = take(now_ns, spare_s, most)
+    def correct(now_ns=None, spare_s=None, most=None, too_old=None):
+        steps = take(now_ns, spare_s, most, too_old)
         clock.now += STEP_NS  # the correction took until after the next step was due
         return steps
 
@@ -308,7 +308,7 @@ def test_a_step_that_is_due_and_not_taken_is_not_asked_for_all_the_time(clock):
     loop, _, _ = make_loop(estimator, clock)
     loop._round()
     waits = noted_waits(loop)
-    estimator.advance = lambda now_ns=None, spare_s=None, most=None: []
+    estimator.advance = lambda now_ns=None, spare_s=None, most=None, too_old=None: []
     clock.now += 2 * STEP_NS
     loop._round()
     loop._sleep()
@@ -432,8 +432,8 @@ def test_steps_are_prefetched_once_a_moment_before_joints_that_several_wait_for(
     class Waiting(Scripted):
         """Takes the steps that joints cover."""
 
-        def advance(self, now_ns=None, spare_s=None, most=None):
-            return super().advance(min(now_ns, self.covered_ns), spare_s, most)
+        def advance(self, now_ns=None, spare_s=None, most=None, too_old=None):
+            return super().advance(min(now_ns, self.covered_ns), spare_s, most, too_old)
 
     estimator = Waiting(clock.now)
     prefetched = []
