@@ -349,13 +349,15 @@ class Estimator:
         health.steps += 1
         if not runs.running:
             return self._start(k)
-        # Uncorrected steps say nothing of the robot: measurements wait for the correction. Where that is not soon, they are fused for the
-        # time being, and counted when they are fused again; but not where they would be taken for what the actuators have done.
+        # Uncorrected steps say nothing of the robot, nor do those that will be corrected at once: measurements wait for the correction. Where that
+        # is not soon, they are fused for the time being, and counted when they are fused again; but not where they would be taken for what the
+        # actuators have done.
         lag = late.lag
         soon = lag <= late.options.reuse_lag
+        awaited = self.inputs.awaits_joints(k, late.options.reuse_lag)
         mark = None if soon else self.innovations.mark()
         astray = self._driven_m > self.robot.tracker.noise.position.value
-        result = runs.step(k, fuse=lag == 0 or not (soon or astray), extrapolated=lag > 0)
+        result = runs.step(k, fuse=not awaited if lag == 0 else not (soon or astray), extrapolated=lag > 0)
         late.history.record(k)
         runs.judge(result)
         if mark is not None:

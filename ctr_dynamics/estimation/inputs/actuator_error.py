@@ -5,6 +5,7 @@ from __future__ import annotations
 import bisect
 import math
 from collections.abc import Sequence
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,13 +27,18 @@ def largest_acceleration(stamps: Sequence[int], values: Sequence[Floats]) -> Flo
         if before < 0:
             break
         ends.append(before)
-    times = np.array([stamps[i] for i in ends], dtype=float) * 1e-9
-    places = np.array([values[i] for i in ends])
     if len(ends) < 3:
-        return np.zeros(places.shape[1])
-    rates = np.diff(places, axis=0) / np.diff(times)[:, None]
-    middles = 0.5 * (times[1:] + times[:-1])
-    return np.abs(np.diff(rates, axis=0) / np.diff(middles)[:, None]).max(axis=0)
+        return np.zeros_like(values[-1])
+    times = [1e-9 * (stamps[i] - stamps[-1]) for i in ends]
+    places = [values[i].tolist() for i in ends]
+    rates = [
+        [(b - a) / (t - s) for a, b in zip(first, second, strict=True)]
+        for (s, first), (t, second) in pairwise(zip(times, places, strict=True))
+    ]
+    between = [0.5 * (t - s) for s, t in zip(times[:-2], times[2:], strict=True)]
+    changes = zip(between, pairwise(rates), strict=True)
+    each = [[abs((b - a) / t) for a, b in zip(*pair, strict=True)] for t, pair in changes]
+    return np.array([max(column) for column in zip(*each, strict=True)])
 
 
 class ActuatorError:
@@ -78,16 +84,16 @@ class ActuatorError:
             length: m, of tube 1.
             time_ns: of the step. open_ns: how long its input has been without correction.
         """
-        error, joints = self.at(time_ns), self._joints
-        if not error.any():
+        error, joints = self.at(time_ns).tolist(), self._joints
+        if not any(error):
             return 0.0
         n = joints.size // 2
         arm = max(0.5 * (length + float(joints.values[-1][n])), math.hypot(position[0], position[1]))
-        turned = float(error[:n] @ error[:n])
-        moved = arm**2 * turned + float(error[n:] @ error[n:])
+        turned = sum(e * e for e in error[:n])
+        moved = arm**2 * turned + sum(e * e for e in error[n:])
         duration = max(time_ns - joints.stamps[-1], open_ns) * 1e-9
-        for first, variance in ((0, moved), (3, turned)):
-            for i in range(first, first + 3):
-                covariance[i, i] += variance
-                covariance[6 + i, 6 + i] += variance * (2.0 / duration) ** 2
+        pose = np.array([moved] * 3 + [turned] * 3)
+        diagonal = np.einsum("ii->i", covariance)
+        diagonal[:6] += pose
+        diagonal[6:] += pose * (2.0 / duration) ** 2
         return math.sqrt(3.0 * moved)

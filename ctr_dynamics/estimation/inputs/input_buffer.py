@@ -311,6 +311,11 @@ class InputBuffer:
         period = stamps[-1] - stamps[-2]
         return -(stamp - stamps[-1]) % period < STEP_NS
 
+    def awaits_joints(self, k: int, most: int) -> bool:
+        """Whether step ``k`` is taken with extrapolated joints, and real ones are to come at their rhythm within ``most`` steps of the last."""
+        ahead_ns = self.timeline.stamp(k) - self.joints.stamps[-1]
+        return self.extrapolating and 0 < ahead_ns <= min(1.5e9 * self.joint_period_s, most * STEP_NS)
+
     def forget(self, k: int) -> None:
         """Drop what no start at step ``k`` or later needs."""
         self.forget_inputs(k - self.window_ns // STEP_NS)

@@ -19,6 +19,7 @@ from ctr_dynamics import chi_square
 
 Floats = NDArray[np.float64]
 FINER = np.arange(-4.5, 5.0) / 10.0  # places between two delays
+IMPOSSIBLE = 50.0  # logarithm of odds that no prior makes up for
 
 
 @dataclass(frozen=True)
@@ -152,6 +153,8 @@ class DelaySearch:
         if not self._evidence:
             return Belief(0.0, present_s, 0.0, 0.0)
         last, options = self._evidence[-1], self.options
+        if last.delays.max() + 0.125 * np.abs(np.diff(last.delays, 2)).max() < last.filter - IMPOSSIBLE:
+            return Belief(0.0, present_s, 0.0, 0.0)  # even between two delays: no parabola rises more above its points
         delays, evidence = self._between(last.delays)
         other = np.abs(delays - present_s) > options.least_s
         as_now = max([last.filter, *evidence[~other]])

@@ -15,7 +15,7 @@ from ctr_dynamics.estimation.discretisation import VibrationErrors
 from ctr_dynamics.estimation.filter.ekf import RodEkf
 from ctr_dynamics.estimation.filter.filter_records import TipEstimate
 from ctr_dynamics.estimation.filter.rational_step import FOLLOWED_S, Stride, error_rates
-from ctr_dynamics.kernels.compiled_rotations import matrix
+from ctr_dynamics.kernels.twist_errors import add_by_modes, add_frame_error, add_motion_error, follow_motion
 from ctr_dynamics.robot import Robot
 from ctr_dynamics.sensing import Tip
 
@@ -40,28 +40,28 @@ class MotionFrequency:
     def clear(self) -> None:
         """Nothing has moved."""
         self._stamp_ns: int | None = None
-        self._mean, self._excursion, self._speed = [0.0, 0.0, 0.0], 0.0, 0.0  # m; m^2; m^2/s^2
+        self._moments = np.zeros(5)  # mean position, m; mean squares of excursion and speed, m^2 and m^2/s^2
 
     def add(self, stamp_ns: int, position: Floats, velocity: Floats) -> None:
         """Take in the tip ``position`` (3,) m and ``velocity`` (3,) m/s of a run that measurements do not move."""
         if self._stamp_ns is None:
-            self._mean = position.tolist()
+            self._moments[:3] = position
         else:
             new = -math.expm1(-max(stamp_ns - self._stamp_ns, 0) * 1e-9 / MEMORY_S)
-            away = [x - m for x, m in zip(position.tolist(), self._mean, strict=True)]
-            self._mean = [m + new * x for m, x in zip(self._mean, away, strict=True)]
-            self._excursion += new * (sum(x * x for x in away) - self._excursion)
-            self._speed += new * (sum(v * v for v in velocity.tolist()) - self._speed)
+            follow_motion(self._moments, new, position, velocity)
         self._stamp_ns = stamp_ns
 
     def square(self, variance: float) -> float:
         """Square of the frequency, 1/s^2. An excursion within the position's ``variance`` (m^2) is no motion."""
-        return self._speed / (self._excursion + variance) if self._speed > 0.0 else 0.0
+        excursion, speed = self._moments[3:].tolist()
+        return speed / (excursion + variance) if speed > 0.0 else 0.0
 
-    def inflate(self, covariance: Floats, pose: Floats) -> None:
-        """Add to the twist in the ``covariance`` (12, 12) of the tip, in place, what an error of covariance ``pose`` (6, 6) is then."""
-        square = self.square(float(pose[0, 0] + pose[1, 1] + pose[2, 2]))
-        covariance[6:, 6:] += square * pose
+    def inflate(self, covariance: Floats, rows: Floats, pi: Floats) -> None:
+        """Add to the twist in the ``covariance`` (12, 12) of the tip, in place, what an error of its pose is then.
+
+        ``rows`` (6, r): of the pose, by coefficients of covariance ``pi`` (r, r) or more.
+        """
+        add_motion_error(self._moments, rows, pi, covariance)
 
 
 class LoadVibration:
@@ -69,6 +69,9 @@ class LoadVibration:
 
     Args:
         modes: how the robot vibrates at rest, and how well that is followed.
+
+    Attributes:
+        vibrating: whether anything does.
     """
 
     def __init__(self, modes: VibrationErrors) -> None:
@@ -80,6 +83,7 @@ class LoadVibration:
         self._amplitude = np.zeros(len(self._modes.exponent), complex)  # modal coordinates at `_stamp_ns`
         self._stamp_ns = 0
         self._since_ns = np.zeros(len(self._amplitude))  # when a vibration got most of its amplitude
+        self.vibrating = False
 
     def load_changed(self, from_ns: int, to_ns: int, difference: Floats) -> None:
         """The known load (6,) N, N m has changed evenly by ``difference`` between two stamps: the robot is off its new equilibrium."""
@@ -92,16 +96,12 @@ class LoadVibration:
         newer = np.abs(excited) > np.abs(before)
         self._since_ns[newer] = to_ns
         self._amplitude, self._stamp_ns = before + excited, to_ns
+        self.vibrating = bool(self._amplitude.any())
 
     def _at(self, stamp_ns: int) -> NDArray[np.complexfloating]:
         """Modal coordinates at ``stamp_ns``, at the earliest those of the last change."""
         elapsed_s = max(stamp_ns - self._stamp_ns, 0) * 1e-9
         return self._amplitude * np.exp(self._modes.exponent * elapsed_s)
-
-    @property
-    def vibrating(self) -> bool:
-        """Whether anything vibrates."""
-        return bool(self._amplitude.any())
 
     def inflate(self, covariance: Floats, stamp_ns: int, lost: Floats) -> None:
         """Add to the ``covariance`` (12, 12) of the tip at ``stamp_ns``, in place, the vibrations' errors.
@@ -124,7 +124,7 @@ class LoadVibration:
         by_tolerances = np.abs(modes.exponent) * modes.tolerance * age * np.minimum(lost * age, 1.0)
         square = np.minimum((modes.phase_rate * age) ** 2 + by_tolerances**2, MOST)
         square[~modes.resolved] = 1.0  # the model follows the mean
-        covariance += ((size**2 * square) @ self._of_one).reshape(12, 12)
+        add_by_modes(size**2 * square, self._of_one, covariance)
 
 
 class EncoderVibration:
@@ -160,7 +160,7 @@ class EncoderVibration:
 
     def inflate(self, covariance: Floats) -> None:
         """Add them to the ``covariance`` (12, 12) of the tip, in place."""
-        covariance += (self._variance @ self._of_one).reshape(12, 12)
+        add_by_modes(self._variance, self._of_one, covariance)
 
 
 def of_modes(modes: VibrationErrors) -> Floats:
@@ -179,24 +179,10 @@ class FrameError:
 
     def __init__(self, rotation: Floats, lever: Floats) -> None:
         self._rotation, self._lever = rotation, lever
-        self._errors = np.zeros((6, 6))
 
     def inflate(self, covariance: Floats, twist: Floats, quaternion: Floats) -> None:
         """Add it to the ``covariance`` (12, 12) of the tip, in place; ``twist`` (6,) and ``quaternion`` (4,) wxyz are the tip's."""
-        errors, crossed = self._errors, (CROSS @ twist).reshape(6, 3)
-        errors[:, :3] = crossed * self._rotation
-        errors[:3, 3:] = crossed[3:] @ matrix(quaternion) * self._lever
-        covariance[6:, 6:] += errors @ errors.T
-
-
-def skew(vector: Floats) -> Floats:
-    """(3, 3) whose product with another vector is the cross product."""
-    x, y, z = vector.tolist()
-    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-
-
-# (18, 6) by which a twist becomes the rows of both skew matrices, of the velocity and of the angular velocity
-CROSS = np.kron(np.eye(2), np.stack([skew(axis).ravel() for axis in np.eye(3)], axis=1))
+        add_frame_error(self._rotation, self._lever, twist, quaternion, covariance)
 
 
 class TwistError:
@@ -230,9 +216,7 @@ class TwistError:
         """
         covariance = tip.covariance
         self._motion.add(stamp_ns, open_loop.mean[:3], open_loop.mean[7:10])
-        columns = ekf.tips.last.columns[:6]
-        r = columns.shape[1]
-        self._motion.inflate(covariance, columns @ ekf.pi[:r, :r] @ columns.T)
+        self._motion.inflate(covariance, ekf.tips.last.columns[:6], ekf.pi)
         if self._vibration.vibrating and ekf.stride is not None:
             if ekf.stride is not self._stride:
                 self._stride, over_s = ekf.stride, ekf.stride.steps * ekf.simulator.scheme.dt

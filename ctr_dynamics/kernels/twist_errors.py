@@ -1,0 +1,72 @@
+"""What the covariance of the tip's twist gets beside the covariance factor; see :mod:`ctr_dynamics.estimation.monitoring.twist_error`."""
+
+import numpy as np
+
+from ctr_dynamics.kernels.compiled_rotations import matrix
+from ctr_dynamics.kernels.compiler import njit
+from ctr_dynamics.kernels.covariance import covariance_of
+
+compiled = njit(cache=True, nogil=True, error_model="numpy")
+
+
+@compiled
+def follow_motion(moments, new, position, velocity):
+    """Let a part ``new`` of ``moments`` (5,) be of a ``position`` (3,) and a ``velocity`` (3,): mean position, square of its excursion, and of the
+    speed."""
+    excursion = speed = 0.0
+    for i in range(3):
+        away = position[i] - moments[i]
+        moments[i] += new * away
+        excursion += away * away
+        speed += velocity[i] * velocity[i]
+    moments[3] += new * (excursion - moments[3])
+    moments[4] += new * (speed - moments[4])
+
+
+@compiled
+def add_motion_error(moments, rows, pi, covariance):
+    """Add to the twist in ``covariance`` (12, 12) what an error of the pose is at the frequency of the motion.
+
+    ``moments`` (5,): of :func:`follow_motion`. ``rows`` (6, r): of the pose, by coefficients of covariance ``pi`` (r, r) or more.
+    """
+    excursion, speed = moments[3], moments[4]
+    if not speed > 0.0:
+        return
+    pose = np.empty((6, 6))
+    covariance_of(rows, pi, pose)
+    square = speed / (excursion + pose[0, 0] + pose[1, 1] + pose[2, 2])
+    for i in range(6):
+        for k in range(6):
+            covariance[6 + i, 6 + k] += square * pose[i, k]
+
+
+@compiled
+def add_frame_error(rotation, lever, twist, quaternion, covariance):
+    """Add to the twist in ``covariance`` (12, 12) what deviations of the registration's ``rotation`` (3,) and of the ``lever`` arm (3,) make.
+
+    ``twist`` (6,), ``quaternion`` (4,) wxyz: of the tip.
+    """
+    R, errors = matrix(quaternion), np.zeros((6, 6))
+    for c in range(3):
+        y, z = (c + 1) % 3, (c + 2) % 3
+        for part in range(0, 6, 3):  # the twist turned about axis c
+            errors[part + y, c] = -twist[part + z] * rotation[c]
+            errors[part + z, c] = twist[part + y] * rotation[c]
+        for i in range(3):  # the point moved along axis c of the sensor
+            j, k = (i + 1) % 3, (i + 2) % 3
+            errors[i, 3 + c] = (twist[3 + j] * R[k, c] - twist[3 + k] * R[j, c]) * lever[c]
+    for i in range(6):
+        for k in range(6):
+            total = 0.0
+            for c in range(6):
+                total += errors[i, c] * errors[k, c]
+            covariance[6 + i, 6 + k] += total
+
+
+@compiled
+def add_by_modes(variances, of_one, covariance):
+    """Add to ``covariance`` (12, 12) the ``variances`` (m,) of modal coordinates times what each is of one (m, 144)."""
+    for mode in range(len(variances)):
+        for i in range(12):
+            for k in range(12):
+                covariance[i, k] += variances[mode] * of_one[mode, 12 * i + k]
