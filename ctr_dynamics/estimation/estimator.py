@@ -204,12 +204,9 @@ class Estimator:
     # -- time --
 
     def advance(
-        self,
-        now_ns: int | None = None,
-        spare_s: Callable[[], float] | None = None,
-        most: int | None = None,
+        self, now_ns: int | None = None, spare_s: Callable[[], float] | None = None, most: int | None = None,
         too_old: Callable[[int], str] = lambda stamp_ns: "",
-    ) -> list[StepOutput]:
+    ) -> list[StepOutput]:  # fmt: skip
         """Take the steps that are due; once their outputs are on their way, :meth:`do_idle_work` does what they need not wait for.
 
         Args:
@@ -397,7 +394,8 @@ class Estimator:
         fused, health, options, late = self.runs.fused, self.health, self.options, self.late
         assert fused.state is not None
         tip = fused.ekf.tip_estimate()
-        predicted = self.runs.open_loop.tips.last.mean[:7].copy()
+        open_loop = self.runs.open_loop.tips.last
+        predicted = open_loop.mean[:7].copy()
         if not (tip.finite and math.isfinite(sum(predicted.tolist()))):
             self.runs.stop()
             health.failed("not finite")
@@ -430,9 +428,7 @@ class Estimator:
             return StepOutput.invalid(stamp, k, of_no_use, innovations)
         fused.inflate_covariance(tip, self.runs.open_loop, self._largest_deviation)
         self._unexpected.inflate(tip.covariance, stamp)
-        self._twist_error.inflate(
-            tip, stamp, self.runs.open_loop.tips.last, fused.ekf, self.inputs.joint_period_s
-        )
+        self._twist_error.inflate(tip, stamp, open_loop, fused.ekf, self.inputs.joint_period_s)
         self._driven_m = self.inputs.actuator_error.inflate(
             tip.covariance, tip.position, self._length, stamp, late.lag * STEP_NS
         )

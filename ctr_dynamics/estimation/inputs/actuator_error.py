@@ -10,6 +10,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from ctr_dynamics.kernels.output_errors import add_actuator_error
 from ctr_dynamics.sensing.interpolation import Signal
 
 Floats = NDArray[np.float64]
@@ -84,16 +85,7 @@ class ActuatorError:
             length: m, of tube 1.
             time_ns: of the step. open_ns: how long its input has been without correction.
         """
-        error, joints = self.at(time_ns).tolist(), self._joints
-        if not any(error):
-            return 0.0
-        n = joints.size // 2
-        arm = max(0.5 * (length + float(joints.values[-1][n])), math.hypot(position[0], position[1]))
-        turned = sum(e * e for e in error[:n])
-        moved = arm**2 * turned + sum(e * e for e in error[n:])
+        error, joints = self.at(time_ns), self._joints
         duration = max(time_ns - joints.stamps[-1], open_ns) * 1e-9
-        pose = np.array([moved] * 3 + [turned] * 3)
-        diagonal = np.einsum("ii->i", covariance)
-        diagonal[:6] += pose
-        diagonal[6:] += pose * (2.0 / duration) ** 2
+        moved = add_actuator_error(error, length, joints.values[-1], position, duration, covariance)
         return math.sqrt(3.0 * moved)

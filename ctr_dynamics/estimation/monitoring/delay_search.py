@@ -83,6 +83,8 @@ class DelaySearch:
         self.options = options = options or DelaySearchOptions()
         self._noise, self._change_s = noise, change_s
         self.delays = np.arange(0.0, options.longest_s + 0.5 * options.spacing_s, options.spacing_s)
+        # the first and the last delay are on their neighbours' parabolas
+        self._middle = np.clip(np.arange(len(self.delays)), 1, len(self.delays) - 2)
         self.clear()
 
     def clear(self) -> None:
@@ -153,12 +155,12 @@ class DelaySearch:
         if not self._evidence:
             return Belief(0.0, present_s, 0.0, 0.0)
         last, options = self._evidence[-1], self.options
-        if last.delays.max() + 0.125 * np.abs(np.diff(last.delays, 2)).max() < last.filter - IMPOSSIBLE:
-            return Belief(0.0, present_s, 0.0, 0.0)  # even between two delays: no parabola rises more above its points
-        delays, evidence = self._between(last.delays)
+        delays, evidence = self._between(last.delays, max(last.filter, float(last.delays.max())) - IMPOSSIBLE)
         other = np.abs(delays - present_s) > options.least_s
+        if not other.any():
+            return Belief(0.0, present_s, 0.0, 0.0)
         as_now = max([last.filter, *evidence[~other]])
-        likely = evidence[other] + math.log(options.prior / len(delays))
+        likely = evidence[other] + math.log(options.prior / (len(FINER) * len(self.delays)))
         most = max(as_now, float(likely.max()))
         weights = np.exp(likely - most)
         weights /= weights.sum() + math.exp(as_now - most)
@@ -171,14 +173,20 @@ class DelaySearch:
         spread = math.sqrt(float(weights[near] @ (delays[near] - delay) ** 2) / around)
         return Belief(float(weights.sum()), delay, spread, around)
 
-    def _between(self, evidence: Floats) -> tuple[Floats, Floats]:
-        """Delays and evidence ten times as dense: parabolas through neighbours. A fast robot moves by more than the noise between two delays."""
-        at = np.clip(np.arange(len(evidence)), 1, len(evidence) - 2)
-        before, middle, after = evidence[at - 1], evidence[at], evidence[at + 1]
-        offset = np.arange(len(evidence))[:, None] - at[:, None] + FINER
-        slope, curvature = 0.5 * (after - before)[:, None], 0.5 * (before - 2.0 * middle + after)[:, None]
+    def _between(self, evidence: Floats, least: float) -> tuple[Floats, Floats]:
+        """Delays and evidence ten times as dense: parabolas through neighbours. A fast robot moves by more than the noise between two delays.
+
+        Parabolas that cannot reach ``least`` are left out: none rises higher above its points than by an eighth of their second difference.
+        """
+        before, middle, after = evidence[:-2], evidence[1:-1], evidence[2:]
+        bent = before - 2.0 * middle + after
+        highest = np.maximum(np.maximum(before, after), middle) + 0.125 * np.abs(bent)
+        place = np.flatnonzero(highest[self._middle - 1] >= least)
+        at = self._middle[place]
+        offset = (place - at)[:, None] + FINER
+        slope, curvature = 0.5 * (after - before)[at - 1, None], 0.5 * bent[at - 1, None]
         delays = self.delays[at][:, None] + self.options.spacing_s * offset
-        dense = middle[:, None] + offset * (slope + offset * curvature)
+        dense = middle[at - 1, None] + offset * (slope + offset * curvature)
         inside = (delays >= 0.0) & (delays <= self.options.longest_s)
         return delays[inside], dense[inside]
 

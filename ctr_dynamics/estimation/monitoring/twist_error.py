@@ -15,7 +15,7 @@ from ctr_dynamics.estimation.discretisation import VibrationErrors
 from ctr_dynamics.estimation.filter.ekf import RodEkf
 from ctr_dynamics.estimation.filter.filter_records import TipEstimate
 from ctr_dynamics.estimation.filter.rational_step import FOLLOWED_S, Stride, error_rates
-from ctr_dynamics.kernels.twist_errors import add_by_modes, add_frame_error, add_motion_error, follow_motion
+from ctr_dynamics.kernels.output_errors import add_by_modes, add_frame_error, add_motion_error, follow_motion
 from ctr_dynamics.robot import Robot
 from ctr_dynamics.sensing import Tip
 

@@ -1,4 +1,9 @@
-"""What the covariance of the tip's twist gets beside the covariance factor; see :mod:`ctr_dynamics.estimation.monitoring.twist_error`."""
+"""What the covariance of the tip gets beside the covariance factor.
+
+See :mod:`ctr_dynamics.estimation.monitoring.twist_error` and :mod:`ctr_dynamics.estimation.inputs.actuator_error`.
+"""
+
+import math
 
 import numpy as np
 
@@ -70,3 +75,25 @@ def add_by_modes(variances, of_one, covariance):
         for i in range(12):
             for k in range(12):
                 covariance[i, k] += variances[mode] * of_one[mode, 12 * i + k]
+
+
+@compiled
+def add_actuator_error(error, length, actuators, position, duration, covariance):
+    """Add to ``covariance`` (12, 12) what deviations ``error`` (2 N,) of the ``actuators`` (2 N,) make, in a ``duration`` (s) for the twist.
+
+    ``length``: m, of tube 1; ``position`` (3,): of the tip. Returns the variance of a position, m^2 per axis.
+    """
+    n = len(error) // 2
+    turned = moved = 0.0
+    for i in range(n):
+        turned += error[i] ** 2
+        moved += error[n + i] ** 2
+    if turned + moved == 0.0:
+        return 0.0
+    arm = max(0.5 * (length + actuators[n]), math.hypot(position[0], position[1]))
+    moved += arm**2 * turned
+    for i in range(6):
+        variance = moved if i < 3 else turned
+        covariance[i, i] += variance
+        covariance[6 + i, 6 + i] += variance * (2.0 / duration) ** 2
+    return moved
