@@ -32,7 +32,7 @@ from ctr_dynamics.estimation.monitoring.twist_error import TwistError
 from ctr_dynamics.estimation.monitoring.unexpected_innovation import UnexpectedInnovation
 from ctr_dynamics.estimation.out_of_sequence import OutOfSequence
 from ctr_dynamics.estimation.runs import Runs
-from ctr_dynamics.estimation.step_output import SolverStats, StepOutput
+from ctr_dynamics.estimation.step_output import Innovation, SolverStats, StepOutput
 from ctr_dynamics.estimation.timeline import seconds
 from ctr_dynamics.estimation.tip_jacobian import JacobianTracker
 from ctr_dynamics.io.messages.topics import STEP_NS
@@ -424,18 +424,16 @@ class Estimator:
             self.innovations.pass_over()
         self._stability_due |= k % options.stability_every == 0
         if of_no_use:
-            health.problem = of_no_use
-            return StepOutput.invalid(stamp, k, of_no_use, innovations)
+            return self._invalid(k, of_no_use, innovations)
         fused.inflate_covariance(tip, self.runs.open_loop, self._largest_deviation)
         self._unexpected.inflate(tip.covariance, stamp)
         self._twist_error.inflate(tip, stamp, open_loop, fused.ekf, self.inputs.joint_period_s)
         self._driven_m = self.inputs.actuator_error.inflate(
             tip.covariance, tip.position, self._length, stamp, late.lag * STEP_NS
         )
-        deviation = tip.position_deviation
         since = fused.measured_ns if fused.measured_ns is not None else self.t0_ns
         health.tracker_age_s = max(0.0, (stamp - (since or stamp)) * 1e-9)
-        problem = health.problem = self._problem(stamp, deviation, unsettled)
+        problem = health.problem = self._problem(stamp, tip.position_deviation, unsettled)
         return StepOutput(
             stamp, k, not problem, problem, tip.position, tip.quaternion, tip.covariance[:6, :6], tip.twist, tip.covariance[6:, 6:],
             predicted[:3], predicted[3:], self._backbone.rows(fused.state), self._modes.measure(fused.state, k), fused.ekf.force,
@@ -443,9 +441,9 @@ class Estimator:
             fused.state.inputs.beta.tolist(), self._jacobian.measure(fused.state),
         )  # fmt: skip
 
-    def _invalid(self, k: int, reason: str) -> StepOutput:
+    def _invalid(self, k: int, reason: str, taken: Sequence[Innovation] = ()) -> StepOutput:
         self.health.problem = reason
-        return StepOutput.invalid(self.timeline.stamp(k), k, reason, self.innovations.take())
+        return StepOutput.invalid(self.timeline.stamp(k), k, reason, [*taken, *self.innovations.take()])
 
     def _problem(self, stamp: int, deviation: float, unsettled: str) -> str:
         """Why the output of that stamp (ns) and ``deviation`` of the tip (m) cannot be trusted; empty when it can.
