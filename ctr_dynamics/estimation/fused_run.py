@@ -265,5 +265,5 @@ class FusedRun:
 
     def restore(self, stored: FusedState) -> None:
         """Return to a checkpoint."""
-        self.state = stored.state.copy()
+        self.state = stored.state.copy_into(self.state)
         self.ekf.restore(stored.filter)

@@ -79,5 +79,5 @@ class OpenLoopRun:
 
     def restore(self, stored: OpenLoopState) -> None:
         """Return to a checkpoint."""
-        self.state = stored.state.copy()
+        self.state = stored.state.copy_into(self.state)
         self.tips.restore(stored.tips)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -39,40 +40,23 @@ SWEEPS = 60  # of one solve: a jump of the load within a step takes up to 40
 
 
 class Workspace(NamedTuple):
-    """Buffers for the sections of one key: of the mesh with its cuts, for collocation, and for the rescue; whether Jacobians are ``condensed``."""
+    """Buffers for the sections of one key: of the mesh with its cuts, for collocation, and for the rescue; whether Jacobians are ``condensed``, and
+    the shapes of their factors."""
 
     segments: Segments
     condensed: bool
-    kind: RobotKind
+    factor_shapes: Sequence[tuple[int, ...]]
     solver: CollocationSolver
     rescue: SegmentedSolver
 
-    def _factor_shapes(self) -> list[tuple[int, ...]]:
-        m, size, E, cuts = (
-            unknown_rows(self.kind.tubes).size,
-            cut_size(self.kind),
-            STAGES // 2,
-            len(self.segments.nodes),
-        )
-        if self.condensed:
-            return [
-                (E, cuts, 2, size, size),
-                (E, cuts, 2, m, size),
-                (E, 2, m, size),
-                (E, 2, m, m),
-                (E, 2, 0, 0),
-            ]
-        mt = m + cuts * size
-        return [(E, 0, 2, 0, 0), (E, 0, 2, 0, 0), (E, 2, 0, 0), (E, 2, 0, 0), (E, 2, mt, mt)]
-
     def new_factors(self) -> Floats:
         """Room for the factors of a run."""
-        return aligned_zeros(sum(math.prod(shape) for shape in self._factor_shapes()))
+        return aligned_zeros(sum(math.prod(shape) for shape in self.factor_shapes))
 
     def factors_in(self, block: Floats) -> SystemFactors:
         """Views of such room as factors."""
         parts, start = [], 0
-        for shape in self._factor_shapes():
+        for shape in self.factor_shapes:
             size = math.prod(shape)
             parts.append(block[start : start + size].reshape(shape))
             start += size
@@ -142,7 +126,17 @@ class Workspaces:
             model.sweep_buffers(mesh, 1, cuts), model.sweep_buffers(mesh, segment_lanes(kind).count, cuts),
             np.ones(mt), np.ones(mt), STEP, self.tolerance, SWEEPS,
         )  # fmt: skip
-        return Workspace(segments, segments.growth < CONDENSED, kind, solver, rescue)
+        condensed = segments.growth < CONDENSED
+        return Workspace(segments, condensed, _factor_shapes(kind, cuts, condensed), solver, rescue)
+
+
+def _factor_shapes(kind: RobotKind, cuts: int, condensed: bool) -> Sequence[tuple[int, ...]]:
+    """Shapes of the arrays of :class:`SystemFactors`, with that many ``cuts``."""
+    m, size, E = unknown_rows(kind.tubes).size, cut_size(kind), STAGES // 2
+    if condensed:
+        return (E, cuts, 2, size, size), (E, cuts, 2, m, size), (E, 2, m, size), (E, 2, m, m), (E, 2, 0, 0)
+    mt = m + cuts * size
+    return (E, 0, 2, 0, 0), (E, 0, 2, 0, 0), (E, 2, 0, 0), (E, 2, 0, 0), (E, 2, mt, mt)
 
 
 def starts_at(model: Model, unknowns: Floats, nodes: Floats, segments: Segments) -> Floats:

@@ -91,6 +91,9 @@ def at_inputs(model: Model, parameters: np.ndarray, now: Inputs) -> np.ndarray:
     return par
 
 
+OWN_ARRAYS = ("bank", "unknowns", "earlier", "inverse", "nodes", "times")  # of a state, which it writes to
+
+
 @dataclass
 class State:
     """Everything that lives between steps; :meth:`copy` makes an independent one.
@@ -125,6 +128,16 @@ class State:
             self.key, self.mesh, self.bank.copy(), self.unknowns.copy(), self.earlier.copy(), self.inverse.copy(), self.usable,
             self.nodes.copy(), self.inputs, self.times.copy(), self.known, self.fewest, self.beyond,
         )  # fmt: skip
+
+    def copy_into(self, room: State | None) -> State:
+        """An independent copy, in the arrays of ``room`` where those are as large; it is nobody else's then."""
+        if room is None or any(getattr(room, name).shape != getattr(self, name).shape for name in OWN_ARRAYS):
+            return self.copy()
+        for name in OWN_ARRAYS:
+            getattr(room, name)[:] = getattr(self, name)
+        room.key, room.mesh, room.usable, room.inputs = self.key, self.mesh, self.usable, self.inputs
+        room.known, room.fewest, room.beyond = self.known, self.fewest, self.beyond
+        return room
 
     def become(self, other: State) -> None:
         """Take over all that ``other`` holds, to go on with a fresh Jacobian."""

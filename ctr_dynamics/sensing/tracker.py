@@ -306,7 +306,11 @@ class TrackerModel:
             position, quaternion = p[0], q[0]
         shift = self.translation
         position = (position - shift - self.drift * stamp) / self.scale + shift
-        return stamp / (1.0 + self.skew), position, quaternion
+        return self.own_time(stamp), position, quaternion
+
+    def own_time(self, stamp: float) -> float:
+        """Time (s) of a ``stamp`` (s) without the error of the clock's rate."""
+        return stamp / (1.0 + self.skew)
 
     def to_base(
         self, position: Floats, quaternion: Floats, tip: Floats | None = None

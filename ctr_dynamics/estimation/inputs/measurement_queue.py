@@ -148,13 +148,16 @@ class MeasurementQueue:
         assert t0_ns is not None
         due = []
         for measurement in self.measurements:
+            stamp_s = (measurement.stamp_ns - t0_ns) * 1e-9
+            if tracker.own_time(stamp_s) - tracker.delay > t + 1e-9:
+                break  # so are all behind it
             if measurement.fused_k is None:
-                stamp_s = (measurement.stamp_ns - t0_ns) * 1e-9
-                time_s, position, quaternion = tracker.undistorted(
-                    stamp_s, measurement.position, measurement.quaternion
+                due.append(
+                    DueMeasurement(
+                        measurement,
+                        *tracker.undistorted(stamp_s, measurement.position, measurement.quaternion),
+                    )
                 )
-                if time_s - tracker.delay <= t + 1e-9:
-                    due.append(DueMeasurement(measurement, time_s, position, quaternion))
         return due
 
     def first_fusion(self, k: int) -> float:
