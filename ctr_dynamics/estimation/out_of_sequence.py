@@ -39,7 +39,7 @@ class CorrectionOptions:
             in the time of one or two outputs. With extrapolated joints every step has one.
         reuse_lag: steps. Joints that are no later, as in regular operation, move the robot so little that the corrected steps can reuse the
             stored covariance: that moves the fused tip by micrometres.
-        largest_lag: steps. Uncorrected steps go no farther ahead than 0.1 s. Beyond, the correction goes first.
+        largest_lag: steps. Uncorrected steps go no farther ahead than 0.1 s of a changed load. Beyond, the correction goes first.
         first_cost_s: what taking a step again is thought to cost before the first has been measured.
         cost_weight: of the newest cost in the running mean.
     """
@@ -195,13 +195,13 @@ class OutOfSequence:
         """Whether the next step may be taken before the correction.
 
         Not where joints are waited for, as steps are then not due by a clock. Not where the load has jumped: measurements fused into a
-        trajectory without the jump would throw the estimate off by more than what they measure. And not where the lag is large.
+        trajectory without the jump would throw the estimate off by more than what they measure. And not where the lag is large. For joints
+        it is where the covariance could not be reused any more: a machine that is too slow for both would from then on have even more to do.
         """
-        last = self.history.last
+        last, options = self.history.last, self.options
         stored = last is not None and last.k == self._inputs.timeline.k
-        return (
-            self._inputs.extrapolating and stored and self.lag < self.options.largest_lag and not self._urgent
-        )
+        limit = options.reuse_lag if self._joints_only else options.largest_lag
+        return self._inputs.extrapolating and stored and self.lag < limit and not self._urgent
 
     # -- 3. correct --
 
@@ -209,16 +209,17 @@ class OutOfSequence:
         """Revert to the last checkpoint before the change and take the steps again, up to the last that was taken.
 
         Args:
-            spare_s: tells the time (s) until the next step is due. With it, the correction goes on only while there is time.
+            spare_s: tells the time (s) until the next step is due. With it, the correction goes on only while there is time, or to its end where
+                no step may go ahead of it.
 
         Returns:
             Whether the runs have started again at step 0.
         """
         timeline, options = self._inputs.timeline, self.options
-        if spare_s is not None and self.may_go_ahead and spare_s() < self._step_s:
-            return False
-        if self._urgent:
+        if not self.may_go_ahead:
             spare_s, self._urgent = None, False
+        elif spare_s is not None and spare_s() < self._step_s:
+            return False
         from_ns, self._from_ns = self._from_ns, None
         joints_only, self._joints_only = self._joints_only, True
         assert from_ns is not None and timeline.t0_ns is not None
@@ -245,8 +246,7 @@ class OutOfSequence:
         # the next joints will return to the last step that these cover; later changes return to one of every eighth
         covered = (self._inputs.joints.stamps[-1] - timeline.t0_ns) // STEP_NS
         for k in range(self._runs.k + 1, reached + 1):
-            waits = reached in later and reached - k < options.largest_lag
-            if spare_s is not None and waits and spare_s() < self._step_s:
+            if spare_s is not None and reached in later and spare_s() < self._step_s:
                 self._postpone(k - 1, later, joints_only and k <= reuse_before)
                 break
             begin = time.perf_counter()

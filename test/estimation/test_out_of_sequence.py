@@ -85,17 +85,32 @@ def test_a_step_goes_ahead_only_on_time_and_near_the_correction():
     made.late.load_changed(START_NS + (made.k - 5) * STEP_NS, jumped=True)
     assert not made.late.may_go_ahead
     far = run("predict")
-    far.late.changed(START_NS + (far.k - OPTIONS.largest_lag) * STEP_NS)
+    far.late.changed(START_NS + (far.k - OPTIONS.reuse_lag) * STEP_NS)
     assert not far.late.may_go_ahead
+    load = run("predict")
+    load.late.load_changed(START_NS + (load.k - OPTIONS.reuse_lag) * STEP_NS, jumped=False)
+    assert load.late.may_go_ahead
+    load.late.load_changed(START_NS + (load.k - OPTIONS.largest_lag) * STEP_NS, jumped=False)
+    assert not load.late.may_go_ahead
+
+
+def test_a_correction_that_is_far_behind_is_done_though_there_is_no_time():
+    """Going ahead of it, a machine that is too slow for both would have even more to do with every step."""
+    made = run("predict", poses=False)
+    made.late.changed(START_NS + (made.k - OPTIONS.reuse_lag) * STEP_NS)
+    again = made.health.corrected_steps
+    made.late.correct(lambda: 0.0)
+    assert not made.late.pending
+    assert made.health.corrected_steps - again == OPTIONS.reuse_lag
 
 
 def test_a_correction_without_time_goes_on_from_where_it_was():
     made = run("predict", poses=False)
-    k, lag, calls, again = made.k, 20, [], made.health.corrected_steps
+    k, lag, calls, again = made.k, OPTIONS.reuse_lag - 1, [], made.health.corrected_steps
 
     def spare_s():
         calls.append(1)
-        return 1.0 if len(calls) <= 6 else 0.0
+        return 1.0 if len(calls) <= 3 else 0.0
 
     before = standing(made)
     made.late.changed(START_NS + (k - lag) * STEP_NS)
