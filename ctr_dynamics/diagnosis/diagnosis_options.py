@@ -388,6 +388,36 @@ class LearnedForceOptions:
 
 
 @dataclass(frozen=True)
+class DesignOptions:
+    """Next experiment: what motions are put together from."""
+
+    rivals: int = option(3, COUNT, "likeliest ones; the smallest separation counts")
+    blocks: int = option(12, COUNT, "random motions that are simulated; more rarely hold a better one")
+    block_s: float = option(5.0, "s", "of a motion: several periods of a slow robot")
+    pause_s: float = option(0.5, "s", "at rest behind a motion, in which vibrations show by themselves")
+    longest_s: float = option(
+        44.0, "s", "of the experiment: a minute of a robot's time, minutes of a diagnosis"
+    )
+    turning_points: tuple[int, ...] = option(
+        (1, 2, 4, 8, 14), COUNT, "of a spline: slow and wide to fast and small"
+    )
+    fastest_rad_s: float = option(3.0, "rad/s", "half a turn in a second, as laboratory drives make")
+    fastest_m_s: float = option(0.02, "m/s", "likewise, of a lead screw")
+    farthest_rad: float = option(6.3, "rad", "one turn; friction and wires of drives rarely allow more")
+    farthest_translation: float = option(0.15, "of the exposed length", "tubes keep most of their overlap")
+    deflection: float = option(
+        0.3,
+        "of the exposed length",
+        "by a hung weight, as the shipped `release` bends the robot of the paper",
+    )
+    least_stability: float = option(
+        0.3, "of that at rest", "the measure falls as the root of the way to a snap: a tenth of it is left"
+    )
+    least_gain: float = option(0.03, "of the separation", "a motion that adds less is not worth its time")
+    seed: int = option(1, COUNT, "of the random motions; the same diagnosis proposes the same experiment")
+
+
+@dataclass(frozen=True)
 class ReportOptions:
     """Output: what is said and shown."""
 
@@ -417,6 +447,7 @@ class DiagnosisOptions:
     tolerances: ToleranceOptions = ToleranceOptions()
     unexplained_force: UnexplainedForceOptions = UnexplainedForceOptions()
     learned_force: LearnedForceOptions = LearnedForceOptions()
+    design: DesignOptions = DesignOptions()
     report: ReportOptions = ReportOptions()
 
 

@@ -1,40 +1,48 @@
-"""Next experiment: which motion of the library would tell two hypotheses apart, by how much.
+"""Next experiment: the motion that would tell a cause from its rivals, and by how much.
 
-In: a diagnosis. Out: a scenario of the library with the separation that it would give, or none where nothing is left to tell apart.
+In: a diagnosis. Out: a scenario with the separation that it would give, or none where nothing is left to tell apart.
+
+What blocks of motion tell of the parameters adds up (Fisher information). So each block is simulated once, and the experiment takes, one after
+another, the block that adds most to the smallest separation: a greedy exact design (Fedorov 1972, for another criterion). The whole is then
+simulated as it is.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from joblib import delayed
 from numpy.typing import NDArray
 
+from ctr_dynamics.diagnosis.diagnosis_options import DesignOptions
 from ctr_dynamics.diagnosis.diagnosis_result import Diagnosis
+from ctr_dynamics.diagnosis.experiment_design import MotionBlock, motion_blocks, scenario_of
 from ctr_dynamics.diagnosis.forward_model import ForwardModel
 from ctr_dynamics.diagnosis.inference.candidates import Candidate
 from ctr_dynamics.diagnosis.inference.fit_problem import Problem
 from ctr_dynamics.diagnosis.inference.map_fit import Fit
 from ctr_dynamics.diagnosis.inference.sensitivities import Sensitivities
-from ctr_dynamics.diagnosis.inference.separation import separation, separation_in
+from ctr_dynamics.diagnosis.inference.separation import departures, left_over_products, prior_scales
 from ctr_dynamics.diagnosis.recording import Recording
+from ctr_dynamics.diagnosis.run_context import RunContext
 from ctr_dynamics.diagnosis.step_choice import with_chosen_steps
 from ctr_dynamics.diagnosis.whitening import Whitener
+from ctr_dynamics.effects import EffectQuantity
 from ctr_dynamics.errors import InputError
 from ctr_dynamics.model.model import Model
 from ctr_dynamics.robot import Robot
-from ctr_dynamics.simulation.scenario import Scenario, load_scenario
+from ctr_dynamics.simulation.scenario import Scenario
 from ctr_dynamics.simulation.scenario_run import drives
 
 Floats = NDArray[np.float64]
-LIBRARY = ("release", "light_release", "reversals", "turns")
-MOST_EXCITING = "release"
 
 
 @dataclass(frozen=True)
 class NextExperiment:
-    """A scenario of the library and what it is worth; separations in whitened units, None where unknown."""
+    """A scenario and what it is worth; separations in whitened units, None where unknown."""
 
     description: str
     scenario: Scenario
@@ -42,35 +50,142 @@ class NextExperiment:
     after: float | None
 
 
-def next_experiment(diagnosis: Diagnosis) -> NextExperiment | None:
+def next_experiment(diagnosis: Diagnosis, context: RunContext | None = None) -> NextExperiment | None:
     """The most informative experiment; None where nothing is left to tell apart."""
-    d = diagnosis
+    d, options = diagnosis, diagnosis.options.design
     if d.verdict == "not_excited":
-        scenario = load_scenario(MOST_EXCITING)
-        text = f"{scenario.description}: excites bending and torsion, which these bags do not"
-        return NextExperiment(text, scenario, None, None)
+        rest, *motions = motion_blocks(d.robot, options)
+        scenario = scenario_of(d.robot, [rest, motions[0]], options)
+        text = "A weight that is cut, and a motion of all tubes: bending and torsion, which these bags do not show"
+        return NextExperiment(text, _described(scenario, text), None, None)
     if d.problem is None or d.extended is None or d.sensitivities is None:
         return None
     cause = next((c for c in d.causes if c.candidate is not None and c.rivals), None)
     if cause is None or cause.candidate is None or cause.separation is None:
         return None
-    rival = next((c for c in d.sensitivities.by_candidate if c.effect == cause.rivals[0]), None)
-    if rival is None:
+    rivals = [c for c in d.sensitivities.by_candidate if c.effect in cause.rivals[: options.rivals]]
+    if not rivals:
         return None
-    before = separation(d.problem, d.extended, (cause.candidate,), rival, d.sensitivities)
-    best: NextExperiment | None = None
-    for name in LIBRARY:
-        scenario = load_scenario(name)
+    contrast = Contrast(d.problem, d.extended, d.sensitivities, cause.candidate, rivals)
+    before = contrast.smallest(contrast.nothing)
+    designed = _designed(contrast, options, context or RunContext())
+    if designed is None:
+        return None
+    scenario, after = designed
+    names = ", ".join(dict.fromkeys(c.effect for c in rivals))
+    text = f"{_kinds(scenario)}, {scenario.duration_s:.0f} s; tells {cause.effect} from {names}"
+    return NextExperiment(text, _described(scenario, text), before, after)
+
+
+def _kinds(scenario: Scenario) -> str:
+    """What happens, in words."""
+    said = ["a weight that is cut"] if scenario.loads else []
+    said += ["turning tubes"] if any(t.rotation for t in scenario.tubes) else []
+    said += ["tubes that slide"] if any(t.translation for t in scenario.tubes) else []
+    text = ", ".join(said)
+    return text[:1].upper() + text[1:]
+
+
+def _described(scenario: Scenario, text: str) -> Scenario:
+    return scenario.model_copy(update={"description": text})
+
+
+def _designed(
+    contrast: Contrast, options: DesignOptions, context: RunContext
+) -> tuple[Scenario, float] | None:
+    """The blocks that tell most together, as a scenario, and its smallest separation; None where none can be simulated."""
+    robot = contrast.problem.robot
+    blocks = motion_blocks(robot, options)
+    told = context.run(delayed(contrast.told)(scenario_of(robot, [b], options)) for b in blocks)
+    known = [(b, products) for b, products in zip(blocks, told, strict=True) if products is not None]
+    chosen: list[MotionBlock] = []
+    total, size = contrast.nothing, contrast.smallest(contrast.nothing)
+    for _ in range(int(options.longest_s / (options.block_s + options.pause_s))):
+        sizes = [contrast.smallest(total + products) for _, products in known]
+        if not sizes or max(sizes) < (1.0 + options.least_gain) * size:
+            break
+        block, products = known[int(np.argmax(sizes))]
+        chosen.append(block)
+        total, size = total + products, max(sizes)
+    while chosen:
+        scenario = scenario_of(robot, chosen, options)
+        whole = contrast.told(scenario, exact=True)
+        if whole is not None:
+            return scenario, contrast.smallest(whole)
+        chosen.pop()
+    return None
+
+
+class Contrast:
+    """A cause against its rivals, each alone.
+
+    Args:
+        problem, fit, sensitivities: of the bags at hand. own: the cause, which ``fit`` holds. rivals: what could do the same.
+    """
+
+    def __init__(
+        self,
+        problem: Problem,
+        fit: Fit,
+        sensitivities: Sensitivities,
+        own: Candidate,
+        rivals: Sequence[Candidate],
+    ) -> None:
+        self.problem, self._fit = problem, fit
+        active = {q.key for q in fit.active}
+        others: dict[tuple[str, str], EffectQuantity] = {
+            q.key: q for rival in rivals for q in rival.quantities if q.key not in active
+        }
+        self._others = tuple(others.values())
+        self._point = {**fit.point, **{key: value for rival in rivals for key, value in rival.start}}
+        a, places = len(fit.active), list(others)
+        self._scales, self._departure = prior_scales(fit, (own,)), departures(fit, (own,))
+        # of each rival: its columns among all, and the products of those of the bags at hand with the errors of the solver
+        self._rivals: list[tuple[list[int], Floats]] = []
+        for rival in rivals:
+            free = [i for i, q in enumerate(rival.quantities) if q.key not in active]
+            against = sensitivities.by_candidate[rival][:, free] * [rival.quantities[i].scale for i in free]
+            columns = np.hstack([fit.columns, against, problem.numerics])
+            own_columns = [*range(a), *(a + places.index(rival.quantities[i].key) for i in free)]
+            self._rivals.append((own_columns, columns.T @ columns))
+        self.nothing = np.zeros((a + len(others), a + len(others)))
+
+    def smallest(self, told: Floats) -> float:
+        """The separation from the nearest rival by the bags at hand and what else is ``told``: products of columns, of :meth:`told` or sums."""
+        return min(self._separation(columns, products, told) for columns, products in self._rivals)
+
+    def _separation(self, columns: list[int], products: Floats, told: Floats) -> float:
+        a, n = len(self._scales), len(columns)
+        total = products.copy()
+        total[:n, :n] += told[np.ix_(columns, columns)]
+        scales = np.concatenate([self._scales, np.ones(len(total) - a)])
+        cause = total[:, :a] @ self._departure
+        square = self._departure @ cause[:a]
+        found = left_over_products(
+            total * np.multiply.outer(scales, scales), (scales * cause)[:, None], np.array([[square]])
+        )
+        return float(found[0])
+
+    def told(self, scenario: Scenario, exact: bool = False) -> Floats | None:
+        """Products of the whitened columns that a bag of ``scenario`` would have, of all active values and of the rivals' by their scales; None
+        where it cannot be simulated. ``exact``: with steps that are chosen for it, not with the shortest throughout."""
+        problem, fit = self.problem, self._fit
         try:
-            after = _separation_with(
-                scenario, d.problem, d.extended, d.sensitivities, (cause.candidate, rival)
-            )
+            recording = recording_of(scenario, problem.robot, problem.options.forward_model.fine_nodes)
+            mask = problem.whiteners[0].mask
+            whiten = Whitener(problem.robot, recording.stamps, mask, np.ones(len(recording.stamps), bool))
+            model = ForwardModel(recording, problem.robot, problem.forward_models[0].options)
+            if exact:
+                model = with_chosen_steps(model, whiten, fit.point, problem.options.steps)
+            prediction, jacobian = model.jacobian(self._point, (*fit.active, *self._others))
         except InputError:
-            continue
-        if after is not None and (best is None or best.after is None or after > best.after):
-            text = f"{scenario.description}; tells {cause.effect} from {rival.effect}"
-            best = NextExperiment(text, scenario, before, after)
-    return best
+            return None
+        if prediction.failure:
+            return None
+        scales = np.array([*(q.scale for q in fit.active), *(1.0 for _ in self._others)])
+        columns = whiten(jacobian) / scales
+        products: Floats = columns.T @ columns
+        return products if np.isfinite(products).all() else None
 
 
 def recording_of(scenario: Scenario, robot: Robot, nodes: int) -> Recording:
@@ -91,33 +206,3 @@ def recording_of(scenario: Scenario, robot: Robot, nodes: int) -> Recording:
     return Recording(
         scenario.description, scenario.source, {}, joints, load, stamps, np.zeros((len(stamps), 3)), still, ()
     )
-
-
-def _separation_with(
-    scenario: Scenario,
-    problem: Problem,
-    fit: Fit,
-    sensitivities: Sensitivities,
-    pair: tuple[Candidate, Candidate],
-) -> float | None:
-    """Separation of a cause from its rival (``pair``) with the bags of ``problem`` and one of ``scenario`` together."""
-    own, rival = pair
-    recording = recording_of(scenario, problem.robot, problem.options.forward_model.fine_nodes)
-    mask = problem.whiteners[0].mask
-    whiten = Whitener(problem.robot, recording.stamps, mask, np.ones(len(recording.stamps), bool))
-    forward_model = ForwardModel(recording, problem.robot, problem.forward_models[0].options)
-    forward_model = with_chosen_steps(forward_model, whiten, fit.point, problem.options.steps)
-    rivals = [q for q in rival.quantities if q.key not in {x.key for x in fit.active}]
-    point = {**fit.point, **dict(rival.start)}
-    prediction, jacobian = forward_model.jacobian(point, (*fit.active, *rivals))
-    if prediction.failure:
-        return None
-    columns = whiten(jacobian)
-    a = len(fit.active)
-    old_rival = sensitivities.by_candidate[rival]
-    chosen = [i for i, q in enumerate(rival.quantities) if q.key in {x.key for x in rivals}]
-    old_rival = old_rival[:, chosen] * [rival.quantities[i].scale for i in chosen]
-    everything = np.vstack([fit.columns, columns[:, :a] / [q.scale for q in fit.active]])
-    against = np.vstack([old_rival, columns[:, a:]])
-    numerics = np.vstack([problem.numerics, np.zeros((len(columns), problem.numerics.shape[1]))])
-    return separation_in(fit, everything, (own,), against, numerics)

@@ -66,7 +66,7 @@ def run(request: Request, context: RunContext | None = None) -> dict[str, Any]:
             "without a validation bag the gain is not measured, and a wrong cause that fits is not found out"
         )
     context.report("next experiment")
-    proposed = next_experiment(diagnosis)
+    proposed = next_experiment(diagnosis, context)
     with replaced_files(directory, FILES) as staged:
         content = findings(diagnosis, request.command, _write_scenario(proposed, staged))
         write(staged, diagnosis, content)

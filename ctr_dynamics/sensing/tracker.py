@@ -269,7 +269,8 @@ class TrackerModel:
         ``tip_at`` as for :meth:`forward`, with quaternions of any length; ``columns_at`` gives their derivatives at times (s,): (s, 7 r).
         """
         times = self.observed_times(stamps)
-        rows = self.averaged(columns_at, times).reshape(len(times), 7, -1)
+        rows = self.averaged(columns_at, times)
+        rows = rows.reshape(len(times), 7, rows.shape[1] // 7)
         tip = self.averaged(tip_at, times)
         h = tip[:, 3:]
         norm2 = np.sum(h * h, axis=1)[:, None]

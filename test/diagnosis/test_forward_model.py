@@ -65,6 +65,15 @@ def test_columns_together_are_those_apart(recording, robot, known):
     assert np.abs(together[:, :3, 1] - slope).max() < 0.03 * np.abs(slope).max()
 
 
+def test_a_part_before_the_first_measurement_has_no_columns(recording, robot, known):
+    """Where parts of several recordings grow together, one may have measurements so early and another none."""
+    early = replace(recording, stamps=recording.stamps + 0.5)
+    of = [known[STIFFNESS], known[AIR]]
+    prediction, columns = ForwardModel(early, robot).until(0.4).jacobian({}, of)
+    assert not prediction.failure
+    assert columns.shape == (0, 6, 2)
+
+
 def test_the_misfit_is_a_smooth_function_of_delays(robot, known):
     """Drives and load later by as much as the tracker is earlier is the same experiment, wherever in the steps their samples fall."""
     rng = np.random.default_rng(2)

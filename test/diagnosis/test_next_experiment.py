@@ -8,7 +8,7 @@ import pytest
 from ctr_dynamics.diagnosis import next_experiment
 from ctr_dynamics.diagnosis.diagnosis_options import DiagnosisOptions
 from ctr_dynamics.diagnosis.inference.candidates import candidates
-from ctr_dynamics.diagnosis.inference.separation import separation
+from ctr_dynamics.diagnosis.inference.separation import separation, separation_in
 from ctr_dynamics.effects import effect_quantities
 from ctr_dynamics.robot_files import load_robot
 from ctr_dynamics.simulation.scenario import load_scenario
@@ -34,23 +34,27 @@ def case(monkeypatch):
         robot=TISSUE, options=DiagnosisOptions(), numerics=rng.normal(size=(ROWS, 1)), whiteners=[SimpleNamespace(mask=None)],
         forward_models=[SimpleNamespace(options=None)],
     )  # fmt: skip
-    made = SimpleNamespace(added=np.zeros((ROWS, 3)))
-    scales = np.array([q.scale for q in (*active, *rival.quantities)])
+    against = sensitivities.by_candidate[rival] * rival.quantities[0].scale
+    made = SimpleNamespace(added=np.zeros((ROWS, 3)), fit=fit, problem=problem, own=own, against=against)
+    scales = np.array([*(q.scale for q in active), 1.0])
     model = SimpleNamespace(
-        jacobian=lambda point, of: (SimpleNamespace(failure=""), made.added * scales)  # by coordinates
+        jacobian=lambda point, of: (SimpleNamespace(failure=""), made.added * scales)  # by scales
     )
     monkeypatch.setattr(next_experiment, "ForwardModel", lambda *given: model)
     monkeypatch.setattr(next_experiment, "with_chosen_steps", lambda model, *given: model)
     monkeypatch.setattr(next_experiment, "Whitener", lambda *given: lambda rows: rows)
     made.before = separation(problem, fit, (own,), rival, sensitivities)
-    made.after = lambda: next_experiment._separation_with(
-        load_scenario("turns"), problem, fit, sensitivities, (own, rival)
-    )
+    made.contrast = next_experiment.Contrast(problem, fit, sensitivities, own, [rival])
+    made.after = lambda: made.contrast.smallest(made.contrast.told(load_scenario("turns")))
     return made
 
 
-def test_an_experiment_that_shows_nothing_changes_nothing(case):
+def test_nothing_told_is_the_separation_of_the_bags_at_hand(case):
     assert case.before > 1.0
+    assert case.contrast.smallest(case.contrast.nothing) == pytest.approx(case.before, rel=1e-9)
+
+
+def test_an_experiment_that_shows_nothing_changes_nothing(case):
     assert case.after() == pytest.approx(case.before, rel=1e-9)
 
 
@@ -60,3 +64,15 @@ def test_more_data_never_tell_less(case):
     for size in (0.1, 1.0, 10.0):
         case.added = size * rng.normal(size=(ROWS, 3))
         assert case.after() > case.before
+
+
+def test_what_is_told_is_that_of_more_rows(case):
+    """Products of columns add up to what the separation with all rows is."""
+    rng = np.random.default_rng(3)
+    case.added = 3.0 * rng.normal(size=(ROWS, 3))
+    fit, problem, own = case.fit, case.problem, case.own
+    columns = np.vstack([fit.columns, case.added[:, :2]])
+    against = np.vstack([case.against, case.added[:, 2:]])
+    numerics = np.vstack([problem.numerics, np.zeros((ROWS, 1))])
+    whole = separation_in(fit, columns, (own,), against, numerics)
+    assert case.after() == pytest.approx(whole, rel=1e-9)

@@ -43,19 +43,26 @@ def separation_in(
         columns: (m, a) whitened, of the active values.
         against: (m, k) of a rival, by its scales. numerics: (m, j) of the error of the solver.
     """
-    own = {q.key for c in members for q in c.quantities}
-    gone = keys_of(members)
-    departure = np.array(
-        [v - q.off if q.key in own else 0.0 for q, v in zip(fit.active, fit.values, strict=True)]
-    )
-    wide = {q.key for q in fit.causes}
-    parts = [
-        columns[:, i] * math.sqrt(prior_variance(q, q.key in wide, fit.tolerance_factor))
-        for i, q in enumerate(fit.active)
-        if q.key not in gone
-    ]
-    J = np.hstack([np.stack(parts, axis=1) if parts else np.zeros((len(columns), 0)), against, numerics])
+    scales, departure = prior_scales(fit, members), departures(fit, members)
+    J = np.hstack([columns * scales, against, numerics])
     return float(left_over(J, (columns @ departure)[:, None])[0])
+
+
+def departures(fit: Fit, members: Sequence[Candidate]) -> Floats:
+    """(a,) how far the active values of ``members`` are off their nominal ones; 0 of all others."""
+    own = {q.key for c in members for q in c.quantities}
+    return np.array([v - q.off if q.key in own else 0.0 for q, v in zip(fit.active, fit.values, strict=True)])
+
+
+def prior_scales(fit: Fit, members: Sequence[Candidate]) -> Floats:
+    """(a,) prior deviations of the active values; 0 of those that are gone with ``members``."""
+    gone, wide = keys_of(members), {q.key for q in fit.causes}
+    return np.array(
+        [
+            0.0 if q.key in gone else math.sqrt(prior_variance(q, q.key in wide, fit.tolerance_factor))
+            for q in fit.active
+        ]
+    )
 
 
 def observable_sizes(problem: Problem, sensitivities: Sensitivities) -> dict[str, float]:
@@ -75,6 +82,11 @@ def observable_sizes(problem: Problem, sensitivities: Sensitivities) -> dict[str
 
 def left_over(J: Floats, sensitivity: Floats) -> Floats:
     """Sizes, largest first, of what columns ``J`` (m, a) with coefficients of unit prior deviation leave of ``sensitivity`` (m, k)."""
-    half = np.linalg.solve(np.linalg.cholesky(np.eye(J.shape[1]) + J.T @ J), J.T @ sensitivity)
-    squares = np.linalg.eigvalsh(sensitivity.T @ sensitivity - half.T @ half)[::-1]
+    return left_over_products(J.T @ J, J.T @ sensitivity, sensitivity.T @ sensitivity)
+
+
+def left_over_products(JJ: Floats, JS: Floats, SS: Floats) -> Floats:
+    """The same by the products of the columns: J^T J (a, a), J^T S (a, k) and S^T S (k, k)."""
+    half = np.linalg.solve(np.linalg.cholesky(np.eye(len(JJ)) + JJ), JS)
+    squares = np.linalg.eigvalsh(SS - half.T @ half)[::-1]
     return np.sqrt(np.maximum(squares, 0.0))
