@@ -74,6 +74,8 @@ def _bounds(p: EffectParameter) -> str:
     ends = sorted(p.value(end) if p.power != 1 else end for end in (p.low, p.high))
     if p.power < 0:
         return "above 0"
+    if p.least is not None:
+        return "at least as the robot file says"
     low, high = ends
     if math.isinf(low) and math.isinf(high):
         return ""

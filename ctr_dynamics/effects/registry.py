@@ -36,7 +36,7 @@ class EffectParameter:
             reciprocal.
         scale: 1-sigma of a plausible departure, in the parameter's coordinate (see :meth:`coordinate`); a function where it depends on the robot.
         tolerance: 1-sigma that the robot file allows, in the same coordinate.
-        low, high: bounds of the coordinate, inclusive.
+        low, high: bounds of the coordinate, inclusive. least: a further lower bound, which the robot sets.
         text: what it is.
         power: the coordinate is value^power: -1 for a stiffness that acts as a compliance, -2 where the effect grows with its square.
         shape: True for a parameter that has no effect by itself (a speed, an axis, a place); its ``off`` is where a search starts.
@@ -56,6 +56,11 @@ class EffectParameter:
     shape: bool = False
     period: float = 0.0
     unbounded: bool = False
+    least: Nominal | None = None
+
+    def lowest(self, robot: Robot, tube: int = 0) -> float:
+        """Lower bound of the coordinate for ``robot``."""
+        return self.low if self.least is None else max(self.low, self.least(robot, tube))
 
     def coordinate(self, value: float) -> float:
         """The number in which the effect is nearly linear."""
@@ -203,9 +208,8 @@ def effect_quantities(robot: Robot) -> list[EffectQuantity]:
                     continue
                 off = p.coordinate(_number(p.off, robot, tube))
                 tolerance = p.tolerance(robot, tube) if p.tolerance else 0.0
-                found.append(
-                    EffectQuantity(entry.name, name, off, tolerance, scale, max(p.low, -math.inf), p.high, p)
-                )
+                lowest = p.lowest(robot, tube)
+                found.append(EffectQuantity(entry.name, name, off, tolerance, scale, lowest, p.high, p))
     return found
 
 

@@ -85,7 +85,7 @@ def robot_from_dict(data: Any, where: str = "robot") -> Robot:
     except ValidationError as error:
         raise InputError(_one_line(error), where=where) from None
     try:
-        check_extensions(robot.extensions, robot.n_tubes)
+        check_extensions(robot.extensions, robot)
     except InputError as error:
         raise InputError(str(error), where=where) from None
     return robot

@@ -11,6 +11,7 @@ import pytest
 
 from ctr_dynamics.effects import EFFECTS, Plant, apply_effects, effect_quantities, make_plant
 from ctr_dynamics.effects.plant import same
+from ctr_dynamics.errors import InputError
 from ctr_dynamics.model.model import Model
 from ctr_dynamics.model.simulator import Inputs, Simulator
 from ctr_dynamics.model.time_scheme import make_scheme
@@ -217,3 +218,18 @@ def test_a_robot_file_with_every_effect_at_its_off_value_simulates_bit_for_bit_a
             assert simulator.step(state, k * 0.003, inputs).ok
         tips.append(state.nodes.copy())
     assert np.array_equal(tips[0], tips[1])
+
+
+@pytest.mark.parametrize("name", ["till2020_tissue", "three_tube"])
+def test_no_robot_carries_less_than_nothing(name):
+    """A negative mass would push where it is pulled, and no solver follows that."""
+    robot = load_robot(name)
+    body = robot.tubes[0].end_body
+    carried = body.mass.value if body else 0.0
+    quantity = next(q for q in effect_quantities(robot) if q.key == ("payload_mass", "added_kg"))
+    assert quantity.low == -carried
+    assert quantity.one_sided == (carried == 0.0)
+    with pytest.raises(InputError, match=r"must lie between"):
+        robot_from_dict(
+            {**robot_to_dict(robot), "extensions": {"payload_mass": {"added_kg": -carried - 1e-4}}}
+        )
