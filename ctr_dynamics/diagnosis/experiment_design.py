@@ -30,6 +30,7 @@ Kind = Literal["rest", "turns", "together", "translations"]
 SPACING_S = 0.01  # of the points of a spline: a joint state each
 LOOKS_S = 0.05  # between looks at the stability
 SECANTS = 3  # to the mass of a weight
+TRIES = 3  # for each motion, at a robot that can hardly move
 HALVINGS = 4  # of a motion that is too large for the robot
 
 
@@ -44,18 +45,19 @@ class MotionBlock(NamedTuple):
 
 
 def motion_blocks(robot: Robot, options: DesignOptions) -> list[MotionBlock]:
-    """Rest with a weight, and random motions of every kind with and without it."""
+    """Rest with a weight, and random motions of every kind with and without it; fewer where the robot can hardly move."""
     rng = np.random.default_rng(options.seed)
     points = round(options.block_s / SPACING_S) + 1
     nothing = np.zeros((points, robot.n_tubes))
     falls = any(robot.gravity.value)
     blocks = [MotionBlock("rest", falls, nothing, nothing)]
-    kinds = _kinds(robot.n_tubes)
-    while len(blocks) < 1 + options.blocks:
+    for kind in itertools.islice(_kinds(robot.n_tubes), TRIES * options.blocks):
         loaded = falls and len(blocks) % 2 == 0
-        block = _safe(robot, _random(robot, next(kinds), loaded, rng, options), options)
+        block = _safe(robot, _random(robot, kind, loaded, rng, options), options)
         if block is not None:
             blocks.append(block)
+        if len(blocks) > options.blocks:
+            break
     return blocks
 
 

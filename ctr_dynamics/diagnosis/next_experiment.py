@@ -54,8 +54,7 @@ def next_experiment(diagnosis: Diagnosis, context: RunContext | None = None) -> 
     """The most informative experiment; None where nothing is left to tell apart."""
     d, options = diagnosis, diagnosis.options.design
     if d.verdict == "not_excited":
-        rest, *motions = motion_blocks(d.robot, options)
-        scenario = scenario_of(d.robot, [rest, motions[0]], options)
+        scenario = scenario_of(d.robot, motion_blocks(d.robot, options)[:2], options)
         text = "A weight that is cut, and a motion of all tubes: bending and torsion, which these bags do not show"
         return NextExperiment(text, _described(scenario, text), None, None)
     if d.problem is None or d.extended is None or d.sensitivities is None:
