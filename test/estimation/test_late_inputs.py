@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from estimation_cases import START_NS, bag_messages, check_outputs, estimator, play, truth_error
+from estimation_cases import START_NS, STEP_NS, bag_messages, check_outputs, estimator, play, truth_error
 
 STEP = 0.003
 
@@ -198,6 +198,22 @@ def test_predict_with_joints_in_time_extrapolates_for_less_than_their_period(swe
     assert float(np.median(differences)) < 5e-6
     first = 50  # poses wait for the joints of their time; the first of them move the tip most
     assert max(differences[first:]) < 0.1e-3
+
+
+@pytest.mark.parametrize(
+    ("policy", "period_ms", "awaited"),
+    [("predict", 10, [1, 2, 3, 4, 5]), ("predict", 3, [1]), ("predict", 50, []), ("wait", 10, [])],
+)
+def test_poses_wait_for_joints_that_come_soon(policy, period_ms, awaited):
+    """Within one and a half periods after the last joint state, where eight steps hold a period."""
+    made = estimator({"output.policy": policy})
+    names = [f"tube{i}_{kind}" for i in (1, 2) for kind in ("rotation", "translation")]
+    last = 50  # step of the last joint state
+    for ago in range(3, -1, -1):
+        stamp_ns = START_NS + last * STEP_NS - ago * period_ms * 1_000_000
+        made.add_joint_state(stamp_ns, names, [1.57, -0.2521, 1.57, -0.1977])
+    now = (made.inputs.joints.stamps[-1] - made.t0_ns) // STEP_NS
+    assert [i for i in range(-1, 20) if made.inputs.awaits_joints(now + i, 8)] == awaited
 
 
 @pytest.mark.parametrize("policy", ["wait", "predict"])

@@ -312,9 +312,9 @@ class InputBuffer:
         return -(stamp - stamps[-1]) % period < STEP_NS
 
     def awaits_joints(self, k: int, most: int) -> bool:
-        """Whether step ``k`` is taken with extrapolated joints, and real ones are to come at their rhythm within ``most`` steps of the last."""
-        ahead_ns = self.timeline.stamp(k) - self.joints.stamps[-1]
-        return self.extrapolating and 0 < ahead_ns <= min(1.5e9 * self.joint_period_s, most * STEP_NS)
+        """Whether step ``k`` is taken with extrapolated joints while real ones come at their rhythm, at least one in ``most`` steps."""
+        ahead_ns, period_ns = self.timeline.stamp(k) - self.joints.stamps[-1], 1e9 * self.joint_period_s
+        return self.extrapolating and period_ns <= most * STEP_NS and 0 < ahead_ns <= 1.5 * period_ns
 
     def forget(self, k: int) -> None:
         """Drop what no start at step ``k`` or later needs."""
