@@ -41,7 +41,7 @@ class Whitener:
 
     def __call__(self, values: Floats) -> Floats:
         """(s, 6) or (s, 6, r) to (size,) or (size, r), axis by axis."""
-        flat = values.reshape(len(values), 6, -1)[self.used]
+        flat = (values if values.ndim == 3 else values[:, :, None])[self.used]
         parts = []
         for axis in np.flatnonzero(self.mask):
             column = flat[:, axis]

@@ -7,6 +7,7 @@ import numpy as np
 from ctr_dynamics.diagnosis import forward_model as forward_model_module
 from ctr_dynamics.diagnosis.diagnosis_options import DiagnosisOptions
 from ctr_dynamics.diagnosis.forward_model import ForwardModel, at_times, smooth
+from ctr_dynamics.diagnosis.inference.fit_problem import make_problem
 from ctr_dynamics.diagnosis.recording import Recording
 from ctr_dynamics.kernels.rotations import from_vector, multiply_rows
 from ctr_dynamics.model.trajectory import Trajectory
@@ -72,6 +73,22 @@ def test_a_part_before_the_first_measurement_has_no_columns(recording, robot, kn
     prediction, columns = ForwardModel(early, robot).until(0.4).jacobian({}, of)
     assert not prediction.failure
     assert columns.shape == (0, 6, 2)
+
+
+def test_a_recording_without_measurements_yet_adds_nothing(recording, robot, known):
+    """Parts of recordings grow together, each by the same fraction of its length."""
+    late = replace(recording, stamps=recording.stamps + 0.5)
+    found = []
+    for recordings in ([recording, late], [recording]):
+        problem = make_problem(robot, recordings, (known[STIFFNESS],), np.ones(6, bool))
+        part = problem.until([0.4] * len(recordings))
+        assert part.size
+        linear, residual = part.linearise({}, [known[STIFFNESS]]), part.residual({})
+        assert linear is not None
+        assert residual is not None
+        found.append((*linear, residual))
+    for both, alone in zip(*found, strict=True):
+        np.testing.assert_array_equal(both, alone)
 
 
 def test_the_misfit_is_a_smooth_function_of_delays(robot, known):
