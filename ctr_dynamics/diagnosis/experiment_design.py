@@ -35,13 +35,18 @@ HALVINGS = 4  # of a motion that is too large for the robot
 
 
 class MotionBlock(NamedTuple):
-    """Motions from the rest position and back: ``rotations`` and ``translations`` (points, N) rad and m at every ``SPACING_S``; whether a weight
-    hangs at the tip meanwhile."""
+    """Motions from the rest position and back: ``rotations`` and ``translations`` (points, N) rad and m at every ``SPACING_S``, while a weight
+    of ``hung_kg`` hangs at the tip (0: none)."""
 
     kind: Kind
-    loaded: bool
+    hung_kg: float
     rotations: Floats
     translations: Floats
+
+    @property
+    def loaded(self) -> bool:
+        """Whether a weight hangs at the tip."""
+        return self.hung_kg > 0.0
 
 
 def motion_blocks(robot: Robot, options: DesignOptions) -> list[MotionBlock]:
@@ -49,11 +54,11 @@ def motion_blocks(robot: Robot, options: DesignOptions) -> list[MotionBlock]:
     rng = np.random.default_rng(options.seed)
     points = round(options.block_s / SPACING_S) + 1
     nothing = np.zeros((points, robot.n_tubes))
-    falls = any(robot.gravity.value)
-    blocks = [MotionBlock("rest", falls, nothing, nothing)]
+    weight = hung_mass(robot, options) if any(robot.gravity.value) else 0.0
+    blocks = [MotionBlock("rest", weight, nothing, nothing)]
     for kind in itertools.islice(_kinds(robot.n_tubes), TRIES * options.blocks):
-        loaded = falls and len(blocks) % 2 == 0
-        block = _safe(robot, _random(robot, kind, loaded, rng, options), options)
+        hung_kg = 0.0 if len(blocks) % 2 else weight
+        block = _safe(robot, _random(robot, kind, hung_kg, rng, options), options)
         if block is not None:
             blocks.append(block)
         if len(blocks) > options.blocks:
@@ -68,7 +73,7 @@ def _kinds(n: int) -> Iterator[Kind]:
 
 
 def _random(
-    robot: Robot, kind: Kind, loaded: bool, rng: np.random.Generator, options: DesignOptions
+    robot: Robot, kind: Kind, hung_kg: float, rng: np.random.Generator, options: DesignOptions
 ) -> MotionBlock:
     """A motion of that kind with as many turning points as chance has it, as fast as is allowed."""
     n, t = robot.n_tubes, np.arange(round(options.block_s / SPACING_S) + 1) * SPACING_S
@@ -93,7 +98,7 @@ def _random(
         rotations = splines(n, 0.5 * options.fastest_rad_s, options.farthest_rad)
         farthest = options.farthest_translation * robot.exposed_length
         translations = splines(n, options.fastest_m_s, farthest)
-    return MotionBlock(kind, loaded, rotations, translations)
+    return MotionBlock(kind, hung_kg, rotations, translations)
 
 
 def _safe(robot: Robot, block: MotionBlock, options: DesignOptions) -> MotionBlock | None:
@@ -110,7 +115,7 @@ def _possible(robot: Robot, block: MotionBlock, options: DesignOptions) -> bool:
     """Whether the robot can be at all points of the motion, and its measure of elastic stability stays above a part of that at rest."""
     alpha, beta = np.array(robot.rest.alpha.value), np.array(robot.rest.beta.value)
     watch = StabilityWatch(Model(robot, nodes=16))
-    force = hung_mass(robot, options) * np.array(robot.gravity.value) if block.loaded else None
+    force = block.hung_kg * np.array(robot.gravity.value)
     try:
         resting = watch.update(0.0, beta, alpha)
         for i in range(0, len(block.rotations), round(LOOKS_S / SPACING_S)):
@@ -139,7 +144,7 @@ def scenario_of(robot: Robot, blocks: Sequence[MotionBlock], options: DesignOpti
         tubes.append(TubeMotion(rotation=axes[0], translation=axes[1]))
     loaded, each_s = sum(block.loaded for block in order), options.block_s + options.pause_s
     cut_s = round(loaded * each_s - 0.5 * options.pause_s, 9)
-    loads = [Load(end_s=cut_s, fall_s=0.01, hung_mass_kg=hung_mass(robot, options))] if loaded else []
+    loads = [Load(end_s=cut_s, fall_s=0.01, hung_mass_kg=order[0].hung_kg)] if loaded else []
     return Scenario(duration_s=len(order) * each_s + options.pause_s, tubes=tubes, loads=loads)
 
 

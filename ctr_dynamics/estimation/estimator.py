@@ -389,8 +389,8 @@ class Estimator:
 
     # -- outputs --
 
-    def _output(self, k: int, result: StepResult, of_no_use: str = "") -> StepOutput:
-        """The output of a step that both runs have taken; invalid where it says nothing of the robot, or is ``of_no_use``: the reason."""
+    def _output(self, k: int, result: StepResult, too_old: str = "") -> StepOutput:
+        """The output of a step that both runs have taken; invalid where it says nothing of the robot, or is ``too_old``: the reason."""
         fused, health, options, late = self.runs.fused, self.health, self.options, self.late
         assert fused.state is not None
         tip = fused.ekf.tip_estimate()
@@ -423,8 +423,8 @@ class Estimator:
             fused.model_error_search.clear()
             self.innovations.pass_over()
         self._stability_due |= k % options.stability_every == 0
-        if of_no_use:
-            return self._invalid(k, of_no_use, innovations)
+        if too_old:
+            return self._invalid(k, too_old, innovations)
         fused.inflate_covariance(tip, self.runs.open_loop, self._largest_deviation)
         self._unexpected.inflate(tip.covariance, stamp)
         self._twist_error.inflate(tip, stamp, open_loop, fused.ekf, self.inputs.joint_period_s)

@@ -29,17 +29,20 @@ def follow_motion(moments, new, position, velocity):
 
 
 @compiled
+def motion_square(moments, variance):
+    """Square of the angular frequency, 1/s^2, by ``moments`` (5,). An excursion within the position's ``variance`` (m^2) is no motion."""
+    return moments[4] / (moments[3] + variance) if moments[4] > 0.0 else 0.0
+
+
+@compiled
 def add_motion_error(moments, rows, pi, covariance):
     """Add to the twist in ``covariance`` (12, 12) what an error of the pose is at the frequency of the motion.
 
     ``moments`` (5,): of :func:`follow_motion`. ``rows`` (6, r): of the pose, by coefficients of covariance ``pi`` (r, r) or more.
     """
-    excursion, speed = moments[3], moments[4]
-    if not speed > 0.0:
-        return
     pose = np.empty((6, 6))
     covariance_of(rows, pi, pose)
-    square = speed / (excursion + pose[0, 0] + pose[1, 1] + pose[2, 2])
+    square = motion_square(moments, pose[0, 0] + pose[1, 1] + pose[2, 2])
     for i in range(6):
         for k in range(6):
             covariance[6 + i, 6 + k] += square * pose[i, k]

@@ -284,7 +284,7 @@ class StepLoop(threading.Thread):
             corrects = self.estimator.correcting
             due_ns = self._next_due_ns()
             begin = time.perf_counter_ns()
-            steps = self.estimator.advance(until_ns, self._spare_s, None if predicting else 1, self._useless)
+            steps = self.estimator.advance(until_ns, self._spare_s, None if predicting else 1, self._too_old)
             spent_ns = time.perf_counter_ns() - begin
             self._starved = not steps and due_ns is not None and until_ns is not None and until_ns >= due_ns
             if steps:
@@ -306,10 +306,10 @@ class StepLoop(threading.Thread):
 
     def _not_too_old(self, step: Any) -> Any:
         """The step, invalid where it comes so late that the robot may be elsewhere by now; the caller asks just before it sends."""
-        reason = self._useless(step.stamp_ns) if step.valid else ""
+        reason = self._too_old(step.stamp_ns) if step.valid else ""
         return step._replace(valid=False, reason=reason) if reason else step
 
-    def _useless(self, stamp_ns: int) -> str:
+    def _too_old(self, stamp_ns: int) -> str:
         """Why an output of that stamp comes too late for anyone to act on it; empty where it does not. Counts those that do."""
         now_ns = self._now_ns()
         if self.max_age_ns is None or now_ns <= 0 or now_ns - stamp_ns <= self.max_age_ns:

@@ -15,7 +15,13 @@ from ctr_dynamics.estimation.discretisation import VibrationErrors
 from ctr_dynamics.estimation.filter.ekf import RodEkf
 from ctr_dynamics.estimation.filter.filter_records import TipEstimate
 from ctr_dynamics.estimation.filter.rational_step import FOLLOWED_S, Stride, error_rates
-from ctr_dynamics.kernels.output_errors import add_by_modes, add_frame_error, add_motion_error, follow_motion
+from ctr_dynamics.kernels.output_errors import (
+    add_by_modes,
+    add_frame_error,
+    add_motion_error,
+    follow_motion,
+    motion_square,
+)
 from ctr_dynamics.robot import Robot
 from ctr_dynamics.sensing import Tip
 
@@ -53,8 +59,7 @@ class MotionFrequency:
 
     def square(self, variance: float) -> float:
         """Square of the frequency, 1/s^2. An excursion within the position's ``variance`` (m^2) is no motion."""
-        excursion, speed = self._moments[3:].tolist()
-        return speed / (excursion + variance) if speed > 0.0 else 0.0
+        return float(motion_square(self._moments, variance))
 
     def inflate(self, covariance: Floats, rows: Floats, pi: Floats) -> None:
         """Add to the twist in the ``covariance`` (12, 12) of the tip, in place, what an error of its pose is then.
