@@ -13,6 +13,7 @@ from ctr_dynamics.diagnosis.inference.discretisation_error import correct_discre
 from ctr_dynamics.diagnosis.inference.fit_problem import make_problem
 from ctr_dynamics.diagnosis.inference.map_fit import corrected, fit
 from ctr_dynamics.diagnosis.run_context import RunContext
+from ctr_dynamics.diagnosis.time_steps import TimeSteps
 
 OPTIONS = DiagnosisOptions()
 SILENT = RunContext(workers=1)
@@ -56,6 +57,22 @@ def test_the_error_of_the_solver_is_that_of_the_point(recording, robot, known, m
     assert again is not None
     assert moved.log_evidence == pytest.approx(again.log_evidence, abs=1e-6)
     assert moved.log_evidence != pytest.approx(there.log_evidence, abs=1.0)
+
+
+def test_steps_that_were_long_for_another_motion_are_chosen_again(recording, robot):
+    """A robot that rested where the nominal model does would leave the time error of this motion in what every cause has to explain."""
+    problem = make_problem(robot, [recording], [], np.ones(6, bool))
+    (even,) = problem.forward_models
+    fine = problem.residual({})
+    problem.forward_models = [even.with_steps(TimeSteps(0.384, (0.192,)))]
+    wrong = problem.residual({})
+    assert np.linalg.norm(wrong - fine) > 2.0 * OPTIONS.steps.limit
+    change = renew_correction(problem, {}, SILENT)
+    assert problem.forward_models[0].longest_step < 0.192
+    now = problem.residual({})
+    np.testing.assert_allclose(wrong - change, now, atol=1e-9)
+    assert np.linalg.norm(now + problem.offset - fine) <= OPTIONS.steps.limit
+    assert renew_correction(problem, {}, SILENT) is None  # they suit it now
 
 
 def test_a_shorter_step_that_fails_is_followed_by_a_longer_one(recording, robot, monkeypatch):

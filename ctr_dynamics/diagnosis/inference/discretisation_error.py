@@ -12,10 +12,12 @@ import numpy as np
 from joblib import delayed
 from numpy.typing import NDArray
 
-from ctr_dynamics.diagnosis.diagnosis_options import DiscretisationOptions
+from ctr_dynamics.diagnosis.diagnosis_options import DiscretisationOptions, StepOptions
 from ctr_dynamics.diagnosis.forward_model import ForwardModel, Key
 from ctr_dynamics.diagnosis.inference.fit_problem import Problem
 from ctr_dynamics.diagnosis.run_context import RunContext
+from ctr_dynamics.diagnosis.step_choice import with_chosen_steps
+from ctr_dynamics.diagnosis.whitening import Whitener
 
 Floats = NDArray[np.float64]
 
@@ -64,17 +66,36 @@ def correct_discretisation(
 
 
 def renew_correction(problem: Problem, point: Mapping[Key, float], context: RunContext) -> Floats | None:
-    """The same at a ``point`` that fits the data: a strong cause, as friction, can make an error that the nominal model does not have.
+    """The same at a ``point`` that fits the data, with steps in time that suit it.
+
+    A strong cause, as friction, can make an error that the nominal model does not have. A robot that does not move as the nominal one vibrates at
+    other times, at which the steps may be long.
 
     Returns:
-        Change (m,) of the whitened correction; None where it is too small to count, and all is left as it was.
+        Change (m,) of the whitened residual there; None where it is too small to count, and all is left as it was.
     """
+    models, before = problem.forward_models, problem.residual(point)
+    pairs = zip(models, problem.whiteners, strict=True)
+    problem.forward_models = context.run(
+        delayed(_with_steps_for)(e, w, point, problem.options.steps) for e, w in pairs
+    )
     D = differences(problem, point, context).directions
-    change = D.sum(axis=1) - problem.offset
-    if not np.any(D[:, 0]) or float(np.linalg.norm(change)) < problem.options.discretisation.renewed:
-        return None
+    if all(new is old for new, old in zip(problem.forward_models, models, strict=True)):
+        change = D.sum(axis=1) - problem.offset
+        if not np.any(D[:, 0]) or float(np.linalg.norm(change)) < problem.options.discretisation.renewed:
+            return None
+        _apply(problem, D)
+        return change
     _apply(problem, D)
-    return change
+    after = problem.residual(point)
+    return None if before is None or after is None else before - after
+
+
+def _with_steps_for(
+    model: ForwardModel, whiten: Whitener, point: Mapping[Key, float], options: StepOptions
+) -> ForwardModel:
+    """``model``, with other steps where its own are long at times and too long at ``point``."""
+    return model if model.steps is None else with_chosen_steps(model, whiten, point, options)
 
 
 def differences(problem: Problem, point: Mapping[Key, float], context: RunContext) -> Differences:
