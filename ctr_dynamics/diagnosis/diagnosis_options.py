@@ -104,6 +104,9 @@ class CalibrationOptions:
     """Calibration: maximum a posteriori fits."""
 
     tolerance_limit: float = option(2.9, "tolerances", "a value farther off is a finding and needs a cause")
+    likely_together: float = option(
+        0.95, "probability", "of the squares of all departures in tolerances; beyond, they imitate a cause"
+    )
     reach: float = option(
         4.0, "tolerances", "a large misfit would carry all nuisances away and hide its cause"
     )
@@ -406,9 +409,7 @@ class DesignOptions:
     farthest_rad: float = option(6.3, "rad", "one turn; friction and wires of drives rarely allow more")
     farthest_translation: float = option(0.15, "of the exposed length", "tubes keep most of their overlap")
     deflection: float = option(
-        0.3,
-        "of the exposed length",
-        "by a hung weight, as the shipped `release` bends the robot of the paper",
+        0.4, "of the exposed length", "by a hung weight: about 1 % of strain, to which tubes are elastic"
     )
     least_stability: float = option(
         0.3, "of that at rest", "the measure falls as the root of the way to a snap: a tenth of it is left"

@@ -7,6 +7,7 @@ import pytest
 from diagnosis_cases import Vibration, quantity
 
 from ctr_dynamics.diagnosis.diagnosis_options import DiagnosisOptions
+from ctr_dynamics.diagnosis.inference import hypotheses
 from ctr_dynamics.diagnosis.inference.candidates import candidates, causes_of
 from ctr_dynamics.diagnosis.inference.fit_problem import make_problem
 from ctr_dynamics.diagnosis.inference.fit_quality import is_far_from_noise
@@ -53,6 +54,38 @@ def test_what_looks_like_a_cause_is_fitted_in_its_place(recording, robot, known)
     assert right.fit.cost < wrong.cost - 1.0
     known_ones = [*state.found, *new]
     assert not [s for s in alternatives(problem, known_ones, here) if s[0].effect == "payload_mass"]
+
+
+def test_alternatives_begin_at_nominal_nuisances_too(recording, robot, known, monkeypatch):
+    """Nuisances that have followed other causes so far may be stuck where these took them."""
+    offset = known["encoder_offset", "tube1.offset_rad"]
+    mass = known["payload_mass", "added_kg"]
+    problem = make_problem(robot, [recording], [offset], np.ones(6, bool))
+    pool = [
+        c
+        for c in candidates(list(known.values()), recording.position)
+        if c.effect in ("payload_mass", "density")
+    ]
+    (right,) = [c for c in pool if c.effect == "payload_mass"]
+    other = next(c for c in pool if c.effect == "density")
+    wrong = fit(problem, causes_of([other]), {})
+    here = sensitivities_at(problem, wrong.point, pool, SILENT, again=wrong)
+    starts = []
+
+    def stuck_first(own, members, start, **given):
+        """A fit that stays where it is when it begins far from nominal."""
+        starts.append(dict(start))
+        begun = {**start, offset.key: 5.0 * offset.tolerance} if len(starts) == 1 else start
+        return Hypothesis(
+            members, fit(own, causes_of(members), begun, iterations=0 if len(starts) == 1 else None)
+        )
+
+    monkeypatch.setattr(hypotheses, "fit_hypothesis", stuck_first)
+    found = hypotheses.fit_alternative(problem, Hypothesis((other,), wrong), (right,), here, np.inf)
+    assert len(starts) == 2
+    assert starts[1][offset.key] == offset.off
+    assert found.fit.point[mass.key] == pytest.approx(3e-4, rel=0.1)
+    assert abs(found.fit.point[offset.key]) < offset.tolerance
 
 
 def test_nuisances_that_a_cause_has_led_to_replace_those_without(recording, robot, known):

@@ -10,7 +10,7 @@ from ctr_dynamics.diagnosis.inference.candidates import candidates
 from ctr_dynamics.diagnosis.inference.fit_problem import make_problem
 from ctr_dynamics.diagnosis.inference.map_fit import fit
 from ctr_dynamics.diagnosis.inference.screening import screen
-from ctr_dynamics.diagnosis.inference.sensitivities import sensitivities_at, with_large_sizes
+from ctr_dynamics.diagnosis.inference.sensitivities import off_nominal, sensitivities_at, with_large_sizes
 from ctr_dynamics.diagnosis.run_context import RunContext
 from ctr_dynamics.effects import EFFECTS, effect_quantities
 from ctr_dynamics.robot_files import load_robot
@@ -46,3 +46,18 @@ def test_large_sizes_are_looked_at_where_the_misfit_is_large(recording, robot, k
     np.testing.assert_array_equal(near.by_candidate[inertia], far.by_candidate[inertia])
     best = screen(problem, far, clean, (), pool)[0]
     assert best.candidate is inertia
+
+
+def test_nuisances_imitate_a_cause_alone_or_together(recording, robot, known):
+    """Twenty of them at 1.3 tolerances are as improbable as one at three."""
+    nuisances = [q for q in known.values() if q.tolerance > 0.0][:20]
+    problem = make_problem(robot, [recording], nuisances, np.ones(6, bool))
+
+    def at(*tolerances):
+        return {q.key: q.off + t * q.tolerance for q, t in zip(nuisances, tolerances, strict=False)}
+
+    assert not off_nominal(problem, {})
+    assert not off_nominal(problem, at(2.8))
+    assert off_nominal(problem, at(-3.0))
+    assert not off_nominal(problem, at(*20 * [1.2]))
+    assert off_nominal(problem, at(*20 * [-1.3]))

@@ -227,7 +227,13 @@ def fit_alternative(
             if q.key not in start
         }
     )
-    return fit_hypothesis(problem, members, start, limit=limit)
+    found = fit_hypothesis(problem, members, start, limit=limit)
+    if found is None or not off_nominal(problem, found.fit.point):
+        return found
+    # nuisances that have followed other causes so far may stay there: nominal ones are tried too
+    nominal = {**found.fit.point, **{q.key: q.off for q in problem.nuisances if q.key not in found.keys}}
+    again = fit_hypothesis(problem, members, nominal, limit=limit)
+    return again if again is not None and again.fit.cost < found.fit.cost else found
 
 
 def fit_exactly(problem: Problem, hypothesis: Hypothesis) -> None:

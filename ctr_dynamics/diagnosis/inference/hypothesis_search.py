@@ -37,7 +37,7 @@ from ctr_dynamics.diagnosis.inference.search_moves import (
     refit_contenders,
     try_large_sizes,
 )
-from ctr_dynamics.diagnosis.inference.sensitivities import sensitivities_at
+from ctr_dynamics.diagnosis.inference.sensitivities import off_nominal, sensitivities_at
 from ctr_dynamics.diagnosis.run_context import RunContext
 
 
@@ -120,6 +120,12 @@ def search_once(
             state.add(search_first_unexplained(state))
         if excess(problem, state.best.fit) > o.little_left:
             screened, here = try_large_sizes(state, screened, here)
+    elif (
+        not large_misfit
+        and off_nominal(problem, recalibrated.point)
+        and off_nominal(problem, state.best.fit.point)
+    ):
+        screened, here = try_large_sizes(state, screened, here, plane=False)
     if state.best.members and not context.out_of_time:
         beside = leaders(state)
         add_further_cause(state, beside, here)

@@ -142,15 +142,18 @@ def begin_again_without_causes(state: SearchState) -> bool:
 
 
 def try_large_sizes(
-    state: SearchState, screened: list[Screened], here: Sensitivities
+    state: SearchState, screened: list[Screened], here: Sensitivities, *, plane: bool = True
 ) -> tuple[list[Screened], Sensitivities]:
-    """Screen and fit single causes at large sizes, and a contact plane that the data show; returns screening and sensitivities with them."""
+    """Screen and fit single causes at large sizes; returns screening and sensitivities with them.
+
+    ``plane``: whether a contact plane that the data show is looked for.
+    """
     problem = state.problem
-    state.context.report("large sizes, and a contact plane")
-    if not (state.plane_sought or any(c.sizes for c in state.pool)):
-        plane = find_contact_plane(problem.even, effect_quantities(problem.robot), state.context)
+    state.context.report("large sizes, and a contact plane" if plane else "large sizes")
+    if plane and not (state.plane_sought or any(c.sizes for c in state.pool)):
+        found = find_contact_plane(problem.even, effect_quantities(problem.robot), state.context)
         state.plane_sought = True
-        state.pool = [*state.pool, *([plane] if plane else [])]
+        state.pool = [*state.pool, *([found] if found else [])]
     here = with_large_sizes(problem, here, state.pool, state.context)
     again = screen(problem, here, state.recalibrated, (), state.pool)
     fit_single_causes(state, again, here, screened)

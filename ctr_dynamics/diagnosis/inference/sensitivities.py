@@ -13,6 +13,7 @@ import numpy as np
 from joblib import delayed
 from numpy.typing import NDArray
 
+from ctr_dynamics.chi_square import quantile
 from ctr_dynamics.diagnosis.forward_model import Key
 from ctr_dynamics.diagnosis.inference.candidates import Candidate
 from ctr_dynamics.diagnosis.inference.fit_problem import Problem
@@ -170,9 +171,14 @@ def with_large_sizes(
 
 
 def off_nominal(problem: Problem, point: Mapping[Key, float]) -> bool:
-    """Whether a nuisance has left its tolerance: it then imitates a cause that is missing."""
-    limit = problem.options.calibration.tolerance_limit
-    return any(abs(point.get(q.key, q.off) - q.off) > limit * q.tolerance for q in problem.nuisances)
+    """Whether the nuisances imitate a cause that is missing: one has left its tolerance, or together they are farther off than is likely.
+
+    Estimates are nearer to the robot file than true values, whose squares in tolerances follow a chi-square distribution.
+    """
+    o = problem.options.calibration
+    off = np.array([(point.get(q.key, q.off) - q.off) / q.tolerance for q in problem.nuisances])
+    likely = quantile(o.likely_together, max(len(off), 1))
+    return bool(np.any(np.abs(off) > o.tolerance_limit) or float(off @ off) > likely)
 
 
 def _by_kind(
