@@ -81,7 +81,7 @@ def test_alternatives_begin_at_nominal_nuisances_too(recording, robot, known, mo
         )
 
     monkeypatch.setattr(hypotheses, "fit_hypothesis", stuck_first)
-    found = hypotheses.fit_alternative(problem, Hypothesis((other,), wrong), (right,), here, np.inf)
+    found = hypotheses.fit_alternative(problem, Hypothesis((other,), wrong), (right,), here, 0.0)
     assert len(starts) == 2
     assert starts[1][offset.key] == offset.off
     assert found.fit.point[mass.key] == pytest.approx(3e-4, rel=0.1)

@@ -228,9 +228,9 @@ def fit_alternative(
         }
     )
     found = fit_hypothesis(problem, members, start, limit=limit)
-    if found is None or not off_nominal(problem, found.fit.point):
+    if found is None or found.fit.cost <= limit or not off_nominal(problem, found.fit.point):
         return found
-    # nuisances that have followed other causes so far may stay there: nominal ones are tried too
+    # given up: nuisances that have followed other causes so far may be stuck, so nominal ones are tried too
     nominal = {**found.fit.point, **{q.key: q.off for q in problem.nuisances if q.key not in found.keys}}
     again = fit_hypothesis(problem, members, nominal, limit=limit)
     return again if again is not None and again.fit.cost < found.fit.cost else found
