@@ -86,9 +86,13 @@ def renew_correction(problem: Problem, point: Mapping[Key, float], context: RunC
             return None
         _apply(problem, D)
         return change
-    _apply(problem, D)
     after = problem.residual(point)
-    return None if before is None or after is None else before - after
+    if before is None or after is None:
+        problem.forward_models = models
+        return None
+    change = before - after + D.sum(axis=1) - problem.offset
+    _apply(problem, D)
+    return change
 
 
 def _with_steps_for(

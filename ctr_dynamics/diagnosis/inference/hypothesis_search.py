@@ -75,10 +75,14 @@ def search_hypotheses(
     )
     if other is None:
         return found
-    change = free.offset - problem.offset
-    problem.offset, problem.numerics = free.offset, free.numerics
-    for e in found.hypotheses:
-        e.fit = corrected(problem, e.fit, change)
+    before = problem.residual(found.best.fit.point)
+    problem.forward_models, problem.offset, problem.numerics = (
+        free.forward_models, free.offset, free.numerics,
+    )  # fmt: skip
+    after = problem.residual(found.best.fit.point)
+    if before is not None and after is not None:
+        for e in found.hypotheses:
+            e.fit = corrected(problem, e.fit, before - after)
     both = found.hypotheses + [e for e in other.hypotheses if e.members]
     weigh(both, found.pool, problem.options)
     return _with_hypotheses(found, both, problem, found, other)
