@@ -34,7 +34,7 @@ PACKAGES = {
     "diagnosis": ("test/diagnosis",),
 }
 """Packages that are changed, with the folders of their tests."""
-SHAPES = (
+SHAPES = [
     "empty",
     "zeros",
     "ones",
@@ -44,7 +44,7 @@ SHAPES = (
     "arange",
     "eye",
     "transpose",
-)  # larger arrays are no error
+]  # larger arrays are no error
 LONG = ("test_hidden", "test_nothing_hidden", "test_bags")  # run last
 LONGEST_S = 1800.0  # of the tests of one mutation
 
@@ -69,12 +69,9 @@ def sites(path: Path) -> Iterator[Site]:
     raw = text.encode()
     ignored: set[int] = set()
     for node in ast.walk(tree := ast.parse(text)):
-        skip = isinstance(node, ast.Subscript | ast.JoinedStr | ast.Raise | ast.Assert)
-        skip |= (
-            isinstance(node, ast.Call) and getattr(node.func, "attr", getattr(node.func, "id", "")) in SHAPES
-        )
-        inside: ast.AST = node.slice if isinstance(node, ast.Subscript) else node
-        if skip:
+        named = getattr(node.func, "attr", getattr(node.func, "id", "")) if isinstance(node, ast.Call) else ""
+        if named in SHAPES or isinstance(node, ast.Subscript | ast.JoinedStr | ast.Raise | ast.Assert):
+            inside = node.slice if isinstance(node, ast.Subscript) else node
             ignored.update(id(child) for child in ast.walk(inside))
 
     def site(begin: int, end: int, line: int, after: str) -> Site:
@@ -117,34 +114,31 @@ def drawn(count: int, seed: int, packages: list[str]) -> list[Site]:
 def tests_of(site: Site) -> list[list[str]]:
     """Test files in the order in which they run: those that import the module, then those of the package's folders."""
     module = site.path.removesuffix(".py").replace("/", ".")
-    files = sorted(p for p in (ROOT / "test").rglob("test_*.py"))
-    near = [p.relative_to(ROOT).as_posix() for p in files if module in p.read_text()]
+    files = sorted((ROOT / "test").rglob("test_*.py"))
+    texts = {p.relative_to(ROOT).as_posix(): p.read_text() for p in files}
+    near = [name for name, text in texts.items() if module in text]
     folders = PACKAGES[site.path.split("/")[1]]
-    far = [
-        p.relative_to(ROOT).as_posix() for p in files if p.relative_to(ROOT).as_posix().startswith(folders)
-    ]
-    far = [p for p in far if p not in near]
-    long = [p for p in far if Path(p).name.startswith(LONG)]
+    far = [name for name in texts if name.startswith(folders) and name not in near]
+    long = [name for name in far if Path(name).name.startswith(LONG)]
     return [group for group in (near, [p for p in far if p not in long], long) if group]
 
 
 def run(site: Site, folder: Path) -> dict[str, Any]:
-    """Apply a mutation in the copy ``folder`` of the project, run its tests, and take it back."""
+    """Apply a mutation in the copy ``folder`` of the project, run its tests, and take it back; ``finished``: whether they ended in time."""
     path = folder / site.path
     raw = path.read_bytes()
     path.write_bytes(raw[: site.begin] + site.after.encode() + raw[site.end :])
-    caught, begin = "", time.monotonic()
+    caught, finished, begin = "", True, time.monotonic()
     try:
         for group in tests_of(site):
-            left = LONGEST_S - (time.monotonic() - begin)
-            if left <= 0.0:
-                break
+            left = max(LONGEST_S - (time.monotonic() - begin), 0.0)
             try:
                 done = subprocess.run(
                     [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", "--no-header", "--tb=no", *group],
                     cwd=folder, env={**os.environ, "PYTHONPATH": str(folder)}, capture_output=True, text=True, timeout=left,
                 )  # fmt: skip
             except subprocess.TimeoutExpired:
+                finished = False
                 break
             if done.returncode:
                 lines = [x for x in done.stdout.splitlines() if x.startswith(("FAILED", "ERROR"))]
@@ -152,21 +146,25 @@ def run(site: Site, folder: Path) -> dict[str, Any]:
                 break
     finally:
         path.write_bytes(raw)
-    return {**site._asdict(), "caught": caught, "seconds": round(time.monotonic() - begin)}
+    return {
+        **site._asdict(),
+        "caught": caught,
+        "finished": finished,
+        "seconds": round(time.monotonic() - begin),
+    }
 
 
 def table(rows: list[dict[str, Any]]) -> str:
-    """Caught and surviving mutations of each package, as Markdown, and the survivors."""
-    lines = ["| package | mutations | caught |", "|---|---|---|"]
+    """Mutations of each package that were caught, as Markdown, and the survivors."""
+    lines = ["| package | mutations | caught | not finished |", "|---|---|---|---|"]
     for name in PACKAGES:
         own = [r for r in rows if r["path"].split("/")[1] == name]
-        if own:
-            lines.append(f"| {name} | {len(own)} | {sum(bool(r['caught']) for r in own)} |")
-    lines += [
-        "",
-        *(f"- {r['path']}:{r['line']} `{r['before']}` -> `{r['after']}`" for r in rows if not r["caught"]),
-    ]
-    return "\n".join(lines)
+        caught, open_ = sum(bool(r["caught"]) for r in own), sum(not r["finished"] for r in own)
+        lines += [f"| {name} | {len(own)} | {caught} | {open_} |"] if own else []
+    survived = [r for r in rows if r["finished"] and not r["caught"]]
+    return "\n".join(
+        [*lines, "", *(f"- {r['path']}:{r['line']} `{r['before']}` -> `{r['after']}`" for r in survived)]
+    )
 
 
 def main() -> None:
@@ -190,10 +188,12 @@ def main() -> None:
                 continue
             row = run(site, folder)
             rows.append(row)
+            done.add((site.path, site.begin))
             with options.output.open("a") as stream:
                 stream.write(json.dumps(row) + "\n")
+            outcome = row["caught"] or ("SURVIVED" if row["finished"] else "not finished")
             print(
-                f"{site.path}:{site.line} {site.before} -> {site.after}: {row['caught'] or 'SURVIVED'}, {row['seconds']} s",
+                f"{site.path}:{site.line} {site.before} -> {site.after}: {outcome}, {row['seconds']} s",
                 flush=True,
             )
     print(table(rows))

@@ -8,8 +8,13 @@ import pytest
 
 from ctr_dynamics.diagnosis.diagnosis_options import DiagnosisOptions, DiscretisationOptions
 from ctr_dynamics.diagnosis.forward_model import ForwardModel
-from ctr_dynamics.diagnosis.inference import discretisation_error
-from ctr_dynamics.diagnosis.inference.discretisation_error import correct_discretisation, renew_correction
+from ctr_dynamics.diagnosis.inference import discretisation_error, hypothesis_search
+from ctr_dynamics.diagnosis.inference.candidates import candidates
+from ctr_dynamics.diagnosis.inference.discretisation_error import (
+    change_solution,
+    correct_discretisation,
+    renew_correction,
+)
 from ctr_dynamics.diagnosis.inference.fit_problem import make_problem
 from ctr_dynamics.diagnosis.inference.map_fit import corrected, fit
 from ctr_dynamics.diagnosis.run_context import RunContext
@@ -73,6 +78,50 @@ def test_steps_that_were_long_for_another_motion_are_chosen_again(recording, rob
     np.testing.assert_allclose(wrong - change, now, atol=1e-9)
     assert np.linalg.norm(now + problem.offset - fine) <= OPTIONS.steps.limit
     assert renew_correction(problem, {}, SILENT) is None  # they suit it now
+
+
+def test_steps_at_which_the_robot_cannot_be_simulated_are_not_taken(recording, robot, monkeypatch):
+    problem = make_problem(robot, [recording], [], np.ones(6, bool))
+    models, offset = problem.forward_models, problem.offset
+    longer = [models[0].with_steps(TimeSteps(0.384, (0.192,)))]
+    plain = ForwardModel.residual_at
+    monkeypatch.setattr(
+        ForwardModel, "residual_at", lambda model, point: None if model is longer[0] else plain(model, point)
+    )
+    assert change_solution(problem, longer, offset + 1.0, problem.numerics, {}) is None
+    assert problem.forward_models is models
+    assert problem.offset is offset
+
+
+def test_the_search_with_free_nuisances_hands_on_its_steps_and_its_correction(
+    recording, robot, known, monkeypatch
+):
+    """All hypotheses are weighed by one solution, whichever search has found them."""
+    problem = make_problem(
+        robot, [recording], [known["encoder_offset", "tube1.offset_rad"]], np.ones(6, bool)
+    )
+    pool = [
+        c
+        for c in candidates(list(known.values()), recording.position)
+        if c.effect in ("payload_mass", "density")
+    ]
+    recalibrated = fit(problem, (), {})
+    shorter = [e.resolved(e.nodes, 0.5 * e.scheme.dt) for e in problem.forward_models]
+    once = hypothesis_search.search_once
+
+    def search_once(own, *given, **named):
+        if own is not problem:  # the one with free nuisances
+            own.forward_models, own.offset = shorter, np.full(own.size, 0.1)
+        return once(own, *given, **named)
+
+    monkeypatch.setattr(hypothesis_search, "search_once", search_once)
+    for name in ("explains", "is_far_from_noise"):
+        monkeypatch.setattr(hypothesis_search, name, lambda *given: False)
+    found = hypothesis_search.search_hypotheses(problem, pool, recalibrated, SILENT)
+    assert found.best.effects == ("payload_mass",)
+    assert problem.forward_models[0].scheme.dt == shorter[0].scheme.dt
+    for e in (found.best, found.no_cause):
+        assert np.linalg.norm(problem.residual(e.fit.point) - e.fit.residual) < 1.0
 
 
 def test_a_shorter_step_that_fails_is_followed_by_a_longer_one(recording, robot, monkeypatch):

@@ -6,7 +6,7 @@ In: a problem and a point. Out: its residual corrected by the differences, and t
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from joblib import delayed
@@ -61,7 +61,7 @@ def correct_discretisation(
         nodes, dt = (2 * nodes if more_nodes else nodes), (0.5 * dt if shorter else dt)
         problem.forward_models = [e.resolved(nodes, dt) for e in problem.forward_models]
         return correct_discretisation(problem, point, context)
-    _apply(problem, found.directions)
+    problem.offset, problem.numerics = _correction(problem, found.directions)
     return {"time_error_m": float(found.rms[0]), "space_error_m": float(found.rms[1])}
 
 
@@ -74,24 +74,32 @@ def renew_correction(problem: Problem, point: Mapping[Key, float], context: RunC
     Returns:
         Change (m,) of the whitened residual there; None where it is too small to count, and all is left as it was.
     """
-    models, before = problem.forward_models, problem.residual(point)
-    pairs = zip(models, problem.whiteners, strict=True)
-    problem.forward_models = context.run(
-        delayed(_with_steps_for)(e, w, point, problem.options.steps) for e, w in pairs
-    )
-    D = differences(problem, point, context).directions
-    if all(new is old for new, old in zip(problem.forward_models, models, strict=True)):
-        change = D.sum(axis=1) - problem.offset
-        if not np.any(D[:, 0]) or float(np.linalg.norm(change)) < problem.options.discretisation.renewed:
+    pairs = zip(problem.forward_models, problem.whiteners, strict=True)
+    models = context.run(delayed(_with_steps_for)(e, w, point, problem.options.steps) for e, w in pairs)
+    D = differences(replace(problem, forward_models=models), point, context).directions
+    offset, numerics = _correction(problem, D)
+    if models == problem.forward_models:
+        small = float(np.linalg.norm(offset - problem.offset)) < problem.options.discretisation.renewed
+        if small or not np.any(D[:, 0]):
             return None
-        _apply(problem, D)
-        return change
-    after = problem.residual(point)
-    if before is None or after is None:
-        problem.forward_models = models
-        return None
-    change = before - after + D.sum(axis=1) - problem.offset
-    _apply(problem, D)
+    return change_solution(problem, models, offset, numerics, point)
+
+
+def change_solution(
+    problem: Problem, models: list[ForwardModel], offset: Floats, numerics: Floats, point: Mapping[Key, float]
+) -> Floats | None:
+    """Go on with other steps in time and another correction.
+
+    Returns:
+        Change (m,) of the whitened residual at ``point``; None where it cannot be simulated there, and all is left as it was.
+    """
+    change = offset - problem.offset
+    if models != problem.forward_models:
+        before, after = problem.residual(point), replace(problem, forward_models=models).residual(point)
+        if before is None or after is None:
+            return None
+        change = change + before - after
+    problem.forward_models, problem.offset, problem.numerics = models, offset, numerics
     return change
 
 
@@ -158,9 +166,9 @@ def _whitened(problem: Problem, parts: list[Floats | None]) -> Floats:
     )
 
 
-def _apply(problem: Problem, D: Floats) -> None:
-    problem.offset = D.sum(axis=1)
-    problem.numerics = problem.options.discretisation.deviation * D
+def _correction(problem: Problem, D: Floats) -> tuple[Floats, Floats]:
+    """Offset (m,) and free directions (m, 2) by the differences ``D`` (m, 2)."""
+    return D.sum(axis=1), problem.options.discretisation.deviation * D
 
 
 def with_shorter_step(

@@ -60,6 +60,11 @@ class Problem:
         """Number of whitened values."""
         return sum(w.size for w in self.whiteners)
 
+    @property
+    def nominal(self) -> dict[Key, float]:
+        """Coordinates of the nuisances as the robot file has them."""
+        return {q.key: q.off for q in self.nuisances}
+
     def with_least_step(self, dt: float) -> Problem:
         """The same with time steps of ``dt`` (s) where they are shorter."""
         return replace(self, forward_models=[e.with_least_step(dt) for e in self.forward_models])

@@ -117,7 +117,7 @@ def fit_addition(problem: Problem, addition: Addition, limit: float = math.inf) 
     point = {**dict(new.candidate.start), **addition.start.point}
     own = with_form(problem, members)
     if new.candidate.sizes:
-        nominal = {**point, **{q.key: q.off for q in problem.nuisances}}
+        nominal = {**point, **problem.nominal}
         first = new.candidate.quantities[0].key
         result = None
         for size in new.candidate.sizes:
@@ -130,7 +130,7 @@ def fit_addition(problem: Problem, addition: Addition, limit: float = math.inf) 
         # so far from where the columns are known that they are computed again; nuisances off nominal mislead, so nominal ones are tried too
         starts = [{**point, **new.trial.shift}]
         if off_nominal(problem, starts[0]):
-            starts.append({**starts[0], **{q.key: q.off for q in problem.nuisances}})
+            starts.append({**starts[0], **problem.nominal})
         fits = []
         for start in starts:
             start.update(best_size_nearby(problem, start, new.candidate.quantities[0]))
@@ -231,8 +231,8 @@ def fit_alternative(
     if found is None or found.fit.cost <= limit or not off_nominal(problem, found.fit.point):
         return found
     # given up: nuisances that have followed other causes so far may be stuck, so nominal ones are tried too
-    nominal = {**found.fit.point, **{q.key: q.off for q in problem.nuisances if q.key not in found.keys}}
-    again = fit_hypothesis(problem, members, nominal, limit=limit)
+    sizes = {key: value for key, value in found.fit.point.items() if key in found.keys}
+    again = fit_hypothesis(problem, members, {**found.fit.point, **problem.nominal, **sizes}, limit=limit)
     return again if again is not None and again.fit.cost < found.fit.cost else found
 
 

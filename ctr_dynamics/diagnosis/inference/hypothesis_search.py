@@ -11,7 +11,7 @@ from dataclasses import replace
 
 from ctr_dynamics.diagnosis.inference.candidates import Candidate
 from ctr_dynamics.diagnosis.inference.contact_plane import time_of_divergence
-from ctr_dynamics.diagnosis.inference.discretisation_error import correct_discretisation
+from ctr_dynamics.diagnosis.inference.discretisation_error import change_solution, correct_discretisation
 from ctr_dynamics.diagnosis.inference.evidence import WeighedHypotheses, probabilities, weigh
 from ctr_dynamics.diagnosis.inference.first_unexplained import search_first_unexplained
 from ctr_dynamics.diagnosis.inference.fit_problem import Problem
@@ -75,14 +75,11 @@ def search_hypotheses(
     )
     if other is None:
         return found
-    before = problem.residual(found.best.fit.point)
-    problem.forward_models, problem.offset, problem.numerics = (
-        free.forward_models, free.offset, free.numerics,
-    )  # fmt: skip
-    after = problem.residual(found.best.fit.point)
-    if before is not None and after is not None:
-        for e in found.hypotheses:
-            e.fit = corrected(problem, e.fit, before - after)
+    change = change_solution(problem, free.forward_models, free.offset, free.numerics, found.best.fit.point)
+    if change is None:
+        return found
+    for e in found.hypotheses:
+        e.fit = corrected(problem, e.fit, change)
     both = found.hypotheses + [e for e in other.hypotheses if e.members]
     weigh(both, found.pool, problem.options)
     return _with_hypotheses(found, both, problem, found, other)
@@ -124,11 +121,8 @@ def search_once(
             state.add(search_first_unexplained(state))
         if excess(problem, state.best.fit) > o.little_left:
             screened, here = try_large_sizes(state, screened, here)
-    elif (
-        not large_misfit
-        and off_nominal(problem, recalibrated.point)
-        and off_nominal(problem, state.best.fit.point)
-    ):
+    imitated = off_nominal(problem, recalibrated.point) and off_nominal(problem, state.best.fit.point)
+    if imitated and not large_misfit and not context.out_of_time:
         screened, here = try_large_sizes(state, screened, here, plane=False)
     if state.best.members and not context.out_of_time:
         beside = leaders(state)

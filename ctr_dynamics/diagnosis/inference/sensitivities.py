@@ -217,7 +217,7 @@ def _nuisance_places(problem: Problem, point: Mapping[Key, float]) -> list[dict[
     """Coordinates of nuisances at which finite sizes are tried: as they are, and nominal ones where some imitate the cause."""
     places: list[dict[Key, float]] = [{}]
     if off_nominal(problem, point):
-        places.append({q.key: q.off for q in problem.nuisances})
+        places.append(problem.nominal)
     return places
 
 
