@@ -173,7 +173,9 @@ def main() -> None:
     parser.add_argument("--output", type=Path, required=True)
     parser.add_argument("--draws", type=int, default=60)
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--packages", default="model,kernels,estimation,diagnosis")
+    parser.add_argument(
+        "--packages", nargs="+", choices=PACKAGES, default=["model", "kernels", "estimation", "diagnosis"]
+    )
     parser.add_argument("--table", action="store_true", help="print the table, and run nothing")
     options = parser.parse_args()
     rows = [json.loads(x) for x in options.output.read_text().splitlines()] if options.output.exists() else []
@@ -183,7 +185,7 @@ def main() -> None:
         if not options.table:
             ignore = shutil.ignore_patterns(".git", ".venv", "__pycache__", ".*_cache")
             shutil.copytree(ROOT, folder, ignore=ignore, symlinks=True)
-        for site in [] if options.table else drawn(options.draws, options.seed, options.packages.split(",")):
+        for site in [] if options.table else drawn(options.draws, options.seed, options.packages):
             if (site.path, site.begin) in done:
                 continue
             row = run(site, folder)
