@@ -64,7 +64,9 @@ class RecordingOptions:
 class ForwardModelOptions:
     """Forward model: resolution and differences."""
 
-    nodes: int = option(10, COUNT, "from plate to tip; the error in space is then far below that in time")
+    nodes: int = option(
+        10, COUNT, "from plate to tip to begin with; more where the data can see the difference"
+    )
     fine_nodes: int = option(
         16, COUNT, "for mistaken geometries and for scenarios, whose error is not measured"
     )
@@ -144,7 +146,11 @@ class DiscretisationOptions:
     """Discretisation error: the solver's own error against finer solutions."""
 
     deviation: float = option(0.6, "of the difference", "what stays free to vary after the correction")
-    space_limit: float = option(3.0, "whitened", "difference to twice the nodes from which these are used")
+    space_limit: float = option(
+        20.0,
+        "whitened",
+        "difference to twice the nodes from which these are used; below, it is corrected, and a tenth of it changes with the fit",
+    )
     most_nodes: int = option(40, COUNT, "cost grows with them")
     time_limit: float = option(
         20.0, "whitened", "a correction is right where it was measured; a tenth of it changes with the fit"

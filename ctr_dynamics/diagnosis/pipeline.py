@@ -17,7 +17,7 @@ from ctr_dynamics.diagnosis.diagnosis_options import DiagnosisOptions
 from ctr_dynamics.diagnosis.diagnosis_result import Diagnosis
 from ctr_dynamics.diagnosis.inference.calibration import calibrate, fit_nuisances, nuisances_of
 from ctr_dynamics.diagnosis.inference.candidates import candidates
-from ctr_dynamics.diagnosis.inference.discretisation_error import correct_discretisation
+from ctr_dynamics.diagnosis.inference.discretisation_error import choose_nodes, correct_discretisation
 from ctr_dynamics.diagnosis.inference.evidence import weigh_by_prediction, weigh_discrepancy
 from ctr_dynamics.diagnosis.inference.fit_problem import Problem, choose_steps, make_problem
 from ctr_dynamics.diagnosis.inference.fit_quality import is_wrong
@@ -81,6 +81,7 @@ def diagnose_recordings(
 
     # forward model: the nominal robot on every recording
     result.problem = problem
+    choose_nodes(problem, {}, context)
     result.residual_nominal = problem.residuals({})
     result.nominal_rms = rms(np.concatenate(result.residual_nominal)[:, :3])
     if not math.isfinite(result.nominal_rms):

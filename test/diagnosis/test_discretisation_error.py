@@ -12,13 +12,16 @@ from ctr_dynamics.diagnosis.inference import discretisation_error, hypothesis_se
 from ctr_dynamics.diagnosis.inference.candidates import candidates
 from ctr_dynamics.diagnosis.inference.discretisation_error import (
     change_solution,
+    choose_nodes,
     correct_discretisation,
     renew_correction,
 )
 from ctr_dynamics.diagnosis.inference.fit_problem import make_problem
 from ctr_dynamics.diagnosis.inference.map_fit import corrected, fit
+from ctr_dynamics.diagnosis.recording import Recording
 from ctr_dynamics.diagnosis.run_context import RunContext
 from ctr_dynamics.diagnosis.time_steps import TimeSteps
+from ctr_dynamics.robot_files import load_robot
 
 OPTIONS = DiagnosisOptions()
 SILENT = RunContext(workers=1)
@@ -34,6 +37,43 @@ def test_more_nodes_where_the_data_can_see_them(recording, robot):
     assert problem.forward_models[0].nodes == keen.most_nodes
     assert finer["space_error_m"] < 0.3 * errors["space_error_m"]
     assert finer["time_error_m"] == pytest.approx(errors["time_error_m"], rel=0.2)
+
+
+def test_nodes_are_chosen_before_anything_is_fitted(recording, robot, monkeypatch):
+    problem = make_problem(robot, [recording], [], np.ones(6, bool))
+    choose_nodes(problem, {}, SILENT)
+    begun = OPTIONS.forward_model.nodes
+    assert problem.forward_models[0].nodes == begun
+    plain = ForwardModel.residual_at
+    monkeypatch.setattr(
+        ForwardModel,
+        "residual_at",
+        lambda model, point: None if model.nodes == begun else plain(model, point),
+    )
+    choose_nodes(problem, {}, SILENT)
+    assert problem.forward_models[0].nodes == 2 * begun, "fewer cannot be simulated"
+
+
+def test_many_nodes_for_a_heavy_payload_on_three_tubes():
+    """Ten nodes miss the vibration after a release by ten times the noise: nuisances would be fitted to that."""
+    robot = load_robot("three_tube")
+    times, still = np.linspace(0.0, 4.0, 161), np.concatenate([robot.rest.alpha.value, robot.rest.beta.value])
+    joints = np.column_stack([times, np.tile(still, (len(times), 1))])
+    weight = np.zeros((2, 7))
+    weight[:, 0], weight[0, 3] = (0.0, 0.2), -0.6
+    places, turns = np.zeros((len(times), 3)), np.tile([1.0, 0.0, 0.0, 0.0], (len(times), 1))
+    recording = Recording("release", "", {}, joints, weight, times, places, turns, ())
+    problem = make_problem(robot, [recording], [], np.ones(6, bool))
+    coarse, fine = (problem.forward_models[0].resolved(n, 0.003).residual_at({}) for n in (10, 40))
+    assert coarse is not None
+    assert fine is not None
+    choose_nodes(problem, {}, SILENT)
+    chosen = problem.residual({})
+    assert problem.forward_models[0].nodes > OPTIONS.forward_model.nodes
+    (whiten,) = problem.whiteners
+    limit = OPTIONS.discretisation.space_limit
+    assert np.linalg.norm(whiten(coarse - fine)) > limit
+    assert np.linalg.norm(chosen - whiten(fine)) < limit
 
 
 def test_the_error_of_the_solver_is_that_of_the_point(recording, robot, known, monkeypatch):

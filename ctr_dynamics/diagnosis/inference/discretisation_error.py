@@ -39,6 +39,26 @@ class Differences:
     second: float
 
 
+def choose_nodes(problem: Problem, point: Mapping[Key, float], context: RunContext) -> None:
+    """Twice the nodes, and twice again, as long as the data can see at ``point`` what more of them change, or fewer cannot be simulated.
+
+    Nuisances that are fitted with too few nodes go where the error in space is least, and that is no place to go on from with more.
+    """
+    o = problem.options.discretisation
+    while 2 * problem.forward_models[0].nodes <= o.most_nodes:
+        done = context.run(
+            job
+            for e in problem.forward_models
+            for job in (delayed(ForwardModel.residual_at)(e, point), delayed(with_more_nodes)(e, point))
+        )
+        pairs = list(zip(done[::2], done[1::2], strict=True))
+        needed = any(base is None and finer is not None for base, (finer, _) in pairs)
+        space = _whitened(problem, [_difference(base, *finer) for base, finer in pairs])
+        if not needed and float(np.linalg.norm(space)) <= o.space_limit:
+            return
+        problem.forward_models = [e.resolved(2 * e.nodes, e.scheme.dt) for e in problem.forward_models]
+
+
 def correct_discretisation(
     problem: Problem, point: Mapping[Key, float], context: RunContext
 ) -> dict[str, float]:
@@ -57,8 +77,8 @@ def correct_discretisation(
     more_nodes = float(np.linalg.norm(found.directions[:, 1])) > o.space_limit and 2 * nodes <= o.most_nodes
     coarse = found.first > o.time_limit or found.second > o.time_left
     shorter = coarse and 0.5 * dt >= o.shortest_s and bool(np.isfinite(found.rms[0]))
-    if more_nodes or shorter:
-        nodes, dt = (2 * nodes if more_nodes else nodes), (0.5 * dt if shorter else dt)
+    if more_nodes or shorter:  # nodes first: with too few of them shorter steps solve another problem
+        nodes, dt = (2 * nodes, dt) if more_nodes else (nodes, 0.5 * dt)
         problem.forward_models = [e.resolved(nodes, dt) for e in problem.forward_models]
         return correct_discretisation(problem, point, context)
     problem.offset, problem.numerics = _correction(problem, found.directions)
