@@ -75,8 +75,7 @@ def run_case(stratum: str, seed: int) -> dict[str, Any]:
 
 
 def true_separations(result: Any, answer: dict[str, Any]) -> dict[str, float]:
-    """d_sep of every true cause, from the true effects fitted to the data, against the nearest rival."""
-    from ctr_dynamics.diagnosis.inference.hypotheses import fit_hypothesis
+    """d_sep of every true cause, from the true effects fitted to the data, against the nearest rival; empty where no such fit comes to the noise."""
     from ctr_dynamics.diagnosis.inference.sensitivities import sensitivities_at
     from ctr_dynamics.diagnosis.inference.separation import separation
     from ctr_dynamics.diagnosis.run_context import RunContext
@@ -101,7 +100,7 @@ def true_separations(result: Any, answer: dict[str, Any]) -> dict[str, float]:
     if not members:
         return {}
     context = RunContext(workers=1)
-    best = fit_hypothesis(problem, tuple(members), start)
+    best = _fit_of_truth(result, tuple(members), start)
     here = sensitivities_at(problem, best.fit.point, found.pool, context) if best else None
     if best is None or here is None:
         return {}
@@ -111,6 +110,23 @@ def true_separations(result: Any, answer: dict[str, Any]) -> dict[str, float]:
         rivals = [c for c in here.by_candidate if c.effect not in own]
         out[member.effect] = min(separation(problem, best.fit, (member,), rival, here) for rival in rivals)
     return out
+
+
+def _fit_of_truth(result: Any, members: tuple[Any, ...], start: dict[Any, float]) -> Any:
+    """The hypothesis of ``members``, from their true values or as the search has found it; None where it leaves more than noise."""
+    from ctr_dynamics.diagnosis.inference.candidates import causes_of, keys_of
+    from ctr_dynamics.diagnosis.inference.fit_quality import is_acceptable
+    from ctr_dynamics.diagnosis.inference.growing_fit import fit_growing
+    from ctr_dynamics.diagnosis.inference.hypotheses import Hypothesis, fit_hypothesis, with_form
+
+    problem = result.problem
+    best = next((e for e in result.search.hypotheses if e.keys == keys_of(members)), None)
+    if best is None or not is_acceptable(problem, best.fit):
+        best = fit_hypothesis(problem, members, start)
+    if best is None or not is_acceptable(problem, best.fit):  # out of phase by turns
+        grown = fit_growing(with_form(problem, members), causes_of(members), start)
+        best = None if grown is None else Hypothesis(members, grown)
+    return best if best is not None and is_acceptable(problem, best.fit) else None
 
 
 def error_removed(result: Any, answer: dict[str, Any]) -> float | None:
