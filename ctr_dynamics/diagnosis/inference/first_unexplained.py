@@ -11,7 +11,7 @@ from joblib import delayed
 from ctr_dynamics.diagnosis.inference.candidates import Candidate, causes_of
 from ctr_dynamics.diagnosis.inference.fit_problem import Problem
 from ctr_dynamics.diagnosis.inference.fit_quality import is_acceptable
-from ctr_dynamics.diagnosis.inference.growing_fit import explain_growing_parts, fit_growing, part_of
+from ctr_dynamics.diagnosis.inference.growing_fit import fit_growing, part_of
 from ctr_dynamics.diagnosis.inference.hypotheses import Hypothesis, with_form
 from ctr_dynamics.diagnosis.inference.map_fit import Fit, fit
 from ctr_dynamics.diagnosis.inference.screening import screen
@@ -23,13 +23,16 @@ def search_first_unexplained(state: SearchState) -> list[Hypothesis]:
     """Hypotheses of one cause from the first part that nuisances do not explain, fitted to the whole; none where they explain all."""
     problem, context = state.problem, state.context
     context.report("the first part that tolerances do not explain")
-    explained = explain_growing_parts(problem)
-    if explained.fit is not None:
+    if problem.explained is None:
+        fit_growing(problem)
+    assert problem.explained is not None
+    explained, point = problem.explained
+    if explained == 1.0:
         return []
     o = problem.options.calibration
-    part = min(explained.part * o.growth, 1.0) if explained.part else o.first_part
+    part = min(explained * o.growth, 1.0) if explained else o.first_part
     short = part_of(problem, part)
-    start = fit(short, (), explained.point, polish=False)
+    start = fit(short, (), point, polish=False)
     here = None if start is None else sensitivities_at(short, start.point, state.pool, context)
     if start is None or here is None:
         return []

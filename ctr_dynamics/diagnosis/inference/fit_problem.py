@@ -42,6 +42,7 @@ class Problem:
         reach: tolerances by which fits move a nuisance at most.
         tolerance_factor: by which the fits take all tolerances to be larger than the robot file says.
         options: numbers of all stages. workers: simulations at once, where nothing else runs.
+        explained: the first part of the recordings that nuisances alone explain, and where; None before growing parts have been fitted.
     """
 
     robot: Robot
@@ -54,6 +55,7 @@ class Problem:
     options: DiagnosisOptions
     workers: int = 1
     tolerance_factor: float = 1.0
+    explained: tuple[float, dict[Key, float]] | None = None
 
     @property
     def size(self) -> int:

@@ -84,6 +84,8 @@ def fit_growing(
 ) -> Fit | None:
     """The fit to the whole recordings to which growing parts lead; None where no part is explained. Arguments: see :func:`explain_growing_parts`."""
     done = explain_growing_parts(problem, causes, start, first_part=first_part, limit=limit)
+    if not causes:
+        problem.explained = done.part, done.point
     if done.fit is not None or not done.part:
         return done.fit
     return fit(problem, causes, done.point, polish=False, limit=limit)

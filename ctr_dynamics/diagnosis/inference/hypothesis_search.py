@@ -68,7 +68,7 @@ def search_hypotheses(
     if is_far_from_noise(problem, found.best, recalibrated):
         return found
     context.report("once more, with nuisances beyond their tolerances")
-    free = replace(problem, reach=math.inf)
+    free = replace(problem, reach=math.inf, explained=None)
     far = fit(free, (), recalibrated.point, polish=False)
     other = (
         None if far is None else search_once(free, found.pool, far, context, plane_sought=found.plane_sought)
