@@ -14,6 +14,7 @@ from ctr_dynamics.diagnosis.inference.discretisation_error import (
     change_solution,
     choose_nodes,
     correct_discretisation,
+    differences,
     renew_correction,
 )
 from ctr_dynamics.diagnosis.inference.fit_problem import make_problem
@@ -37,6 +38,25 @@ def test_more_nodes_where_the_data_can_see_them(recording, robot):
     assert problem.forward_models[0].nodes == keen.most_nodes
     assert finer["space_error_m"] < 0.3 * errors["space_error_m"]
     assert finer["time_error_m"] == pytest.approx(errors["time_error_m"], rel=0.2)
+
+
+def test_errors_far_below_the_misfit_need_no_finer_solution(recording, robot):
+    """Beside a misfit of many times the noise nothing sees them; where causes explain the data, they are looked at again."""
+    wrong = {("payload_mass", "added_kg"): 1.5e-3}
+    problem = make_problem(robot, [recording], [], np.ones(6, bool))
+    found = differences(problem, wrong, SILENT)
+    assert found.misfit > 2.0
+    seen = DiscretisationOptions(
+        space_limit=0.6 * float(np.linalg.norm(found.directions[:, 1])),
+        time_limit=math.inf,
+        time_left=math.inf,
+    )
+    problem.options = replace(OPTIONS, discretisation=seen)
+    correct_discretisation(problem, wrong, SILENT)
+    assert problem.forward_models[0].nodes == OPTIONS.forward_model.nodes
+    problem.options = replace(OPTIONS, discretisation=replace(seen, space_limit=0.0))
+    renew_correction(problem, {}, SILENT)
+    assert problem.forward_models[0].nodes == seen.most_nodes
 
 
 def test_nodes_are_chosen_before_anything_is_fitted(recording, robot, monkeypatch):

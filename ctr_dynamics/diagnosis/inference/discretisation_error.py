@@ -5,6 +5,7 @@ In: a problem and a point. Out: its residual corrected by the differences, and t
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
@@ -31,12 +32,14 @@ class Differences:
         rms: (2,) m, of what the last refinement of step and of nodes still changed; NaN where none could be simulated.
         first, second: whitened sizes of the differences to the first shorter step, and from there to half of that; the second is zero
             where the first is too small to ask.
+        misfit: rms of the whitened residual, where that is above the noise; else 1.
     """
 
     directions: Floats
     rms: Floats
     first: float
     second: float
+    misfit: float = 1.0
 
 
 def choose_nodes(problem: Problem, point: Mapping[Key, float], context: RunContext) -> None:
@@ -64,29 +67,54 @@ def correct_discretisation(
 ) -> dict[str, float]:
     """Compare with finer solutions at ``point``: correct the residual by the differences, and let them vary.
 
-    Where the data can see the error in space, the problem goes on with twice the nodes. Where the error in time is large, or what the
-    correction leaves of it can be seen, it goes on with half the step: a correction holds at one point only.
+    The problem goes on with more nodes or half the step where :func:`_finer` says so.
 
     Returns:
         rms in m of what the last refinement changed: ``time_error_m`` (half the step), ``space_error_m`` (twice the nodes); NaN where it
         cannot be measured.
     """
-    o = problem.options.discretisation
-    found = differences(problem, point, context)
-    nodes, dt = problem.forward_models[0].nodes, problem.forward_models[0].scheme.dt
-    more_nodes = float(np.linalg.norm(found.directions[:, 1])) > o.space_limit and 2 * nodes <= o.most_nodes
-    coarse = found.first > o.time_limit or found.second > o.time_left
-    shorter = coarse and 0.5 * dt >= o.shortest_s and bool(np.isfinite(found.rms[0]))
-    if more_nodes or shorter:  # nodes first: with too few of them shorter steps solve another problem
-        nodes, dt = (2 * nodes, dt) if more_nodes else (nodes, 0.5 * dt)
-        problem.forward_models = [e.resolved(nodes, dt) for e in problem.forward_models]
-        return correct_discretisation(problem, point, context)
+    found = _refine(problem, point, context)
     problem.offset, problem.numerics = _correction(problem, found.directions)
     return {"time_error_m": float(found.rms[0]), "space_error_m": float(found.rms[1])}
 
 
+def _refine(problem: Problem, point: Mapping[Key, float], context: RunContext) -> Differences:
+    """Give ``problem`` the resolution that it needs at ``point``; the differences there."""
+    while True:
+        found = differences(problem, point, context)
+        finer = _finer(problem, found)
+        if finer is None:
+            return found
+        problem.forward_models = finer
+
+
+def _finer(problem: Problem, found: Differences) -> list[ForwardModel] | None:
+    """Models with twice the nodes where the data can see the error in space, else with half the step where that in time is large, or where they see
+    what the correction leaves of it: a correction holds at one point only. None where the resolution will do.
+
+    What is far below the misfit is not seen beside it. Nodes come first: with too few of them shorter steps solve another problem.
+    """
+    o = problem.options.discretisation
+    first = problem.forward_models[0]
+    nodes, dt = first.nodes, first.scheme.dt
+    if (
+        float(np.linalg.norm(found.directions[:, 1])) > o.space_limit * found.misfit
+        and 2 * nodes <= o.most_nodes
+    ):
+        nodes *= 2
+    elif (
+        (found.first > o.time_limit * found.misfit or found.second > o.time_left * found.misfit)
+        and 0.5 * dt >= o.shortest_s
+        and np.isfinite(found.rms[0])
+    ):
+        dt *= 0.5
+    else:
+        return None
+    return [e.resolved(nodes, dt) for e in problem.forward_models]
+
+
 def renew_correction(problem: Problem, point: Mapping[Key, float], context: RunContext) -> Floats | None:
-    """The same at a ``point`` that fits the data, with steps in time that suit it.
+    """The same at a ``point`` that fits the data, with the resolution that suits it.
 
     A strong cause, as friction, can make an error that the nominal model does not have. A robot that does not move as the nominal one vibrates at
     other times, at which the steps may be long.
@@ -96,13 +124,14 @@ def renew_correction(problem: Problem, point: Mapping[Key, float], context: RunC
     """
     pairs = zip(problem.forward_models, problem.whiteners, strict=True)
     models = context.run(delayed(_with_steps_for)(e, w, point, problem.options.steps) for e, w in pairs)
-    D = differences(replace(problem, forward_models=models), point, context).directions
+    there = replace(problem, forward_models=models)
+    D = _refine(there, point, context).directions
     offset, numerics = _correction(problem, D)
-    if models == problem.forward_models:
+    if there.forward_models == problem.forward_models:
         small = float(np.linalg.norm(offset - problem.offset)) < problem.options.discretisation.renewed
         if small or not np.any(D[:, 0]):
             return None
-    return change_solution(problem, models, offset, numerics, point)
+    return change_solution(problem, there.forward_models, offset, numerics, point)
 
 
 def change_solution(
@@ -166,8 +195,14 @@ def differences(problem: Problem, point: Mapping[Key, float], context: RunContex
         np.sqrt(sum(np.nan if d is None else float(np.sum(d[:, :3] ** 2)) for d in parts) / rows)
         for parts in (last, space)
     ]
+    left = _whitened(problem, base)
+    misfit = max(1.0, float(np.linalg.norm(left)) / math.sqrt(len(left)))
     return Differences(
-        np.stack([total, _whitened(problem, space)], axis=1), np.array(rms, dtype=float), first, second
+        np.stack([total, _whitened(problem, space)], axis=1),
+        np.array(rms, dtype=float),
+        first,
+        second,
+        misfit,
     )
 
 
