@@ -39,7 +39,7 @@ class Differences:
     rms: Floats
     first: float
     second: float
-    misfit: float = 1.0
+    misfit: float
 
 
 def choose_nodes(problem: Problem, point: Mapping[Key, float], context: RunContext) -> None:
@@ -137,7 +137,7 @@ def renew_correction(problem: Problem, point: Mapping[Key, float], context: RunC
 def change_solution(
     problem: Problem, models: list[ForwardModel], offset: Floats, numerics: Floats, point: Mapping[Key, float]
 ) -> Floats | None:
-    """Go on with other steps in time and another correction.
+    """Go on with another resolution and another correction.
 
     Returns:
         Change (m,) of the whitened residual at ``point``; None where it cannot be simulated there, and all is left as it was.

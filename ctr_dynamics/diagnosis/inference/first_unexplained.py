@@ -11,7 +11,7 @@ from joblib import delayed
 from ctr_dynamics.diagnosis.inference.candidates import Candidate, causes_of
 from ctr_dynamics.diagnosis.inference.fit_problem import Problem
 from ctr_dynamics.diagnosis.inference.fit_quality import is_acceptable
-from ctr_dynamics.diagnosis.inference.growing_fit import fit_growing, part_of
+from ctr_dynamics.diagnosis.inference.growing_fit import explain_growing_parts, fit_growing, part_of
 from ctr_dynamics.diagnosis.inference.hypotheses import Hypothesis, with_form
 from ctr_dynamics.diagnosis.inference.map_fit import Fit, fit
 from ctr_dynamics.diagnosis.inference.screening import screen
@@ -24,8 +24,8 @@ def search_first_unexplained(state: SearchState) -> list[Hypothesis]:
     problem, context = state.problem, state.context
     context.report("the first part that tolerances do not explain")
     if problem.explained is None:
-        fit_growing(problem)
-    assert problem.explained is not None
+        done = explain_growing_parts(problem)
+        problem.explained = done.part, done.point
     explained, point = problem.explained
     if explained == 1.0:
         return []
