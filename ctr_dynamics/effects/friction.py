@@ -33,6 +33,7 @@ def _coefficient(row: str, name: str, unit: str, factor: float, floor: float, te
         ),
         text=text,
         source="Till et al. (2020), (22)-(24)",
+        large_sizes=(1.0,) if kind == "viscous" else (),
     )
     def apply(plant: Plant, values: Values) -> None:
         plant.put(row, values[name])
@@ -123,6 +124,7 @@ def distributed_friction(plant: Plant, values: Values) -> None:
     text="The fluid around the robot resists its motion, per length of backbone.",
     source="Morison et al. (1950), drag term",
     extended=True,
+    large_sizes=(1.0,),
 )
 def air_drag(plant: Plant, values: Values) -> None:
     if values["linear_Ns_per_m2"] != 0.0 or values["quadratic_Ns2_per_m3"] != 0.0:

@@ -87,7 +87,7 @@ class Effect:
         extended: whether it needs the extended kernels.
         finite_sizes: sizes, in scales, at which it is tried where its derivative at the off-value says little; empty where that serves.
         large_sizes: sizes, in scales, at which its first parameter is tried besides where the misfit is large: it changes a frequency, and in time a
-            phase, beyond what its derivative says.
+            phase, or a damping, beyond what its derivative says.
         joint: parameters that are only tried together (a vector); else each is a variant of its own.
         presets: values of the shape parameters from which a search starts, by name; several are tried.
         nuisance: not a cause by itself: it adds to the uncertainty of others, and is not in the catalogue of findings.

@@ -154,6 +154,7 @@ def payload_inertia(plant: Plant, values: Values) -> None:
     ),
     text="The material damps bending.",
     source="Till et al. (2020), (16): B_xy",
+    large_sizes=(1.0,),
 )
 def bending_damping(plant: Plant, values: Values) -> None:
     for i in range(plant.n):
@@ -173,6 +174,7 @@ def bending_damping(plant: Plant, values: Values) -> None:
     ),
     text="The material damps torsion.",
     source="Till et al. (2020), (16): B_z",
+    large_sizes=(1.0,),
 )
 def torsion_damping(plant: Plant, values: Values) -> None:
     for i in range(plant.n):

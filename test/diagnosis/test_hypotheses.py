@@ -7,14 +7,16 @@ import pytest
 from diagnosis_cases import Vibration, quantity
 
 from ctr_dynamics.diagnosis.diagnosis_options import DiagnosisOptions
+from ctr_dynamics.diagnosis.forward_model import ForwardModel
 from ctr_dynamics.diagnosis.inference import hypotheses
 from ctr_dynamics.diagnosis.inference.candidates import candidates, causes_of
 from ctr_dynamics.diagnosis.inference.fit_problem import make_problem
-from ctr_dynamics.diagnosis.inference.fit_quality import is_far_from_noise
+from ctr_dynamics.diagnosis.inference.fit_quality import is_acceptable, is_far_from_noise
 from ctr_dynamics.diagnosis.inference.hypotheses import Hypothesis, best_size_nearby
 from ctr_dynamics.diagnosis.inference.map_fit import fit
 from ctr_dynamics.diagnosis.inference.search_moves import (
     SearchState,
+    add_further_cause,
     alternatives,
     begin_again_without_causes,
     fit_alternatives,
@@ -120,3 +122,29 @@ def test_a_search_far_from_the_noise_ends(recording, robot, known, noises, left,
     members = candidates(list(known.values()), recording.position)[:causes]
     hypothesis = Hypothesis(tuple(members), replace(some, chi2=chi2, cost=chi2))
     assert is_far_from_noise(problem, hypothesis, replace(some, chi2=before, cost=before)) is far
+
+
+def test_a_further_cause_is_tried_at_finite_sizes_where_much_is_left(recording, robot, known):
+    """Derivatives at zero rank damping of torsion, drag and friction at the plate before damping of bending, which was hidden."""
+    damping = known["bending_damping", "tube2.B_Nm2s"]
+    truth = {("registration_rotation", "rx_rad"): 0.04, damping.key: 3.0 * damping.scale}
+    seen = ForwardModel(recording, robot).predict(truth)
+    there = replace(recording, position=seen.position, quaternion=seen.quaternion)
+    problem = make_problem(robot, [there], [known["encoder_offset", "tube1.offset_rad"]], np.ones(6, bool))
+    problem.options = replace(OPTIONS, search=replace(OPTIONS.search, further=1))
+    every = candidates(list(known.values()), there.position)
+    dissipation = ("bending_damping", "torsion_damping", "air_drag", "base_viscous", "tube_viscous")
+    pool = [c for c in every if c.effect in ("registration_rotation", *dissipation)]
+    (rotation,) = [c for c in pool if c.effect == "registration_rotation"]
+    alone = fit(problem, (), {})
+    led = fit(problem, causes_of([rotation]), {})
+    assert alone is not None
+    assert led is not None
+    leader = Hypothesis((rotation,), led)
+    assert not is_acceptable(problem, led)
+    state = SearchState(problem, pool, alone, SILENT, [leader, Hypothesis((), alone)])
+    here = sensitivities_at(problem, alone.point, pool, SILENT)
+    assert here is not None
+    add_further_cause(state, [leader], here)
+    assert state.best.effects == ("bending_damping", "registration_rotation")
+    assert state.best.fit.point[damping.key] == pytest.approx(truth[damping.key], rel=0.02)

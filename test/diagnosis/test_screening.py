@@ -1,16 +1,22 @@
 """Candidates and their screening, at small and at large sizes."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from ctr_dynamics.diagnosis.forward_model import ForwardModel
-from ctr_dynamics.diagnosis.inference.candidates import candidates
+from ctr_dynamics.diagnosis.inference.candidates import Candidate, candidates
 from ctr_dynamics.diagnosis.inference.fit_problem import make_problem
 from ctr_dynamics.diagnosis.inference.map_fit import fit
 from ctr_dynamics.diagnosis.inference.screening import screen
-from ctr_dynamics.diagnosis.inference.sensitivities import off_nominal, sensitivities_at, with_large_sizes
+from ctr_dynamics.diagnosis.inference.sensitivities import (
+    Series,
+    off_nominal,
+    sensitivities_at,
+    with_large_sizes,
+)
 from ctr_dynamics.diagnosis.run_context import RunContext
 from ctr_dynamics.effects import EFFECTS, effect_quantities
 from ctr_dynamics.robot_files import load_robot
@@ -42,10 +48,29 @@ def test_large_sizes_are_looked_at_where_the_misfit_is_large(recording, robot, k
     far = with_large_sizes(problem, near, pool, SILENT)
     assert not near.trials
     (inertia,) = [c for c in pool if c.effect == "payload_inertia"]
-    assert [p.shift[heavy] for p in far.trials[inertia]] == pytest.approx([0.55, 0.75, 1.25, 1.45, 1.7])
+    # the last of each sign that leaves least is followed by one 1.5 times as large
+    assert [p.shift[heavy] for p in far.trials[inertia]] == pytest.approx(
+        [1.25, 1.45, 1.7, 0.75, 0.55, 0.325]
+    )
     np.testing.assert_array_equal(near.by_candidate[inertia], far.by_candidate[inertia])
     best = screen(problem, far, clean, (), pool)[0]
     assert best.candidate is inertia
+
+
+def test_a_series_of_sizes_goes_on_as_long_as_the_last_leaves_least(known):
+    c = Candidate("clearance", (known["clearance", "play_rad"],))
+
+    def ends(*squares):
+        return Series(c, {}, [0.6, 1.2], [100.0, *squares]).grows(1.5, least=3.0)
+
+    assert ends(90.0, 80.0)
+    assert not ends(70.0, 80.0)
+    assert not ends(90.0, 88.0)  # by less than the noise of the squares
+    assert not ends(110.0, 105.0)
+    assert not ends(90.0, math.inf)  # it could not be simulated
+    series = Series(c, {}, [0.6, 1.2], [100.0, 90.0, 80.0])
+    assert series.grows(1.5, least=3.0)
+    assert series.sizes == [0.6, 1.2, pytest.approx(1.8)]
 
 
 def test_nuisances_imitate_a_cause_alone_or_together(recording, robot, known):

@@ -187,6 +187,8 @@ def add_further_cause(state: SearchState, beside: Sequence[Hypothesis], here: Se
         state.context.report(f"what {', '.join(leader.effects)} leaves")
         fit_exactly(problem, leader)
         there = here.carried_to(leader.fit)
+        if not is_acceptable(problem, leader.fit):
+            there = with_large_sizes(problem, there, state.pool, state.context)
         screened = screen(problem, there, leader.fit, leader.members, state.pool)
         jobs = []
         least = o.further_gain - o.further_slack

@@ -6,6 +6,7 @@ at zero says little (backlash, clearance, contact) is tried at finite sizes; its
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -25,26 +26,39 @@ Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Size:
-    """A finite size of a candidate, in scales, with the coordinates of nuisances that are set beside it."""
-
-    candidate: Candidate
-    size: float
-    beside: Mapping[Key, float]
-
-    @property
-    def shift(self) -> dict[Key, float]:
-        """Coordinates that differ from those of the base point."""
-        q = self.candidate.quantities[0]
-        return {**self.beside, **dict(self.candidate.start), q.key: q.off + self.size * q.scale}
-
-
-@dataclass(frozen=True)
 class Trial:
     """A candidate at a finite size: coordinates beside the base point, and the residual (m,) there, as longer steps in time show it."""
 
     shift: dict[Key, float]
     residual: Floats
+
+
+@dataclass
+class Series:
+    """Finite sizes of a candidate, in scales, that grow from zero on, all of one sign.
+
+    Attributes:
+        beside: coordinates of nuisances that are set there. squares: of the residual at zero and at each size.
+    """
+
+    candidate: Candidate
+    beside: Mapping[Key, float]
+    sizes: list[float]
+    squares: list[float]
+
+    def shift(self, size: float) -> dict[Key, float]:
+        """Coordinates that differ from those of the base point."""
+        q = self.candidate.quantities[0]
+        return {**self.beside, **dict(self.candidate.start), q.key: q.off + size * q.scale}
+
+    def grows(self, factor: float, least: float) -> bool:
+        """Append a size larger by ``factor``, if the last one leaves less than all before it by ``least``."""
+        q, size = self.candidate.quantities[0], self.sizes[-1] * factor
+        falls = math.isfinite(self.squares[-1]) and self.squares[-1] < min(self.squares[:-1]) - least
+        if falls and q.low <= q.off + size * q.scale <= q.high:
+            self.sizes.append(size)
+            return True
+        return False
 
 
 @dataclass
@@ -56,7 +70,6 @@ class Sensitivities:
         columns: (m,) of every quantity that has a derivative there.
         by_candidate: (m, quantities) of each candidate.
         trials: of candidates that were tried at finite sizes.
-        coarse_residual: (m,) by the longer steps of the trials; None where these cannot be simulated.
     """
 
     point: dict[Key, float]
@@ -64,7 +77,6 @@ class Sensitivities:
     columns: dict[Key, Floats]
     by_candidate: dict[Candidate, Floats] = field(default_factory=dict)
     trials: dict[Candidate, list[Trial]] = field(default_factory=dict)
-    coarse_residual: Floats | None = None
 
     def carried_to(self, fit: Fit) -> Sensitivities:
         """The same at a fit not far away: its residual and columns, and the candidates' sensitivities of here."""
@@ -119,14 +131,6 @@ def sensitivities_at(
     # together: what has no room in one simulation has it in another
     jobs = [delayed(columns)(at, wanted, first)]
     jobs += [delayed(columns)(at, tuple(q for c in group for q in c.quantities)) for at, group in groups[1:]]
-    if again:
-        sizes = [Size(c, _finite_sizes(c)[0], {}) for c in finite]
-        jobs += _residual_jobs(problem, point, sizes)
-    else:
-        coarse = problem.with_least_step(problem.options.screening.finite_size_dt_s)
-        places = _nuisance_places(problem, point)
-        sizes = [Size(c, size, beside) for beside in places for c in finite for size in _finite_sizes(c)]
-        jobs += [*_residual_jobs(coarse, point, sizes), delayed(coarse.residual)(point)]
     done = context.run(jobs)
     if done[0] is None:
         return None
@@ -135,8 +139,7 @@ def sensitivities_at(
         dict(point), residual, {**known, **{q.key: computed[:, i] for i, q in enumerate(wanted)}}
     )
     outcomes = [(members, computed[:, len(wanted) :])] if computed.shape[1] > len(wanted) else []
-    more = max(len(groups), 1)
-    outcomes += [(m, o[1]) for (_, m), o in zip(groups[1:], done[1:more], strict=True) if o is not None]
+    outcomes += [(m, o[1]) for (_, m), o in zip(groups[1:], done[1:], strict=True) if o is not None]
     for group, found in outcomes:
         last = 0
         for c in group:
@@ -145,8 +148,8 @@ def sensitivities_at(
     for c in pool:
         if c not in shaped and c not in finite:
             result.by_candidate[c] = np.stack([result.columns[q.key] for q in c.quantities], axis=1)
-    result.coarse_residual = residual if again else done[-1]
-    result.trials = _trials(result, sizes, done[more : more + len(sizes)])
+    sizes = {c: _finite_sizes(c)[:1] if again else _finite_sizes(c) for c in finite}
+    result.trials = _tried(problem, result, sizes, context, compared=again is not None)
     _set_secants(result, finite)
     return result
 
@@ -156,14 +159,8 @@ def with_large_sizes(
 ) -> Sensitivities:
     """``known`` with trials at large sizes, of which the derivative says little, and of candidates in ``pool`` that it does not have."""
     new = [c for c in pool if EFFECTS[c.effect].finite_sizes and c not in known.by_candidate]
-    sizes = [
-        Size(c, size, beside)
-        for beside in _nuisance_places(problem, known.point)
-        for c in pool
-        for size in (_finite_sizes(c) if c in new else EFFECTS[c.effect].large_sizes)
-    ]
-    coarse = problem.with_least_step(problem.options.screening.finite_size_dt_s)
-    found = _trials(known, sizes, context.run(_residual_jobs(coarse, known.point, sizes)))
+    sizes = {c: _finite_sizes(c) if c in new else EFFECTS[c.effect].large_sizes for c in pool}
+    found = _tried(problem, known, sizes, context)
     trials = {c: known.trials.get(c, []) + found.get(c, []) for c in (*known.trials, *found)}
     result = replace(known, by_candidate=dict(known.by_candidate), trials=trials)
     _set_secants(result, new)
@@ -227,21 +224,51 @@ def _finite_sizes(c: Candidate) -> tuple[float, ...]:
     return tuple((size - q.off) / q.scale for size in c.sizes[:1]) or EFFECTS[c.effect].finite_sizes
 
 
-def _residual_jobs(problem: Problem, point: Mapping[Key, float], sizes: Sequence[Size]) -> list:
-    """Jobs: the residual with each of ``sizes`` at ``point``."""
-    return [delayed(problem.residual)({**point, **size.shift}) for size in sizes]
-
-
-def _trials(
-    known: Sensitivities, sizes: Sequence[Size], residuals: Sequence[Floats | None]
+def _tried(
+    problem: Problem,
+    known: Sensitivities,
+    sizes: Mapping[Candidate, Sequence[float]],
+    context: RunContext,
+    *,
+    compared: bool = False,
 ) -> dict[Candidate, list[Trial]]:
-    """Trials with the residuals of :func:`_residual_jobs`; only the change that a size makes counts."""
-    trials: dict[Candidate, list[Trial]] = {}
-    for size, residual in zip(sizes, residuals, strict=True):
-        if residual is not None and known.coarse_residual is not None:
-            trial = Trial(size.shift, known.residual + residual - known.coarse_residual)
-            trials.setdefault(size.candidate, []).append(trial)
+    """Trials at ``sizes``, in scales, by longer steps in time. As long as the last of a series leaves least, the series goes on.
+
+    Nuisances are as they are and, where they imitate a cause, nominal as well. ``compared``: trials are only compared with a fit, so that
+    these sizes alone count, with its steps and nuisances.
+    """
+    o = problem.options.screening
+    model = problem if compared else problem.with_least_step(o.finite_size_dt_s)
+    places = [{}] if compared else _nuisance_places(problem, known.point)
+    at_zero = (
+        [known.residual]
+        if compared
+        else context.run([delayed(model.residual)({**known.point, **beside}) for beside in places])
+    )
+    base, trials = at_zero[0], dict[Candidate, list[Trial]]()
+    if base is None:
+        return trials
+    series = [
+        Series(c, beside, own, [_squares(zero)])
+        for beside, zero in zip(places, at_zero, strict=True)
+        for c, every in sizes.items()
+        for own in ([z for z in every if z > 0.0], sorted((z for z in every if z < 0.0), reverse=True))
+        if own
+    ]
+    for _ in range(1 if compared else 1 + o.larger_sizes):
+        shifts = [(s, s.shift(size)) for s in series for size in s.sizes[len(s.squares) - 1 :]]
+        done = context.run([delayed(model.residual)({**known.point, **shift}) for _, shift in shifts])
+        for (s, shift), residual in zip(shifts, done, strict=True):
+            s.squares.append(_squares(residual))
+            if residual is not None:  # only the change that a size makes counts
+                trials.setdefault(s.candidate, []).append(Trial(shift, known.residual + residual - base))
+        series = [s for s in series if s.grows(o.size_growth, math.sqrt(2.0 * problem.size))]
     return trials
+
+
+def _squares(residual: Floats | None) -> float:
+    """Sum of the squares; infinite where a simulation has failed."""
+    return math.inf if residual is None else float(residual @ residual)
 
 
 def _set_secants(result: Sensitivities, finite: Sequence[Candidate]) -> None:
