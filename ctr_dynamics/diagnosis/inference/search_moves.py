@@ -17,7 +17,7 @@ from ctr_dynamics.diagnosis.inference.contact_plane import find_contact_plane
 from ctr_dynamics.diagnosis.inference.discretisation_error import renew_correction
 from ctr_dynamics.diagnosis.inference.evidence import weigh
 from ctr_dynamics.diagnosis.inference.fit_problem import Problem
-from ctr_dynamics.diagnosis.inference.fit_quality import is_acceptable, leaves_much, poor_fit_cost
+from ctr_dynamics.diagnosis.inference.fit_quality import excess, is_acceptable, leaves_much, poor_fit_cost
 from ctr_dynamics.diagnosis.inference.hypotheses import (
     Addition,
     Hypothesis,
@@ -187,7 +187,7 @@ def add_further_cause(state: SearchState, beside: Sequence[Hypothesis], here: Se
         state.context.report(f"what {', '.join(leader.effects)} leaves")
         fit_exactly(problem, leader)
         there = here.carried_to(leader.fit)
-        if not is_acceptable(problem, leader.fit):
+        if excess(problem, leader.fit) > o.little_left:
             there = with_large_sizes(problem, there, state.pool, state.context)
         screened = screen(problem, there, leader.fit, leader.members, state.pool)
         jobs = []

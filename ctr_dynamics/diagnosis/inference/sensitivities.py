@@ -157,8 +157,8 @@ def sensitivities_at(
 def with_large_sizes(
     problem: Problem, known: Sensitivities, pool: Sequence[Candidate], context: RunContext
 ) -> Sensitivities:
-    """``known`` with trials at large sizes, of which the derivative says little, and of candidates in ``pool`` that it does not have."""
-    new = [c for c in pool if EFFECTS[c.effect].finite_sizes and c not in known.by_candidate]
+    """``known`` with trials at large sizes, of which the derivative says little, and at finite ones where these have not been tried."""
+    new = [c for c in pool if EFFECTS[c.effect].finite_sizes and c not in known.trials]
     sizes = {c: _finite_sizes(c) if c in new else EFFECTS[c.effect].large_sizes for c in pool}
     found = _tried(problem, known, sizes, context)
     trials = {c: known.trials.get(c, []) + found.get(c, []) for c in (*known.trials, *found)}
