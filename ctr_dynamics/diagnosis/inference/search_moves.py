@@ -187,7 +187,7 @@ def add_further_cause(state: SearchState, beside: Sequence[Hypothesis], here: Se
         state.context.report(f"what {', '.join(leader.effects)} leaves")
         fit_exactly(problem, leader)
         there = here.carried_to(leader.fit)
-        if excess(problem, leader.fit) > o.little_left:
+        if excess(problem, leader.fit) > o.little_left and leader.fit.cost < beyond:
             there = with_large_sizes(problem, there, state.pool, state.context)
         screened = screen(problem, there, leader.fit, leader.members, state.pool)
         jobs = []
