@@ -192,8 +192,12 @@ class ScreeningOptions:
     finite_size_dt_s: float = option(
         0.005, "s", "step for finite sizes; their change exceeds its error in time"
     )
-    larger_sizes: int = option(3, COUNT, "finite sizes beyond the largest, as long as each leaves less")
-    size_growth: float = option(1.5, "of the one before", "each of them")
+    larger_sizes: int = option(
+        3, COUNT, "finite sizes beyond the largest, as long as each leaves less: 3.4 times as far"
+    )
+    size_growth: float = option(
+        1.5, "of the one before", "each of them; a fit looks for the best size up to 1.7 times as large"
+    )
     least_gain: float = option(1.0, LOG, "below, a candidate is not worth a fit")
     candidates: int = option(8, COUNT, "that are fitted; the true cause was among them in 87 of 87 cases")
     spare: int = option(3, COUNT, "more that are looked at, since presets of one effect count once")

@@ -60,16 +60,16 @@ def test_large_sizes_are_looked_at_where_the_misfit_is_large(recording, robot, k
 def test_a_series_of_sizes_goes_on_as_long_as_the_last_leaves_least(known):
     c = Candidate("clearance", (known["clearance", "play_rad"],))
 
-    def ends(*squares):
-        return Series(c, {}, [0.6, 1.2], [100.0, *squares]).grows(1.5, least=3.0)
+    def goes_on(*squares):
+        return Series(c, {}, [0.6, 1.2], [100.0, *squares]).goes_on(1.5, least=3.0)
 
-    assert ends(90.0, 80.0)
-    assert not ends(70.0, 80.0)
-    assert not ends(90.0, 88.0)  # by less than the noise of the squares
-    assert not ends(110.0, 105.0)
-    assert not ends(90.0, math.inf)  # it could not be simulated
+    assert goes_on(90.0, 80.0)
+    assert not goes_on(70.0, 80.0)
+    assert not goes_on(90.0, 88.0)  # by less than the noise of the squares
+    assert not goes_on(110.0, 105.0)
+    assert not goes_on(90.0, math.inf)  # it could not be simulated
     series = Series(c, {}, [0.6, 1.2], [100.0, 90.0, 80.0])
-    assert series.grows(1.5, least=3.0)
+    assert series.goes_on(1.5, least=3.0)
     assert series.sizes == [0.6, 1.2, pytest.approx(1.8)]
 
 

@@ -51,8 +51,8 @@ class Series:
         q = self.candidate.quantities[0]
         return {**self.beside, **dict(self.candidate.start), q.key: q.off + size * q.scale}
 
-    def grows(self, factor: float, least: float) -> bool:
-        """Append a size larger by ``factor``, if the last one leaves less than all before it by ``least``."""
+    def goes_on(self, factor: float, least: float) -> bool:
+        """Whether the last size leaves less than all before it by ``least``; one that is larger by ``factor`` is then appended."""
         q, size = self.candidate.quantities[0], self.sizes[-1] * factor
         falls = math.isfinite(self.squares[-1]) and self.squares[-1] < min(self.squares[:-1]) - least
         if falls and q.low <= q.off + size * q.scale <= q.high:
@@ -262,7 +262,7 @@ def _tried(
             s.squares.append(_squares(residual))
             if residual is not None:  # only the change that a size makes counts
                 trials.setdefault(s.candidate, []).append(Trial(shift, known.residual + residual - base))
-        series = [s for s in series if s.grows(o.size_growth, math.sqrt(2.0 * problem.size))]
+        series = [s for s in series if s.goes_on(o.size_growth, math.sqrt(2.0 * problem.size))]
     return trials
 
 
