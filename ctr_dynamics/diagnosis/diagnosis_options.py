@@ -196,7 +196,9 @@ class ScreeningOptions:
         3, COUNT, "finite sizes beyond the largest, as long as each leaves less: 3.4 times as far"
     )
     size_growth: float = option(
-        1.5, "of the one before", "each of them; a fit looks for the best size up to 1.7 times as large"
+        1.5,
+        "of the one before",
+        "each of them, and other sizes of the best hypothesis; a fit looks for the best size up to 1.7 times as large",
     )
     least_gain: float = option(1.0, LOG, "below, a candidate is not worth a fit")
     candidates: int = option(8, COUNT, "that are fitted; the true cause was among them in 87 of 87 cases")

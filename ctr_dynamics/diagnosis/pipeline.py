@@ -124,7 +124,7 @@ def diagnose_recordings(
             context.report("evidence of the validation bags")
             correct_discretisation(held_out, found.best.fit.point, context)
             weigh_by_prediction(found, problem, held_out, context)
-    best = hypothesis_for_verdict(found, options)
+    best = hypothesis_for_verdict(found, problem)
     result.extended = best.fit
     result.whiteness_extended = whiteness(problem, best.fit)
 

@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from ctr_dynamics.effects.plant import Plant
-from ctr_dynamics.effects.registry import EffectParameter, Values, effect
+from ctr_dynamics.effects.registry import STRIKING_PARTS, EffectParameter, Values, effect
 from ctr_dynamics.kernels.rotations import from_vector, matrix
 
 
@@ -86,6 +86,7 @@ def tip_spring(plant: Plant, values: Values) -> None:
     finite_sizes=(0.7,),
     joint=True,
     impacts=True,
+    form_error=STRIKING_PARTS,
 )
 def contact(plant: Plant, values: Values) -> None:
     stiffness = values["stiffness_N_per_m"]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from ctr_dynamics.effects.plant import Plant
-from ctr_dynamics.effects.registry import EffectParameter, Values, effect
+from ctr_dynamics.effects.registry import STRIKING_PARTS, EffectParameter, Values, effect
 
 
 @effect(
@@ -34,6 +34,7 @@ def insertion_velocity(plant: Plant, values: Values) -> None:
     presets=({"share": 0.0}, {"share": 1.0}),
     finite_sizes=(0.6, 1.2, 1.6),
     form=("play_kinematics",),
+    form_error=STRIKING_PARTS,
 )
 def clearance(plant: Plant, values: Values) -> None:
     if values["play_rad"] != 0.0:

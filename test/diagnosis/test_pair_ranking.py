@@ -18,11 +18,12 @@ from ctr_dynamics.diagnosis.inference.evidence import (
 from ctr_dynamics.diagnosis.inference.hypotheses import Hypothesis
 from ctr_dynamics.diagnosis.inference.map_fit import fit
 from ctr_dynamics.diagnosis.inference.screening import rank_pairs
-from ctr_dynamics.diagnosis.inference.search_moves import SearchState, add_pairs
+from ctr_dynamics.diagnosis.inference.search_moves import SearchState, add_pairs, try_other_sizes
 from ctr_dynamics.diagnosis.inference.sensitivities import Sensitivities
+from ctr_dynamics.diagnosis.inference.separation import separation
 from ctr_dynamics.diagnosis.run_context import RunContext
 from ctr_dynamics.diagnosis.verdict.decision import hypothesis_for_verdict, needed_hypothesis
-from ctr_dynamics.effects import EffectParameter, EffectQuantity
+from ctr_dynamics.effects import EFFECTS, EffectParameter, EffectQuantity
 
 OPTIONS = DiagnosisOptions()
 SILENT = RunContext(workers=1)
@@ -52,6 +53,10 @@ class Linear:
     @property
     def size(self):
         return len(self.data)
+
+    @property
+    def nominal(self):
+        return {q.key: q.off for q in self.nuisances}
 
     def residual(self, point):
         return self.data - sum(self.columns[key] * value for key, value in point.items())
@@ -142,6 +147,44 @@ def test_pairs_of_what_helps_most_by_itself(made):
     assert state.found == before
 
 
+@dataclass
+class Wavy(Linear):
+    """What the cause leaves has minima half a unit of its size apart; the least is at 1.5."""
+
+    def residual(self, point):
+        x = point.get(self.nuisances[0].key, 0.0)
+        (size,) = [value for key, value in point.items() if key != self.nuisances[0].key] or [0.0]
+        wave, slope = self.columns["wave"], self.columns["slope"]
+        return self.data + wave * np.sin(2.0 * np.pi * (size - 1.5)) + slope * (size - 1.5 + x)
+
+    def linearise(self, point, wanted):
+        def change(q):
+            step = 1e-6
+            return (
+                self.residual({**point, q.key: point.get(q.key, 0.0) + step}) - self.residual(point)
+            ) / -step
+
+        return self.residual(point), np.stack([change(q) for q in wanted], axis=1)
+
+
+@pytest.mark.parametrize(("data_tell", "size"), [(False, 1.5), (True, 1.0)])
+def test_the_best_hypothesis_is_tried_from_sizes_around_its_own(data_tell, size):
+    """A fit that stands in a minimum beside the least one finds it; not where the data have told the size already."""
+    rng = np.random.default_rng(3)
+    cause, nuisance = quantity("backlash", low=0.0), quantity("nuisance", tolerance=0.01)
+    columns = {name: rng.normal(size=300) for name in ("wave", "slope")}
+    columns = {"wave": 3.0 * columns["wave"], "slope": 2.0 * columns["slope"]}
+    problem = Wavy(columns, rng.normal(size=300), (nuisance,), np.zeros((300, 0)))
+    candidate = Candidate("backlash", (cause,), sizes=(1.0,) if data_tell else ())
+    start = Hypothesis((candidate,), fit(problem, (cause,), {cause.key: 1.0}), exact=True)
+    none = Hypothesis((), fit(problem, (), {}))
+    state = SearchState(problem, [candidate], none.fit, SILENT, [start, none])
+    state.add()
+    assert state.best.fit.point[cause.key] == pytest.approx(1.0, abs=0.1)
+    try_other_sizes(state)
+    assert state.best.fit.point[cause.key] == pytest.approx(size, abs=0.1)
+
+
 def test_bags_that_were_not_fitted_have_a_say(made):
     """A likeness that fits about as well as the truth does not predict."""
     problem, pool, held_out = made
@@ -178,7 +221,7 @@ def test_bags_that_were_not_fitted_have_a_say(made):
 
 
 def test_a_cause_that_gains_little_is_not_needed(made):
-    _, pool, _ = made
+    problem, pool, _ = made
     one, two, other = pool["one"], pool["two"], pool["other"]
     three, pair, single = (Hypothesis(m, None) for m in ((one, two, other), (one, two), (one,)))
     none = Hypothesis((), None)
@@ -191,19 +234,39 @@ def test_a_cause_that_gains_little_is_not_needed(made):
     ):
         for e, score in zip(found, scores, strict=True):
             e.score = e.fitted_score = score
-        assert needed_hypothesis(found, OPTIONS.verdict.needed_gain) is expected
+        assert needed_hypothesis(found, problem) is expected
     # what only the other bags speak for
     three.score, pair.score, single.score, none.score = 0.0, -9.0, -20.0, -40.0
     three.fitted_score, pair.fitted_score, single.fitted_score, none.fitted_score = 0.0, -1.0, -12.0, -40.0
-    assert needed_hypothesis((three, pair, single, none), OPTIONS.verdict.needed_gain) is pair
+    assert needed_hypothesis((three, pair, single, none), problem) is pair
+
+
+def test_a_further_cause_gains_more_than_the_law_of_the_first_may_miss(made, monkeypatch):
+    """A tenth of what the first does is left by its law; a cause that collects less than that is not needed, nor in the set of causes."""
+    problem, pool, _ = made
+    single, pair, none = (fitted(problem, *(pool[n] for n in m)) for m in (("one",), ("one", "two"), ()))
+    size = separation(problem, single.fit, single.members)
+    limit = 0.5 * (0.1 * size) ** 2
+    assert limit > 2.0 * OPTIONS.verdict.needed_gain
+    for part, gain, needed in (
+        (0.0, 0.9 * limit, pair),
+        (0.1, 0.9 * limit, single),
+        (0.1, 1.1 * limit, pair),
+    ):
+        monkeypatch.setitem(EFFECTS, EFFECT["one"], replace(EFFECTS[EFFECT["one"]], form_error=part))
+        for e, score in ((pair, gain), (single, 0.0), (none, -1e3)):
+            e.score = e.fitted_score = score
+        found = WeighedHypotheses([pair, single, none], np.array([0.98, 0.02, 0.0]), none, None, [], [])
+        assert needed_hypothesis(found.hypotheses, problem) is needed
+        assert found.cause_sets(problem, needed)[0][0] == needed.effects
 
 
 @pytest.mark.parametrize(("probability", "clean"), [(0.95, False), (0.85, True)])
 def test_no_bag_is_clean_where_a_cause_is_as_sure_as_a_name(made, probability, clean):
     """By the evidence that a cause has to gain it is not needed; nobody would bet on the robot file."""
-    _, pool, _ = made
+    problem, pool, _ = made
     single, none = Hypothesis((pool["one"],), None), Hypothesis((), None)
     none.score = none.fitted_score = -3.0
     found = WeighedHypotheses([single, none], np.array([probability, 1.0 - probability]), none, None, [], [])
-    assert needed_hypothesis(found.hypotheses, OPTIONS.verdict.needed_gain) is none
-    assert hypothesis_for_verdict(found, OPTIONS) is (none if clean else single)
+    assert needed_hypothesis(found.hypotheses, problem) is none
+    assert hypothesis_for_verdict(found, problem) is (none if clean else single)

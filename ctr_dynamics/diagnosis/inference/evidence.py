@@ -30,8 +30,10 @@ from ctr_dynamics.diagnosis.inference.hypotheses import Hypothesis, fit_exactly
 from ctr_dynamics.diagnosis.inference.map_fit import Fit
 from ctr_dynamics.diagnosis.inference.screening import Screened
 from ctr_dynamics.diagnosis.inference.sensitivities import Sensitivities
+from ctr_dynamics.diagnosis.inference.separation import separation
 from ctr_dynamics.diagnosis.inference.tolerance_factors import credible, log_gain, under_factors, with_factor
 from ctr_dynamics.diagnosis.run_context import RunContext
+from ctr_dynamics.effects import EFFECTS
 
 Floats = NDArray[np.float64]
 IMPOSSIBLE = -1e9  # log likelihood of bags that a hypothesis cannot simulate
@@ -65,25 +67,23 @@ class WeighedHypotheses:
         """The likeliest."""
         return self.hypotheses[0]
 
-    def cause_sets(
-        self, options: DiagnosisOptions, needed: Hypothesis | None = None
-    ) -> list[tuple[tuple[str, ...], float]]:
+    def cause_sets(self, problem: Problem, needed: Hypothesis) -> list[tuple[tuple[str, ...], float]]:
         """Sets of effects with their probabilities, likeliest first, as few as hold the probability of the options.
 
         Args:
-            needed: whose causes stand for those of every hypothesis that has more of them without need.
+            needed: whose causes, if it has any, stand for those of every hypothesis that has more of them without need.
         """
+        least = needed_gain(problem, needed)
         total: dict[tuple[str, ...], float] = {}
         for e, p in zip(self.hypotheses, self.probabilities, strict=True):
-            effects = e.effects
-            if needed is not None and needed.members and needed.keys < e.keys:
-                effects = needed.effects if e.gain_over(needed) < options.verdict.needed_gain else effects
+            without_need = needed.members and needed.keys < e.keys and e.gain_over(needed) < least
+            effects = needed.effects if without_need else e.effects
             total[effects] = total.get(effects, 0.0) + float(p)
         out, held = [], 0.0
         for effects, p in sorted(total.items(), key=lambda item: -item[1]):
             out.append((effects, p))
             held += p
-            if held >= options.evidence.set_probability:
+            if held >= problem.options.evidence.set_probability:
                 break
         return out
 
@@ -91,6 +91,19 @@ class WeighedHypotheses:
         """Sum of the probabilities of all hypotheses that hold ``effect``."""
         every = zip(self.hypotheses, self.probabilities, strict=True)
         return min(float(sum(p for e, p in every if effect in e.effects)), 1.0)
+
+
+def needed_gain(problem: Problem, fewer: Hypothesis) -> float:
+    """Log posterior that further causes must gain over those of ``fewer``.
+
+    What the laws of those may miss, further causes could collect: squares of a part ``form_error`` of the separation of each.
+    """
+    missed = sum(
+        (error * separation(problem, fewer.fit, (m,))) ** 2
+        for m in fewer.members
+        if (error := EFFECTS[m.effect].form_error) > 0.0
+    )
+    return max(problem.options.verdict.needed_gain, 0.5 * missed)
 
 
 def weigh(found: list[Hypothesis], pool: Sequence[Candidate], options: DiagnosisOptions) -> None:

@@ -36,6 +36,7 @@ from ctr_dynamics.diagnosis.inference.search_moves import (
     pair_for_a_third,
     refit_contenders,
     try_large_sizes,
+    try_other_sizes,
 )
 from ctr_dynamics.diagnosis.inference.sensitivities import off_nominal, sensitivities_at
 from ctr_dynamics.diagnosis.run_context import RunContext
@@ -132,6 +133,7 @@ def search_once(
         add_further_cause(state, pair_for_a_third(state, beside), here)
         drop_causes(state)
     refit_contenders(state)
+    try_other_sizes(state)
     at_best = add_alternatives(state, screened)
     return WeighedHypotheses(
         state.found,

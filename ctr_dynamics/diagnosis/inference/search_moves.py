@@ -25,6 +25,7 @@ from ctr_dynamics.diagnosis.inference.hypotheses import (
     fit_addition,
     fit_alternative,
     fit_exactly,
+    fit_hypothesis,
     fit_pair,
     fit_with_likeliest_tolerances,
     fit_without,
@@ -34,7 +35,7 @@ from ctr_dynamics.diagnosis.inference.screening import Screened, one_form_each, 
 from ctr_dynamics.diagnosis.inference.sensitivities import Sensitivities, sensitivities_at, with_large_sizes
 from ctr_dynamics.diagnosis.inference.separation import separation
 from ctr_dynamics.diagnosis.run_context import RunContext
-from ctr_dynamics.effects import effect_quantities
+from ctr_dynamics.effects import EFFECTS, effect_quantities
 
 
 @dataclass
@@ -261,6 +262,32 @@ def refit_contenders(state: SearchState) -> None:
     settle_tolerances(state)
 
 
+def try_other_sizes(state: SearchState) -> None:
+    """The best hypothesis from sizes around its own and from every preset, for causes that are tried at finite sizes.
+
+    What such a cause leaves has several minima, in its size and in its form together.
+    """
+    problem, best = state.problem, state.best
+    if best.fit.cost > state.poor_fit_cost or state.context.out_of_time:
+        return
+    growth = problem.options.screening.size_growth
+    jobs = []
+    for m in best.members:
+        if m.sizes or not EFFECTS[m.effect].finite_sizes:  # of which the data tell, or a derivative does
+            continue
+        q = m.quantities[0]
+        departure = best.fit.point[q.key] - q.off
+        for form in (c for c in state.pool if c.keys == m.keys):
+            for factor in (growth, 1.0 / growth):
+                size = min(q.off + factor * departure, q.high)
+                start = {**best.fit.point, **problem.nominal, **dict(form.start), q.key: size}
+                jobs.append(delayed(fit_hypothesis)(problem, best.members, start, limit=state.cost_limit))
+    if jobs:
+        state.context.report(f"other sizes of {', '.join(best.effects)}")
+        state.add(state.run_fits(jobs))
+        refit_contenders(state)
+
+
 def renew_discretisation(state: SearchState) -> None:
     """The discretisation error where the best hypothesis stands, if that is about right; what was found so far is weighed with it."""
     best = state.best
@@ -328,7 +355,7 @@ def alternatives(
     for gone in (*combinations(best.members, 1), *combinations(best.members, 2)):
         rest = tuple(m for m in best.members if m not in gone)
         kept = {m.effect for m in rest} if len(gone) > 1 else set(best.effects)
-        size = separation(problem, best.fit, gone, None, at_best)
+        size = separation(problem, best.fit, gone)
         apart = max(distance, o.alternative_likeness * size)
         near = sorted(
             (

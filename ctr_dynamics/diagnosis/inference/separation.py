@@ -24,12 +24,15 @@ def separation(
     problem: Problem,
     fit: Fit,
     members: Sequence[Candidate],
-    rival: Candidate | None,
-    sensitivities: Sensitivities,
+    rival: Candidate | None = None,
+    sensitivities: Sensitivities | None = None,
 ) -> float:
-    """d_sep of a cause, or of several together: the whitened size of what they do beside nuisances, other causes and the rival."""
+    """d_sep of a cause, or of several together: the whitened size of what they do beside nuisances, other causes and the rival.
+
+    ``sensitivities``: at the fit, with those of the rival.
+    """
     against = np.zeros((len(fit.columns), 0))
-    if rival is not None and rival in sensitivities.by_candidate:
+    if sensitivities is not None and rival in sensitivities.by_candidate:
         against = sensitivities.by_candidate[rival] * [q.scale for q in rival.quantities]
     return separation_in(fit, fit.columns, members, against, problem.numerics)
 

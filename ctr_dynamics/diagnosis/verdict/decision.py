@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 
 from ctr_dynamics.diagnosis.diagnosis_options import DiagnosisOptions
 from ctr_dynamics.diagnosis.inference.discrepancy import CorrelatedProblem, Discrepancy, as_beside
-from ctr_dynamics.diagnosis.inference.evidence import WeighedHypotheses, WithDiscrepancy
+from ctr_dynamics.diagnosis.inference.evidence import WeighedHypotheses, WithDiscrepancy, needed_gain
 from ctr_dynamics.diagnosis.inference.fit_problem import Problem
 from ctr_dynamics.diagnosis.inference.fit_quality import is_wrong
 from ctr_dynamics.diagnosis.inference.hypotheses import Hypothesis
@@ -66,20 +66,20 @@ class Evidence:
     numerics: Mapping[str, float] = field(default_factory=dict)
 
 
-def needed_hypothesis(hypotheses: Sequence[Hypothesis], needed_gain: float) -> Hypothesis:
-    """The first of ``hypotheses``, likeliest first, without causes that gain less than ``needed_gain`` together."""
+def needed_hypothesis(hypotheses: Sequence[Hypothesis], problem: Problem) -> Hypothesis:
+    """The first of ``hypotheses``, likeliest first, without causes that together gain less than they must."""
     best = hypotheses[0]
-    fewer = [e for e in hypotheses if e.keys <= best.keys and best.gain_over(e) < needed_gain]
+    fewer = [e for e in hypotheses if e.keys <= best.keys and best.gain_over(e) < needed_gain(problem, e)]
     return min(fewer, key=lambda e: (len(e.members), -e.score))
 
 
-def hypothesis_for_verdict(found: WeighedHypotheses, options: DiagnosisOptions) -> Hypothesis:
+def hypothesis_for_verdict(found: WeighedHypotheses, problem: Problem) -> Hypothesis:
     """The one that is needed; the likeliest where none with causes is, and yet it is as sure that something is wrong as a name must be."""
-    needed = needed_hypothesis(found.hypotheses, options.verdict.needed_gain)
+    needed = needed_hypothesis(found.hypotheses, problem)
     if needed.members or not found.best.members:
         return needed
     right = sum(float(p) for e, p in zip(found.hypotheses, found.probabilities, strict=True) if not e.members)
-    return found.best if 1.0 - right >= options.verdict.named else needed
+    return found.best if 1.0 - right >= problem.options.verdict.named else needed
 
 
 def is_unexplained(problem: Problem, found: WeighedHypotheses, best: Hypothesis, evidence: Evidence) -> bool:
@@ -129,14 +129,14 @@ def _without_remainder(
     o = problem.options
     is_noise = evidence.whiteness.p >= o.residual_tests.noise_p
     predicted = evidence.validation is not None and evidence.validation.confirms(o.validation)
-    sets = found.cause_sets(o, best)
+    sets = found.cause_sets(problem, best)
     result = Verdict("clean", cause_sets=list(sets))
     if best.members:
         _separate(result, problem, found, best, context)
     apart = all(cause.is_apart(o.verdict) for cause in result.causes)
     # who names more names these too
     probability = sum(p for effects, p in sets if set(best.effects) <= set(effects))
-    needed = needed_hypothesis(found.hypotheses, o.verdict.needed_gain)
+    needed = needed_hypothesis(found.hypotheses, problem)
     sure = probability >= o.verdict.named and bool(needed.members or not best.members)
     if not evidence.excited and not (best.members and apart and sure):
         result.word, result.causes = "not_excited", []

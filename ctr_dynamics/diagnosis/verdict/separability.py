@@ -82,7 +82,7 @@ def cause_with_rivals(
     near.update(_fitted_rivals(found, best, candidate, o))
     rivals = sorted((d, name) for name, (d, needed) in near.items() if d < needed)
     nearest = min((d for d, _ in near.values()), default=math.inf)
-    by_itself = separation(problem, best.fit, (candidate,), None, sensitivities)
+    by_itself = separation(problem, best.fit, (candidate,))
     return Cause(
         candidate,
         candidate.effect,
