@@ -90,13 +90,16 @@ def knocked(p: cdr.PoseIn) -> cdr.PoseIn:
     return p._replace(position=(p.position[0] + 0.02, *p.position[1:]), quaternion_xyzw=(x, y, z, w))
 
 
-def late(seconds: float) -> Edit:
-    """Poses stamped on arrival, which is late."""
+def late(seconds: float, begin_s: float = 0.0) -> Edit:
+    """Poses stamped on arrival, which is late, from ``begin_s`` on."""
     ns = round(seconds * 1e9)
 
     def change(messages: Messages) -> Messages:
+        since = messages[0].log_ns + begin_s * 1e9
         moved = [
-            m._replace(log_ns=m.log_ns + ns, data=shifted(m.data, ns)) if m.topic == T else m
+            m._replace(log_ns=m.log_ns + ns, data=shifted(m.data, ns))
+            if m.topic == T and m.log_ns >= since
+            else m
             for m in messages
         ]
         return sorted(moved, key=lambda m: m.log_ns)
@@ -118,6 +121,19 @@ def one_joint_state(edit: Callable[[RawMessage], RawMessage]) -> Edit:
 def turned_on(m: RawMessage) -> RawMessage:
     """The first joint 1 rad further."""
     return joints(lambda j: j._replace(positions=(j.positions[0] + 1.0, *j.positions[1:])))(m)[0]
+
+
+def stopped(messages: Messages) -> Messages:
+    """Encoders that report the same for a second, while the tubes move."""
+    first = messages[0].log_ns
+    last = [m for m in messages if m.topic == J and m.log_ns - first < BEGIN_S * 1e9][-1]
+    held = cdr.decode_joint_state(last.data)
+    return in_span(J, joints(lambda j: held._replace(stamp_ns=j.stamp_ns)), BEGIN_S + 1.0)(messages)
+
+
+def slipped(j: cdr.JointStateIn) -> cdr.JointStateIn:
+    """The first encoder 0.2 rad further."""
+    return j._replace(positions=(j.positions[0] + 0.2, *j.positions[1:]))
 
 
 def two_drivers(messages: Messages) -> Messages:
@@ -159,6 +175,9 @@ FAULTS: dict[str, tuple[Edit, float]] = {  # the change, and when it ends (s); i
     "sensor 20 mm off and turned by 0.5 rad for 2 s": (in_span(T, pose(knocked)), END_S),
     "poses of 1e160 for 2 s": (in_span(T, pose(huge)), END_S),
     "poses 80 ms late, not told": (late(0.08), math.inf),
+    "latency that jumps by 60 ms": (late(0.06, BEGIN_S), math.inf),
+    "joints stopped for 1 s": (stopped, BEGIN_S + 1.0),
+    "an encoder slips by 0.2 rad": (in_span(J, joints(slipped), math.inf), math.inf),
     "joints silent for 0.25 s": (in_span(J, lambda m: [], BEGIN_S + 0.25), BEGIN_S + 0.25),
     "joints NaN for 0.6 s": (
         in_span(J, joints(lambda j: j._replace(positions=(NAN, *j.positions[1:]))), BEGIN_S + 0.6),

@@ -15,6 +15,7 @@ from ctr_dynamics.estimation.inputs.input_buffer import InputBuffer
 from ctr_dynamics.estimation.inputs.measurement_queue import DueMeasurement
 from ctr_dynamics.estimation.inputs.run_inputs import InterpolatedInputs, RunInputs
 from ctr_dynamics.estimation.monitoring.delay_search import DelaySearch, allowance
+from ctr_dynamics.estimation.monitoring.disagreement import Disagreement
 from ctr_dynamics.estimation.monitoring.health import Health
 from ctr_dynamics.estimation.monitoring.innovation_log import InnovationLog
 from ctr_dynamics.estimation.monitoring.model_error_search import ModelErrorSearch
@@ -69,6 +70,7 @@ class FusedRun:
         file = ekf.tracker.state_sigma
         registered = math.hypot(file[TRANSLATION].max(), length * file[ROTATION].max())
         self.delay_search = DelaySearch(noise.position.value, ekf.options.force_change)
+        self.disagreement = Disagreement(noise.position.value)
         self.model_error_search = ModelErrorSearch(
             noise.position.value,
             noise.rotation.value,
@@ -86,6 +88,7 @@ class FusedRun:
         self.ekf.forget_parameters()
         self.delay_search.clear()
         self.model_error_search.clear()
+        self.disagreement.clear()
         self.state, self.measured_ns, self.confirmed, self.late = None, None, 0, False
 
     def start(self, state: State, t: float) -> None:
@@ -117,11 +120,19 @@ class FusedRun:
                 update = self.ekf.compare(time_s, position, quaternion)
                 if self.late:
                     update = update._replace(reason=update.reason.replace(FUSION_OFF, UNKNOWN_DELAY))
+            if motion is not None and residual is not None:
+                seen = motion.position + motion.residual
+                self.disagreement.add(measurement.stamp_ns, seen, motion.position, residual)
             if motion is not None and update.foretold is not None:
                 self._apart = motion.residual
                 own_s, seen = time_s - self.ekf.tracker.age, motion.position + motion.residual
                 self.delay_search.add(
-                    measurement.stamp_ns, own_s, seen, *open_loop.tips.positions(), update.foretold
+                    measurement.stamp_ns,
+                    own_s,
+                    seen,
+                    *open_loop.tips.positions(),
+                    update.foretold,
+                    self.ekf.delay,
                 )
                 self.model_error_search.add(
                     measurement.stamp_ns,
@@ -235,11 +246,13 @@ class FusedRun:
 
     def inflate_covariance(self, tip: TipEstimate, open_loop: OpenLoopRun, farthest: float) -> None:
         """Have the covariance of ``tip`` hold what else may be right: the open-loop run where the tracker may be late or the model may err more
-        than the filter counts on, the tracker where it is thought to be late or has been shifted since the start.
+        than the filter counts on, the tracker where it is thought to be late, has been shifted since the start, or lies apart without having jumped.
 
         A shift of more than ``farthest`` (m) is no error of a registration; outputs are invalid where tracker and model lie that far apart.
         """
-        if not self.agreed and not self.ekf.adapted.noisy:
+        if self.agreed:
+            tip.covariance[:3, :3] += self.disagreement.covariance
+        elif not self.ekf.adapted.noisy:
             # a shift that has been there since the start may be one of the registration, which belongs to the pose
             shift = self.ekf.shift_in_base()
             if math.hypot(*shift.tolist()) < farthest:

@@ -11,14 +11,15 @@ NOISE = 2.5e-4
 
 def search(path, delay, beside=(0.0, 0.0, 0.0), foretold=(-20.0, -2.0), seen=None, seconds=1.0):
     """Positions at 40 Hz of a tip on ``path``, measured ``delay`` late by a tracker that sees ``seen``, or the same, beside a filter that has
-    ``foretold`` every one like that: as if a force had changed."""
+    ``foretold`` every one like that, or that of a time (s): as if a force had changed."""
     rng, found = np.random.default_rng(3), DelaySearch(NOISE, 20.0)
     times = np.arange(0.0, 0.9 + seconds + 0.1, 0.003)
     for k in range(round(40 * seconds)):
         t = 0.9 + 0.025 * k
         z = (seen or path)(np.array([t - delay]))[0] + np.array(beside) + NOISE * rng.standard_normal(3)
         known = times <= t
-        found.add(round(t * 1e9), t, z, times[known], path(times[known]), foretold)
+        told = foretold(t) if callable(foretold) else foretold
+        found.add(round(t * 1e9), t, z, times[known], path(times[known]), told)
     return found
 
 
@@ -49,6 +50,21 @@ def test_nothing_is_found_where_nothing_is_wrong():
     assert search(moving, 0.08, foretold=WELL).belief(0.0).late < 1e-2, "the filter has foretold it"
     still = search(lambda t: np.zeros((len(t), 3)), 0.08, foretold=WELL)
     assert still.belief(0.0).late < 0.05, "a robot at rest tells nothing"
+
+
+def test_a_delay_that_changes_is_found_after_a_long_time_without():
+    """Ten seconds in which the filter has foretold well do not speak against a change of the latency after them."""
+
+    def seen(t):
+        return moving(np.where(t < 10.0, t, t - 0.06))
+
+    found = search(moving, 0.0, foretold=WELL, seen=seen, seconds=9.0)
+    assert found.found(0.0) is None
+    later = search(
+        moving, 0.0, foretold=lambda t: WELL if t < 10.0 else (-20.0, -8.0), seen=seen, seconds=9.8
+    ).found(0.0)
+    assert later is not None
+    assert later[0] == pytest.approx(0.06, abs=0.001)
 
 
 def test_a_free_vibration_whose_phase_is_wrong_is_no_delay():
@@ -100,3 +116,17 @@ def test_the_estimate_follows_a_late_tracker(late):
     assert "older than their stamps" in run.estimator.health.tracker["latency"].last
     errors, _ = truth_error(run, "clean_sweep", "p_trk", since=2.0)
     assert np.linalg.norm(errors, axis=-1).max() < 2e-3
+
+
+def test_the_estimate_follows_a_tracker_whose_latency_jumps():
+    messages = [
+        m.shifted(0.06) if m.kind == "pose" and m.stamp > 4e9 else m for m in bag_messages("clean_sweep", 6.0)
+    ]
+    run = play(messages)
+    assert "older than their stamps" in run.estimator.health.tracker["latency"].last
+    errors, steps = truth_error(run, "clean_sweep", "p_trk", since=1.0)
+    deviation = np.sqrt(run.column("tip_covariance")[steps][:, range(3), range(3)].sum(axis=1))
+    honest = np.linalg.norm(errors, axis=-1) < np.maximum(3.0 * deviation, 3e-3)
+    assert honest.all(), "until it is found, the covariance holds the error"
+    errors, _ = truth_error(run, "clean_sweep", "p_trk", since=4.3)
+    assert np.linalg.norm(errors, axis=-1).max() < 1e-3

@@ -105,7 +105,7 @@ def test_a_robot_file_with_far_too_small_tolerances_does_not_make_the_filter_cer
 
 
 def test_a_tracker_clock_that_runs_fast_leaves_the_valid_tip_where_it_says_or_the_covariance_large():
-    """Stamps run ahead by 3 ms in a second: the delay that is found grows beyond the file's, and with it the bent parameters refute the file."""
+    """Stamps run ahead by 3 ms in a second: either the delay that grows is found, or the bent parameters refute the file."""
     messages = [
         replace(m, stamp=round(m.stamp * 1.003)) if m.kind == "pose" else m
         for m in bag_messages("clean_sweep", 6.0)
@@ -114,5 +114,5 @@ def test_a_tracker_clock_that_runs_fast_leaves_the_valid_tip_where_it_says_or_th
     error, steps = truth_error(run, "clean_sweep", "p_trk")
     distance = np.linalg.norm(error, axis=1)
     deviation = np.sqrt(np.trace(run.column("tip_covariance")[steps, :3, :3], axis1=1, axis2=2))
-    assert run.estimator.health.refutation
+    assert run.estimator.health.refutation or "latency" in run.estimator.health.tracker
     assert np.all((distance < 3e-3) | (distance < 3.0 * deviation))

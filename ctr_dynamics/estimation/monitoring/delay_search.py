@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -16,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctr_dynamics import chi_square
+from ctr_dynamics.estimation.filter.adapted_variances import AdaptationOptions
 
 Floats = NDArray[np.float64]
 FINER = np.arange(-4.5, 5.0) / 10.0  # places between two delays
@@ -33,6 +35,7 @@ class DelaySearchOptions:
         believed: probability from which on the estimate begins again with the delay.
         drift_s: time in which the open-loop run goes astray by about the tracker's noise, beside a registration that is wrong for good.
         memory_s: s, for which evidence counts. Latency is the same for long. A vibration that gets out of phase was in phase before.
+        sound_s: s, mean time after which it changes, as that of a network or of a driver that starts again.
         remembered: measurements that may be taken again.
     """
 
@@ -43,6 +46,7 @@ class DelaySearchOptions:
     believed: float = 0.99
     drift_s: float = 1.0
     memory_s: float = 10.0
+    sound_s: float = AdaptationOptions.sound_s
     remembered: int = 200
 
 
@@ -52,6 +56,8 @@ class Evidence(NamedTuple):
     Attributes:
         level: (d, 3) m, how far measurements lie from the open-loop run for every delay, as known from the past. variance: m^2, of it.
         delays: (d,) logarithm of the evidence of every delay; filter: of what the filter foretold.
+        changed: (d,) the same of a latency that has changed to every delay, at the time that speaks most for it; began_ns: (d,) stamp before that;
+            changed_level: (d, 3) m, the level since then.
     """
 
     stamp_ns: int
@@ -59,6 +65,9 @@ class Evidence(NamedTuple):
     variance: float
     delays: Floats
     filter: float
+    changed: Floats
+    began_ns: NDArray[np.int64]
+    changed_level: Floats
 
 
 class Belief(NamedTuple):
@@ -100,6 +109,7 @@ class DelaySearch:
         stamps: Floats,
         tips: Floats,
         foretold: tuple[float, float],
+        present_s: float = 0.0,
     ) -> None:
         """Take in a measured tip that the filter has met; one of a stamp that is known takes its place.
 
@@ -108,6 +118,7 @@ class DelaySearch:
             position: (3,) m, base axes.
             stamps, tips: (k,) s and (k, 3) m of the open-loop run.
             foretold: what the filter foretold; see :class:`~ctr_dynamics.estimation.filter.filter_records.Update`.
+            present_s: s beyond the nominal delay, with which the filter has met it.
         """
         while self._evidence and self._evidence[-1].stamp_ns >= stamp_ns:
             self._evidence.pop()  # its step is taken again
@@ -118,7 +129,8 @@ class DelaySearch:
         residual = position - np.stack([np.interp(times, stamps, tips[:, axis]) for axis in range(3)], axis=1)
         noise = self._noise**2
         if not self._evidence:
-            self._evidence.append(Evidence(stamp_ns, residual, noise, np.zeros(len(times)), 0.0))
+            none, began = np.zeros(len(times)), np.full(len(times), stamp_ns)
+            self._evidence.append(Evidence(stamp_ns, residual, noise, none, 0.0, none, began, residual))
             return
         # 1. The registration and the drift of the open-loop run: a random walk.
         last, options = self._evidence[-1], self.options
@@ -126,19 +138,32 @@ class DelaySearch:
         before = last.variance + noise * elapsed / options.drift_s
         change = residual - last.level
         total = before + noise
+
         # 2. Density of the position, by that of the stated noise at zero.
-        density = -0.5 * ((change**2).sum(axis=1) / total + 3.0 * math.log(total / noise))
+        def density(change: Floats) -> Floats:
+            return -0.5 * ((change**2).sum(axis=1) / total + 3.0 * math.log(total / noise))
+
         own = density_of_filter(foretold, elapsed / self._change_s)
         # 3. What is known of the past counts less and less.
         decay = math.exp(-elapsed / options.memory_s)
         gain = before / total
+        # 4. The latency may have changed just now. That leaves the registration as it is; a model that is wrong all of a sudden does not.
+        present = int(np.argmin(np.abs(self.delays - present_s)))
+        right_before = decay * max(last.filter, float(last.delays[present]))
+        goes_on, begins = residual - last.changed_level, residual - last.level[present]
+        on = decay * last.changed + density(goes_on)
+        begun = right_before + math.log(-math.expm1(-elapsed / options.sound_s)) + density(begins)
+        new = begun > on
         self._evidence.append(
             Evidence(
                 stamp_ns,
                 last.level + gain * change,
                 before * (1.0 - gain),
-                decay * last.delays + density,
+                decay * last.delays + density(change),
                 decay * last.filter + own,
+                np.where(new, begun, on),
+                np.where(new, last.stamp_ns, last.began_ns),
+                residual - (1.0 - gain) * np.where(new[:, None], begins, goes_on),
             )
         )
 
@@ -148,14 +173,17 @@ class DelaySearch:
         The filter may be right; so may the open-loop run with the delay that the filter has, and so may it with any other.
         """
         if self._belief is None or self._belief[0] != present_s:
-            self._belief = present_s, self._compare(present_s)
+            self._belief = present_s, self._compare(present_s, self._evidence)
         return self._belief[1]
 
-    def _compare(self, present_s: float) -> Belief:
-        if not self._evidence:
+    def _compare(self, present_s: float, known: Sequence[Evidence], changes: bool = True) -> Belief:
+        if not known:
             return Belief(0.0, present_s, 0.0, 0.0)
-        last, options = self._evidence[-1], self.options
-        delays, evidence = self._between(last.delays, max(last.filter, float(last.delays.max())) - IMPOSSIBLE)
+        last, options = known[-1], self.options
+        least = max(last.filter, float(last.delays.max())) - IMPOSSIBLE
+        ways = [last.delays, self._after_change(present_s, known)] if changes else [last.delays]
+        dense = [self._between(one, least) for one in ways]
+        delays, evidence = (np.concatenate(parts) for parts in zip(*dense, strict=True))
         other = np.abs(delays - present_s) > options.least_s
         if not other.any():
             return Belief(0.0, present_s, 0.0, 0.0)
@@ -172,6 +200,21 @@ class DelaySearch:
         delay = float(weights[near] @ delays[near]) / around
         spread = math.sqrt(float(weights[near] @ (delays[near] - delay) ** 2) / around)
         return Belief(float(weights.sum()), delay, spread, around)
+
+    def _after_change(self, present_s: float, known: Sequence[Evidence]) -> Floats:
+        """(d,) logarithm of the evidence of every delay, if the latency has changed from ``present_s``.
+
+        Around the likeliest, all delays have the same time of the change, so that parabolas lead to the delays between them.
+        """
+        last, delays = known[-1], self.delays
+        other = np.abs(delays - present_s) > self.options.least_s
+        likeliest = int(np.where(other, last.changed, -np.inf).argmax())
+        then = next((e for e in reversed(known) if e.stamp_ns <= last.began_ns[likeliest]), known[0])
+        decay = math.exp((then.stamp_ns - last.stamp_ns) * 1e-9 / self.options.memory_s)
+        since = last.delays - decay * then.delays
+        near = np.abs(delays - delays[likeliest]) <= 2.0 * self.options.least_s
+        alike = last.changed[likeliest] + np.minimum(since - since[likeliest], 0.0)
+        return np.where(near, alike, last.changed)
 
     def _between(self, evidence: Floats, least: float) -> tuple[Floats, Floats]:
         """Delays and evidence ten times as dense: parabolas through neighbours. A fast robot moves by more than the noise between two delays.
@@ -196,14 +239,28 @@ class DelaySearch:
         return float(np.linalg.norm(self._evidence[-1].level, axis=1).min()) if self._evidence else 0.0
 
     def found(self, present_s: float) -> tuple[float, float] | None:
-        """The delay that is believed instead of ``present_s``, beyond the nominal one, and its deviation, s; None where there is none."""
+        """The delay that is believed instead of ``present_s``, beyond the nominal one, and its deviation, s; None where there is none.
+
+        One to which the latency has changed was likely as long ago as it is itself. What a model that is suddenly wrong does has shown by then:
+        before, a long delay says that it has yet to come.
+        """
+        if self.belief(present_s).near <= self.options.believed:
+            return None
+        always = self._compare(present_s, self._evidence, changes=False)
+        if always.near > self.options.believed:
+            return always.delay, always.spread
         belief = self.belief(present_s)
-        return (belief.delay, belief.spread) if belief.near > self.options.believed else None
+        until_ns = self._evidence[-1].stamp_ns - round(belief.delay * 1e9)
+        before = self._compare(present_s, [e for e in self._evidence if e.stamp_ns <= until_ns])
+        same = abs(before.delay - belief.delay) <= 2.0 * self.options.least_s
+        return (belief.delay, belief.spread) if same and before.near > 0.5 else None
 
     def undecided(self, present_s: float) -> bool:
-        """Whether the tracker is late, by a time that is not known yet."""
+        """Whether the tracker has been late since the start, by a time that is not known yet."""
         believed = self.options.believed
-        belief = self.belief(present_s)
+        if self.belief(present_s).late <= believed:
+            return False
+        belief = self._compare(present_s, self._evidence, changes=False)
         return belief.late > believed >= belief.near
 
     def begin_again(self, present_s: float) -> None:
@@ -212,7 +269,8 @@ class DelaySearch:
         if self._evidence:
             last = self._evidence.pop()
             same = np.abs(self.delays - present_s) <= self.options.least_s
-            self._evidence.append(last._replace(filter=max([last.filter, *last.delays[same]])))
+            best = max([last.filter, *last.delays[same], *last.changed[same]])
+            self._evidence.append(last._replace(filter=best))
 
 
 def density_of_filter(foretold: tuple[float, float], changes: float) -> float:
