@@ -36,6 +36,7 @@ class DelaySearchOptions:
         drift_s: time in which the open-loop run goes astray by about the tracker's noise, beside a registration that is wrong for good.
         memory_s: s, for which evidence counts. Latency is the same for long. A vibration that gets out of phase was in phase before.
         sound_s: s, mean time after which it changes, as that of a network or of a driver that starts again.
+        lasts_s: s, for which a change has been likely before it is believed. Other faults look like a latency for a moment, one that grows.
         remembered: measurements that may be taken again.
     """
 
@@ -47,6 +48,7 @@ class DelaySearchOptions:
     drift_s: float = 1.0
     memory_s: float = 10.0
     sound_s: float = AdaptationOptions.sound_s
+    lasts_s: float = 0.2
     remembered: int = 200
 
 
@@ -241,8 +243,8 @@ class DelaySearch:
     def found(self, present_s: float) -> tuple[float, float] | None:
         """The delay that is believed instead of ``present_s``, beyond the nominal one, and its deviation, s; None where there is none.
 
-        One to which the latency has changed was likely as long ago as it is itself. What a model that is suddenly wrong does has shown by then:
-        before, a long delay says that it has yet to come.
+        One to which the latency has changed was likely as long ago as it is itself, and some time at least. What a model that is suddenly wrong
+        does has shown by then: before, a long delay says that it has yet to come.
         """
         if self.belief(present_s).near <= self.options.believed:
             return None
@@ -250,7 +252,7 @@ class DelaySearch:
         if always.near > self.options.believed:
             return always.delay, always.spread
         belief = self.belief(present_s)
-        until_ns = self._evidence[-1].stamp_ns - round(belief.delay * 1e9)
+        until_ns = self._evidence[-1].stamp_ns - round(max(belief.delay, self.options.lasts_s) * 1e9)
         before = self._compare(present_s, [e for e in self._evidence if e.stamp_ns <= until_ns])
         same = abs(before.delay - belief.delay) <= 2.0 * self.options.least_s
         return (belief.delay, belief.spread) if same and before.near > 0.5 else None
