@@ -56,11 +56,15 @@ def in_span(topic: str, change: Callable[[RawMessage], list[RawMessage]], end_s:
     return during(topic, change, BEGIN_S, end_s)
 
 
+def last_before(topic: str, messages: Messages) -> RawMessage:
+    """The last message of ``topic`` before the span."""
+    begin = messages[0].log_ns + BEGIN_S * 1e9
+    return next(m for m in reversed(messages) if m.topic == topic and m.log_ns < begin)
+
+
 def frozen(messages: Messages) -> Messages:
     """The last pose before the span again and again."""
-    first = messages[0].log_ns
-    last = [m for m in messages if m.topic == T and m.log_ns - first < BEGIN_S * 1e9][-1]
-    held = cdr.decode_pose_stamped(last.data)
+    held = cdr.decode_pose_stamped(last_before(T, messages).data)
     return in_span(T, pose(lambda p: held._replace(stamp_ns=p.stamp_ns)))(messages)
 
 
@@ -118,22 +122,15 @@ def one_joint_state(edit: Callable[[RawMessage], RawMessage]) -> Edit:
     return change
 
 
-def turned_on(m: RawMessage) -> RawMessage:
-    """The first joint 1 rad further."""
-    return joints(lambda j: j._replace(positions=(j.positions[0] + 1.0, *j.positions[1:])))(m)[0]
+def turned_on(angle: float) -> Callable[[RawMessage], list[RawMessage]]:
+    """The first joint ``angle`` (rad) further."""
+    return joints(lambda j: j._replace(positions=(j.positions[0] + angle, *j.positions[1:])))
 
 
 def stopped(messages: Messages) -> Messages:
     """Encoders that report the same for a second, while the tubes move."""
-    first = messages[0].log_ns
-    last = [m for m in messages if m.topic == J and m.log_ns - first < BEGIN_S * 1e9][-1]
-    held = cdr.decode_joint_state(last.data)
+    held = cdr.decode_joint_state(last_before(J, messages).data)
     return in_span(J, joints(lambda j: held._replace(stamp_ns=j.stamp_ns)), BEGIN_S + 1.0)(messages)
-
-
-def slipped(j: cdr.JointStateIn) -> cdr.JointStateIn:
-    """The first encoder 0.2 rad further."""
-    return j._replace(positions=(j.positions[0] + 0.2, *j.positions[1:]))
 
 
 def two_drivers(messages: Messages) -> Messages:
@@ -177,13 +174,13 @@ FAULTS: dict[str, tuple[Edit, float]] = {  # the change, and when it ends (s); i
     "poses 80 ms late, not told": (late(0.08), math.inf),
     "latency that jumps by 60 ms": (late(0.06, BEGIN_S), math.inf),
     "joints stopped for 1 s": (stopped, BEGIN_S + 1.0),
-    "an encoder slips by 0.2 rad": (in_span(J, joints(slipped), math.inf), math.inf),
+    "an encoder slips by 0.2 rad": (in_span(J, turned_on(0.2), math.inf), math.inf),
     "joints silent for 0.25 s": (in_span(J, lambda m: [], BEGIN_S + 0.25), BEGIN_S + 0.25),
     "joints NaN for 0.6 s": (
         in_span(J, joints(lambda j: j._replace(positions=(NAN, *j.positions[1:]))), BEGIN_S + 0.6),
         BEGIN_S + 0.6,
     ),
-    "one joint state 1 rad off": (one_joint_state(turned_on), 5.1),
+    "one joint state 1 rad off": (one_joint_state(lambda m: turned_on(1.0)(m)[0]), 5.1),
     "one joint state 0.9 s ahead": (
         one_joint_state(lambda m: m._replace(data=shifted(m.data, 900_000_000))),
         5.0,

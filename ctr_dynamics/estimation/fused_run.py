@@ -125,7 +125,7 @@ class FusedRun:
                 self.disagreement.add(measurement.stamp_ns, seen, motion.position, residual)
             if motion is not None and update.foretold is not None:
                 self._apart = motion.residual
-                own_s, seen = time_s - self.ekf.tracker.age, motion.position + motion.residual
+                own_s = time_s - self.ekf.tracker.age
                 self.delay_search.add(
                     measurement.stamp_ns,
                     own_s,

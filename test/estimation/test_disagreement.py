@@ -89,3 +89,10 @@ def test_steps_that_are_taken_again_count_once():
         again.add(*one)
     np.testing.assert_array_equal(found.covariance, again.covariance)
     assert np.trace(found.covariance) > 0.0
+
+
+def test_a_tracker_without_noise_may_leave_nothing():
+    found = Disagreement(0.0)
+    for k in range(2 * LAST):
+        found.add(k * PERIOD_NS, np.zeros(3), np.zeros(3), np.zeros(3))
+    np.testing.assert_array_equal(found.covariance, np.zeros((3, 3)))

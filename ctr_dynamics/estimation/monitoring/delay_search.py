@@ -11,7 +11,7 @@ import math
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -140,11 +140,8 @@ class DelaySearch:
         before = last.variance + noise * elapsed / options.drift_s
         change = residual - last.level
         total = before + noise
-
-        # 2. Density of the position, by that of the stated noise at zero.
-        def density(change: Floats) -> Floats:
-            return -0.5 * ((change**2).sum(axis=1) / total + 3.0 * math.log(total / noise))
-
+        # 2. Density of the position.
+        density = log_density((change**2).sum(axis=1), total, noise)
         own = density_of_filter(foretold, elapsed / self._change_s)
         # 3. What is known of the past counts less and less.
         decay = math.exp(-elapsed / options.memory_s)
@@ -153,15 +150,16 @@ class DelaySearch:
         present = int(np.argmin(np.abs(self.delays - present_s)))
         right_before = decay * max(last.filter, float(last.delays[present]))
         goes_on, begins = residual - last.changed_level, residual - last.level[present]
-        on = decay * last.changed + density(goes_on)
-        begun = right_before + math.log(-math.expm1(-elapsed / options.sound_s)) + density(begins)
+        on = decay * last.changed + log_density((goes_on**2).sum(axis=1), total, noise)
+        now = math.log(-math.expm1(-elapsed / options.sound_s))
+        begun = right_before + now + log_density((begins**2).sum(axis=1), total, noise)
         new = begun > on
         self._evidence.append(
             Evidence(
                 stamp_ns,
                 last.level + gain * change,
                 before * (1.0 - gain),
-                decay * last.delays + density(change),
+                decay * last.delays + density,
                 decay * last.filter + own,
                 np.where(new, begun, on),
                 np.where(new, last.stamp_ns, last.began_ns),
@@ -246,12 +244,12 @@ class DelaySearch:
         One to which the latency has changed was likely as long ago as it is itself, and some time at least. What a model that is suddenly wrong
         does has shown by then: before, a long delay says that it has yet to come.
         """
-        if self.belief(present_s).near <= self.options.believed:
+        belief = self.belief(present_s)
+        if belief.near <= self.options.believed:
             return None
         always = self._compare(present_s, self._evidence, changes=False)
         if always.near > self.options.believed:
             return always.delay, always.spread
-        belief = self.belief(present_s)
         until_ns = self._evidence[-1].stamp_ns - round(max(belief.delay, self.options.lasts_s) * 1e9)
         before = self._compare(present_s, [e for e in self._evidence if e.stamp_ns <= until_ns])
         same = abs(before.delay - belief.delay) <= 2.0 * self.options.least_s
@@ -273,6 +271,11 @@ class DelaySearch:
             same = np.abs(self.delays - present_s) <= self.options.least_s
             best = max([last.filter, *last.delays[same], *last.changed[same]])
             self._evidence.append(last._replace(filter=best))
+
+
+def log_density(square: Any, variance: Any, noise: float) -> Any:
+    """Logarithm of a normal density of three axes, of ``variance`` (m^2) each, at a squared distance ``square`` (m^2), by that of ``noise`` at 0."""
+    return -0.5 * (square / variance + 3.0 * np.log(variance / noise))
 
 
 def density_of_filter(foretold: tuple[float, float], changes: float) -> float:

@@ -99,9 +99,9 @@ class Disagreement:
         if len(self._measured) < LAST:
             return np.zeros((3, 3))
         r = np.array([self._measured[i].residual for i in range(-LAST, 0)])
-        whole = float((r * r).sum())
-        squares = sum((float((r[lag:] * r[:-lag]).sum()) / whole) ** 2 / (LAST - lag) for lag in LAGS)
-        if r.size * (LAST + 2) * squares < self._correlated:
+        squares = sum(float((r[lag:] * r[:-lag]).sum()) ** 2 / (LAST - lag) for lag in LAGS)
+        # not divided by: a tracker without noise may leave nothing
+        if r.size * (LAST + 2) * squares <= self._correlated * float((r * r).sum()) ** 2:
             return np.zeros((3, 3))
         sizes, axes = np.linalg.eigh(r.T @ r / LAST)
         more: Floats = (axes * np.maximum(sizes - self._noise**2, 0.0)) @ axes.T

@@ -14,14 +14,14 @@ from __future__ import annotations
 import math
 from collections import deque
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ctr_dynamics.estimation.filter.adapted_variances import AdaptationOptions
 from ctr_dynamics.estimation.filter.filter_records import ModelErrorSize
-from ctr_dynamics.estimation.monitoring.delay_search import density_of_filter
+from ctr_dynamics.estimation.monitoring.delay_search import density_of_filter, log_density
 
 Floats = NDArray[np.float64]
 CONSTANT, REST = -2, -1  # rows beyond those of the departures
@@ -155,12 +155,12 @@ class ModelErrorSearch:
         level = remains[:, None] * last.level
         change, total = observed - level, before + noise
         # 2. Density of the position, by that of the stated noise at zero.
-        density = _log_density((change**2).sum(axis=1), total, noise)
+        density = log_density((change**2).sum(axis=1), total, noise)
         # of what is constant and what has jumped to anywhere, the likelier goes on
         anywhere = self._reach**2 + noise
         jumps = math.log(-math.expm1(-elapsed / options.sound_s))
         for row in (CONSTANT, REST):
-            moved = jumps + _log_density(observed[row] @ observed[row], anywhere, noise)
+            moved = jumps + log_density(observed[row] @ observed[row], anywhere, noise)
             if moved > density[row]:
                 density[row], before[row], total[row] = moved, self._reach**2, anywhere
                 level[row], change[row] = 0.0, observed[row]
@@ -254,8 +254,3 @@ class ModelErrorSearch:
             self._compared = None
             last = self._evidence.pop()
             self._evidence.append(last._replace(filter=float(max(last.filter, last.departures[:REST].max()))))
-
-
-def _log_density(square: Any, variance: Any, noise: float) -> Any:
-    """Logarithm of a normal density of three axes, of ``variance`` (m^2) each, at a squared distance ``square`` (m^2), by that of ``noise`` at 0."""
-    return -0.5 * (square / variance + 3.0 * np.log(variance / noise))
