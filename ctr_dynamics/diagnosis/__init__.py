@@ -11,7 +11,7 @@
 | screening | `inference.candidates`, `inference.sensitivities`, `inference.screening` |
 | hypotheses | `inference.hypothesis_search`, `inference.search_moves`, `inference.hypotheses`, `inference.contact_plane` |
 | evidence | `inference.evidence` |
-| validation | `verdict.validation`, `verdict.residual_tests` |
+| validation | `verdict.validation`, `inference.residual_tests` |
 | verdict | `verdict.separability`, `verdict.decision`, `verdict.unexplained_force`; then `next_experiment` |
 | output | `output.findings`, `output.findings_report`, `output.robot_export`, `output.summary_text` |
 

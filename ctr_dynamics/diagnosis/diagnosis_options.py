@@ -247,6 +247,11 @@ class SearchOptions:
     large_misfit: float = option(80.0, NOISE, "from which large sizes and a contact plane are tried")
     little_left: float = option(2.0, NOISE, "what leaves no more makes these trials needless")
     much_left: float = option(4.0, NOISE, "from which more hypotheses are tried")
+    suspicious_p: float = option(
+        0.01,
+        "probability",
+        "of the residual tests, below which causes are tried at large sizes: needlessly in one bag of a hundred",
+    )
     poor_fit: float = option(0.3, "of the misfit", "two causes that leave more are not made right by a third")
     acceptable: float = option(1.5, "times the noise", "squares; a hypothesis that leaves more is not right")
     far_from_noise: float = option(

@@ -14,11 +14,11 @@ from ctr_dynamics.diagnosis.inference.discrepancy import Discrepancy
 from ctr_dynamics.diagnosis.inference.evidence import WeighedHypotheses
 from ctr_dynamics.diagnosis.inference.fit_problem import Problem
 from ctr_dynamics.diagnosis.inference.map_fit import Fit
+from ctr_dynamics.diagnosis.inference.residual_tests import Whiteness, rms
 from ctr_dynamics.diagnosis.inference.sensitivities import Sensitivities
 from ctr_dynamics.diagnosis.inference.tolerance_evidence import ToleranceEvidence
 from ctr_dynamics.diagnosis.learned.learn import Learning
 from ctr_dynamics.diagnosis.recording import Recording
-from ctr_dynamics.diagnosis.verdict.residual_tests import Whiteness, rms
 from ctr_dynamics.diagnosis.verdict.separability import Cause
 from ctr_dynamics.diagnosis.verdict.unexplained_force import UnexplainedForce
 from ctr_dynamics.diagnosis.verdict.validation import Validation

@@ -23,6 +23,7 @@ from ctr_dynamics.diagnosis.inference.fit_problem import Problem, choose_steps, 
 from ctr_dynamics.diagnosis.inference.fit_quality import is_wrong
 from ctr_dynamics.diagnosis.inference.hypothesis_search import search_hypotheses
 from ctr_dynamics.diagnosis.inference.map_fit import Fit
+from ctr_dynamics.diagnosis.inference.residual_tests import rms, whiteness
 from ctr_dynamics.diagnosis.inference.tolerance_evidence import tolerance_evidence
 from ctr_dynamics.diagnosis.learned.learn import learn_force, on_robot
 from ctr_dynamics.diagnosis.recording import Recording, measured_axes
@@ -34,7 +35,6 @@ from ctr_dynamics.diagnosis.verdict.decision import (
     hypothesis_for_verdict,
     is_unexplained,
 )
-from ctr_dynamics.diagnosis.verdict.residual_tests import rms, whiteness
 from ctr_dynamics.diagnosis.verdict.separability import Cause, observability
 from ctr_dynamics.diagnosis.verdict.validation import validate
 from ctr_dynamics.effects import effect_quantities

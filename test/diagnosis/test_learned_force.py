@@ -15,11 +15,11 @@ from ctr_dynamics.diagnosis.diagnosis_options import DiagnosisOptions
 from ctr_dynamics.diagnosis.inference.calibration import nuisances_of
 from ctr_dynamics.diagnosis.inference.fit_problem import make_problem
 from ctr_dynamics.diagnosis.inference.map_fit import fit
+from ctr_dynamics.diagnosis.inference.residual_tests import rms
 from ctr_dynamics.diagnosis.learned.learn import learn_force, rejection
 from ctr_dynamics.diagnosis.output.robot_export import robot_with
 from ctr_dynamics.diagnosis.recording import read_recording
 from ctr_dynamics.diagnosis.run_context import RunContext
-from ctr_dynamics.diagnosis.verdict.residual_tests import rms
 from ctr_dynamics.diagnosis.verdict.validation import BagErrors, Validation
 from ctr_dynamics.diagnosis.whitening import noise_floor
 

@@ -23,6 +23,7 @@ from ctr_dynamics.diagnosis.inference.hypotheses import (
     with_form,
 )
 from ctr_dynamics.diagnosis.inference.map_fit import Fit, corrected, fit
+from ctr_dynamics.diagnosis.inference.residual_tests import whiteness
 from ctr_dynamics.diagnosis.inference.screening import screen
 from ctr_dynamics.diagnosis.inference.search_moves import (
     SearchState,
@@ -123,7 +124,8 @@ def search_once(
         if excess(problem, state.best.fit) > o.little_left:
             screened, here = try_large_sizes(state, screened, here)
     imitated = off_nominal(problem, recalibrated.point) and off_nominal(problem, state.best.fit.point)
-    if imitated and not large_misfit and not context.out_of_time:
+    suspicious = imitated or whiteness(problem, state.best.fit).p < o.suspicious_p
+    if suspicious and not large_misfit and not context.out_of_time:
         screened, here = try_large_sizes(state, screened, here, plane=False)
     if state.best.members and not context.out_of_time:
         beside = leaders(state)

@@ -14,11 +14,11 @@ from ctr_dynamics import __version__
 from ctr_dynamics.diagnosis.diagnosis_result import Diagnosis
 from ctr_dynamics.diagnosis.inference.candidates import Candidate
 from ctr_dynamics.diagnosis.inference.map_fit import Fit
+from ctr_dynamics.diagnosis.inference.residual_tests import rms
 from ctr_dynamics.diagnosis.inference.tolerance_evidence import WiderTolerance
 from ctr_dynamics.diagnosis.learned.dictionary import EFFECT
 from ctr_dynamics.diagnosis.output.cause_text import cause_text
 from ctr_dynamics.diagnosis.output.robot_export import robot_with
-from ctr_dynamics.diagnosis.verdict.residual_tests import rms
 from ctr_dynamics.diagnosis.verdict.separability import Cause
 from ctr_dynamics.diagnosis.whitening import noise_floor
 from ctr_dynamics.effects import EFFECTS, EffectQuantity

@@ -12,9 +12,9 @@ from scipy.signal import periodogram
 
 from ctr_dynamics.diagnosis.diagnosis_result import Diagnosis
 from ctr_dynamics.diagnosis.inference.map_fit import Fit
+from ctr_dynamics.diagnosis.inference.residual_tests import by_axis
 from ctr_dynamics.diagnosis.inference.separation import separation
 from ctr_dynamics.diagnosis.output.summary_text import summary
-from ctr_dynamics.diagnosis.verdict.residual_tests import by_axis
 from ctr_dynamics.diagnosis.whitening import noise_floor
 from ctr_dynamics.effects import EFFECTS
 from ctr_dynamics.io.atomic_files import atomic_file

@@ -15,10 +15,10 @@ from ctr_dynamics.diagnosis.inference.evidence import WeighedHypotheses, WithDis
 from ctr_dynamics.diagnosis.inference.fit_problem import Problem
 from ctr_dynamics.diagnosis.inference.fit_quality import is_wrong
 from ctr_dynamics.diagnosis.inference.hypotheses import Hypothesis
+from ctr_dynamics.diagnosis.inference.residual_tests import Whiteness
 from ctr_dynamics.diagnosis.inference.screening import one_form_each
 from ctr_dynamics.diagnosis.inference.sensitivities import Sensitivities, sensitivities_at
 from ctr_dynamics.diagnosis.run_context import RunContext
-from ctr_dynamics.diagnosis.verdict.residual_tests import Whiteness
 from ctr_dynamics.diagnosis.verdict.separability import Cause, cause_with_rivals
 from ctr_dynamics.diagnosis.verdict.unexplained_force import UnexplainedForce, unexplained_force
 from ctr_dynamics.diagnosis.verdict.validation import Validation
