@@ -33,7 +33,7 @@ from ctr_dynamics.io.bag_reader import RawMessage, open_bag
 from ctr_dynamics.io.bag_writer import write_bag
 from ctr_dynamics.io.messages import cdr, topics
 from ctr_dynamics.io.messages.encode import encode_wrench_stamped
-from ctr_dynamics.kernels.rotations import from_vector, multiply
+from ctr_dynamics.kernels.rotations import from_vector, matrix, multiply
 from ctr_dynamics.robot_files import load_robot
 from ctr_dynamics.ros.listener import Listener
 from ctr_dynamics.ros.node_processes import ESTIMATOR, NodeProcess, free_domain
@@ -83,6 +83,24 @@ def beside(size_m: float, share: float) -> Edit:
             return p._replace(position=(x, y, z))
 
         return in_span(T, pose(off))(messages)
+
+    return change
+
+
+def moving_frame(speed: float, turn: float) -> Edit:
+    """A frame that shifts by ``speed`` (m/s) and turns by ``turn`` (rad/s) from the begin of the span on, for good."""
+
+    def change(messages: Messages) -> Messages:
+        begin_ns = cdr.decode_stamp(messages[0].data) + round(BEGIN_S * 1e9)
+        direction, axis = np.array([0.6, 0.0, 0.8]), np.array([0.0, 1.0, 0.0])
+
+        def moved(p: cdr.PoseIn) -> cdr.PoseIn:
+            since = (p.stamp_ns - begin_ns) * 1e-9
+            turned = matrix(from_vector(turn * since * axis)) @ np.array(p.position)
+            x, y, z = (turned + speed * since * direction).tolist()
+            return p._replace(position=(x, y, z))
+
+        return in_span(T, pose(moved), math.inf)(messages)
 
     return change
 
@@ -170,6 +188,8 @@ FAULTS: dict[str, tuple[Edit, float]] = {  # the change, and when it ends (s); i
     "half the poses 3 mm off for 2 s": (beside(0.003, 0.5), END_S),
     "half the poses 50 mm off for 2 s": (beside(0.05, 0.5), END_S),
     "sensor 20 mm off and turned by 0.5 rad for 2 s": (in_span(T, pose(knocked)), END_S),
+    "a frame that shifts by 2 mm/s": (moving_frame(0.002, 0.0), math.inf),
+    "a frame that turns by 0.03 rad/s": (moving_frame(0.0, 0.03), math.inf),
     "poses of 1e160 for 2 s": (in_span(T, pose(huge)), END_S),
     "poses 80 ms late, not told": (late(0.08), math.inf),
     "latency that jumps by 60 ms": (late(0.06, BEGIN_S), math.inf),

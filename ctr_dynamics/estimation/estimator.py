@@ -359,11 +359,7 @@ class Estimator:
         runs.judge(result)
         if mark is not None:
             self.innovations.discard(mark)
-        elif result.ok and (
-            runs.fused.follow_delay(runs.open_loop, k)
-            or runs.fused.follow_model_error(runs.open_loop, k)
-            or runs.fused.leave_refuted(runs.open_loop, k)
-        ):
+        elif result.ok and runs.fused.begin_again(runs.open_loop, k):
             late.history.restart(k)
         health.sweeps += result.sweeps
         if not result.ok:

@@ -20,7 +20,13 @@ from ctr_dynamics.estimation.monitoring.health import Health
 from ctr_dynamics.estimation.monitoring.innovation_log import InnovationLog
 from ctr_dynamics.estimation.monitoring.model_error_search import ModelErrorSearch
 from ctr_dynamics.estimation.open_loop import OpenLoopRun
-from ctr_dynamics.estimation.step_output import FUSION_OFF, UNKNOWN_DELAY, Innovation, MotionPoint
+from ctr_dynamics.estimation.step_output import (
+    FUSION_OFF,
+    MOVING_FRAME,
+    UNKNOWN_DELAY,
+    Innovation,
+    MotionPoint,
+)
 from ctr_dynamics.estimation.timeline import DT, seconds
 from ctr_dynamics.kernels import rotations
 from ctr_dynamics.kernels.layout import parameters_of_inputs
@@ -54,7 +60,8 @@ class FusedRun:
         state: after the last step; None before the start and after what cannot be gone on from.
         measured_ns: stamp of the newest measurement that reached the gate.
         confirmed: measurements since the start that were fused and show no shift of the tracker.
-        late: whether the tracker is late by a time that is not known yet. Measurements are then compared and not fused.
+        late: whether the tracker is late by a time that is not known yet. moving: whether its frame moves. Measurements are then compared and not
+            fused.
     """
 
     def __init__(
@@ -80,7 +87,7 @@ class FusedRun:
         )
         self.state: State | None = None
         self.measured_ns: int | None = None
-        self.confirmed, self.late = 0, False
+        self.confirmed, self.late, self.moving = 0, False, False
         self._apart = np.zeros(3)  # m, the last measurement from the open-loop run
 
     def clear(self) -> None:
@@ -89,7 +96,7 @@ class FusedRun:
         self.delay_search.clear()
         self.model_error_search.clear()
         self.disagreement.clear()
-        self.state, self.measured_ns, self.confirmed, self.late = None, None, 0, False
+        self.state, self.measured_ns, self.confirmed, self.late, self.moving = None, None, 0, False, False
 
     def start(self, state: State, t: float) -> None:
         """Begin at the static equilibrium ``state`` at the time ``t`` (s)."""
@@ -100,6 +107,11 @@ class FusedRun:
     def agreed(self) -> bool:
         """Whether measurements have agreed since the start."""
         return self.confirmed >= CONFIRMED
+
+    @property
+    def not_fused(self) -> str:
+        """Why measurements are compared and not fused; empty where they are."""
+        return UNKNOWN_DELAY if self.late else MOVING_FRAME if self.moving else ""
 
     @property
     def inputs_at(self) -> RunInputs:
@@ -114,12 +126,12 @@ class FusedRun:
             motion, residual = self.residuals(time_s, position, quaternion, open_loop)
             if self._inputs.missing_at(time_s - self.ekf.tracker.age):
                 update = Update.impossible("no joint states at its time")
-            elif self._health.fusing and not self.late:
+            elif self._health.fusing and not self.not_fused:
                 update = self.ekf.update(self.state, time_s, position, quaternion)
             else:
                 update = self.ekf.compare(time_s, position, quaternion)
-                if self.late:
-                    update = update._replace(reason=update.reason.replace(FUSION_OFF, UNKNOWN_DELAY))
+                if self.not_fused:
+                    update = update._replace(reason=update.reason.replace(FUSION_OFF, self.not_fused))
             if motion is not None and residual is not None:
                 seen = motion.position + motion.residual
                 self.disagreement.add(measurement.stamp_ns, seen, motion.position, residual)
@@ -194,6 +206,15 @@ class FusedRun:
         self.start(open_loop.state.copy(), seconds(k))
         self._health.restarts += 1
 
+    def begin_again(self, open_loop: OpenLoopRun, k: int) -> bool:
+        """Go on from the open-loop run at step ``k`` if measurements show that something else is right than the filter counts on."""
+        return (
+            self.follow_delay(open_loop, k)
+            or self.leave_moving_frame(open_loop, k)
+            or self.follow_model_error(open_loop, k)
+            or self.leave_refuted(open_loop, k)
+        )
+
     def follow_delay(self, open_loop: OpenLoopRun, k: int) -> bool:
         """Go on from the open-loop run at step ``k`` with another delay of the tracker, if measurements follow it far better with that.
 
@@ -217,12 +238,28 @@ class FusedRun:
         self.reinitialise(open_loop, k)
         return True
 
+    def leave_moving_frame(self, open_loop: OpenLoopRun, k: int) -> bool:
+        """Go on from the open-loop run at step ``k`` if the frame of the tracker moves; measurements are not fused as long as it does."""
+        was, frame = self.moving, self.model_error_search.frame
+        self.moving = self._health.fusing and not self.late and frame.moves(was)
+        if was or not self.moving:
+            return False
+        velocity, turn = frame.rates(open_loop.tips.last.mean[:3])
+        self._health.note(
+            "tracker",
+            "moving frame",
+            f"measured positions depart from the model as by a frame that moves by {1e3 * math.hypot(*velocity):.1f} mm/s and "
+            f"{math.degrees(math.hypot(*turn)):.1f} deg/s; check the field generator, the tracker's stand and the robot's base",
+        )
+        self.reinitialise(open_loop, k)
+        return True
+
     def follow_model_error(self, open_loop: OpenLoopRun, k: int) -> bool:
         """Go on from the open-loop run at step ``k`` with a larger model error, if measurements follow that far better than the filter.
 
         Without it, the filter takes the error of the model for a force and for wrong parameters, which move the velocities too.
         """
-        if not self._health.fusing or self.late:
+        if not self._health.fusing or self.not_fused:
             return False
         found = self.model_error_search.found(self.ekf.model_error)
         if found is None:
@@ -238,15 +275,20 @@ class FusedRun:
 
         Inputs that were wrong for a while have bent parameters and registration then, which are certain by now and would not come back for long.
         """
-        if not self._health.fusing or self.late or not (self.ekf.refuted and self.model_error_search.astray):
+        if (
+            not self._health.fusing
+            or self.not_fused
+            or not (self.ekf.refuted and self.model_error_search.astray)
+        ):
             return False
         self.model_error_search.forgive()
         self.reinitialise(open_loop, k)
         return True
 
     def inflate_covariance(self, tip: TipEstimate, open_loop: OpenLoopRun, farthest: float) -> None:
-        """Have the covariance of ``tip`` hold what else may be right: the open-loop run where the tracker may be late or the model may err more
-        than the filter counts on, the tracker where it is thought to be late, has been shifted since the start, or lies apart without having jumped.
+        """Have the covariance of ``tip`` hold what else may be right: the open-loop run where the tracker may be late, its frame may move, or the
+        model may err more than the filter counts on, the tracker where it is not fused, has been shifted since the start, or lies apart without
+        having jumped.
 
         A shift of more than ``farthest`` (m) is no error of a registration; outputs are invalid where tracker and model lie that far apart.
         """
@@ -258,13 +300,14 @@ class FusedRun:
             if math.hypot(*shift.tolist()) < farthest:
                 tip.covariance[:3, :3] += np.multiply.outer(shift, shift)
         belief = self.delay_search.belief(self.ekf.delay)
-        other = max(belief.late, self.model_error_search.probability(self.ekf.model_error))
+        search = self.model_error_search
+        moves = search.frame.probability
+        other = max(belief.late, moves, search.probability(self.ekf.model_error))
         if not self._health.fusing or other < NEGLIGIBLE:
             return
-        if self.late:
-            tip.covariance[:3, :3] += allowance(1.0 - belief.late) * np.multiply.outer(
-                self._apart, self._apart
-            )
+        if self.not_fused:
+            fusing = 1.0 - (belief.late if self.late else moves)
+            tip.covariance[:3, :3] += allowance(fusing) * np.multiply.outer(self._apart, self._apart)
             return
         mean = open_loop.tips.last.mean
         turn = rotations.to_vector(rotations.multiply(tip.quaternion, rotations.conjugate(mean[3:7])))

@@ -14,6 +14,7 @@ Floats = NDArray[np.float64]
 OK, WARN, ERROR = 0, 1, 2
 FUSION_OFF = "fusion is off"
 UNKNOWN_DELAY = "the tracker is late by a time that is not known yet"
+MOVING_FRAME = "the frame of the tracker moves"
 
 
 class Modes(NamedTuple):

@@ -64,7 +64,16 @@ def test_a_delay_that_changes_is_found_after_a_long_time_without():
         moving, 0.0, foretold=lambda t: WELL if t < 10.0 else (-20.0, -8.0), seen=seen, seconds=9.8
     ).found(0.0)
     assert later is not None
-    assert later[0] == pytest.approx(0.06, abs=0.001)
+    assert later[0] == pytest.approx(0.06, abs=3.0 * later[1])
+
+
+def test_delays_between_two_points_rise_above_them_only_at_a_smooth_peak():
+    found = DelaySearch(NOISE, 20.0)
+    smooth = -0.5 * ((found.delays - 0.06125) / 0.003) ** 2  # its peak lies halfway
+    delays, dense = found._between(smooth, -np.inf)
+    np.testing.assert_allclose(dense, -0.5 * ((delays - 0.06125) / 0.003) ** 2, atol=1e-9)
+    bent = np.where(np.abs(found.delays - 0.06) < 0.011, -3.0, -500.0)
+    assert found._between(bent, -np.inf)[1].max() < -2.9
 
 
 @pytest.mark.parametrize("seconds", [9.2, 9.3, 9.4])

@@ -219,17 +219,22 @@ class DelaySearch:
     def _between(self, evidence: Floats, least: float) -> tuple[Floats, Floats]:
         """Delays and evidence ten times as dense: parabolas through neighbours. A fast robot moves by more than the noise between two delays.
 
-        Parabolas that cannot reach ``least`` are left out: none rises higher above its points than by an eighth of their second difference.
+        Between two points there are two parabolas, through the next point on either side. The lower one counts: where both are right they agree, and
+        where the evidence bends sharply, as between two times of a change, one of them rises far above all points. Those that cannot reach ``least``
+        are left out: none rises higher above its points than by an eighth of their second difference.
         """
         before, middle, after = evidence[:-2], evidence[1:-1], evidence[2:]
-        bent = before - 2.0 * middle + after
+        slope, bent = 0.5 * (after - before), before - 2.0 * middle + after
         highest = np.maximum(np.maximum(before, after), middle) + 0.125 * np.abs(bent)
         place = np.flatnonzero(highest[self._middle - 1] >= least)
-        at = self._middle[place]
-        offset = (place - at)[:, None] + FINER
-        slope, curvature = 0.5 * (after - before)[at - 1, None], 0.5 * bent[at - 1, None]
-        delays = self.delays[at][:, None] + self.options.spacing_s * offset
-        dense = middle[at - 1, None] + offset * (slope + offset * curvature)
+        delays = self.delays[place, None] + self.options.spacing_s * FINER
+        sides = np.where(FINER < 0.0, -1, 1)
+        dense = np.full(delays.shape, np.inf)
+        for at in (place[:, None], place[:, None] + sides):
+            centre = np.clip(at, 1, len(evidence) - 2)
+            offset = (place[:, None] - centre) + FINER
+            i = centre - 1
+            dense = np.minimum(dense, middle[i] + offset * (slope[i] + 0.5 * offset * bent[i]))
         inside = (delays >= 0.0) & (delays <= self.options.longest_s)
         return delays[inside], dense[inside]
 

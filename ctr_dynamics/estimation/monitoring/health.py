@@ -13,7 +13,7 @@ import numpy as np
 from ctr_dynamics import chi_square
 from ctr_dynamics.estimation.filter.filter_records import ModelErrorSize
 from ctr_dynamics.estimation.monitoring.consistency_monitor import ConsistencyMonitor
-from ctr_dynamics.estimation.step_output import FUSION_OFF, UNKNOWN_DELAY, Innovation
+from ctr_dynamics.estimation.step_output import FUSION_OFF, MOVING_FRAME, UNKNOWN_DELAY, Innovation
 from ctr_dynamics.model.stability import Stability
 
 TRACKER_LIMIT_S = 1.0  # without a usable measurement for longer the status says so: 40 are missing at 40 Hz
@@ -157,7 +157,7 @@ class Health:
         Args:
             again: its time has been published before the clock was set back; its step is in no output, and neither is it in the totals.
         """
-        within = innovation.reason in (FUSION_OFF, UNKNOWN_DELAY) or (
+        within = innovation.reason in (FUSION_OFF, MOVING_FRAME, UNKNOWN_DELAY) or (
             innovation.accepted and not innovation.reason
         )
         if innovation.dof:

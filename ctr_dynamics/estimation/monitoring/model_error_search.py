@@ -6,7 +6,8 @@ each of some sizes and times. These and the filter compete by how well each fore
 
 A robot that is better than its tolerances is foretold by its open-loop run better than by the filter, which counts on them. So the open-loop run
 with a constant departure, that of a registration within its tolerance, competes too. Where it foretells best, the model does not err. That departure
-may jump: a tracker or sensor that was moved departs suddenly, by any distance, and stays there, which no model does.
+may jump: a tracker or sensor that was moved departs suddenly, by any distance, and stays there, which no model does. And it may grow steadily: the
+frame of the tracker moves then (:mod:`~ctr_dynamics.estimation.monitoring.frame_motion`).
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from numpy.typing import NDArray
 from ctr_dynamics.estimation.filter.adapted_variances import AdaptationOptions
 from ctr_dynamics.estimation.filter.filter_records import ModelErrorSize
 from ctr_dynamics.estimation.monitoring.delay_search import density_of_filter, log_density
+from ctr_dynamics.estimation.monitoring.frame_motion import FrameMotion
 
 Floats = NDArray[np.float64]
 CONSTANT, REST = -2, -1  # rows beyond those of the departures
@@ -90,6 +92,9 @@ class ModelErrorSearch:
         registered: m per axis, by which the tip may depart for the registration's tolerance alone.
         change_s: mean time between two changes of the unknown force. The filter may have met one with every measurement.
         options: when a model error is believed.
+
+    Attributes:
+        frame: evidence for a tracker whose frame moves.
     """
 
     def __init__(
@@ -114,6 +119,7 @@ class ModelErrorSearch:
         )
         self._variances = np.r_[self.sizes, registered, length] ** 2
         self._rates = np.r_[1.0 / self.times, 0.0, 0.0]
+        self.frame = FrameMotion(position_noise, length)
         self.clear()
 
     def clear(self) -> None:
@@ -121,6 +127,7 @@ class ModelErrorSearch:
         self._evidence: deque[Evidence] = deque(maxlen=self.options.remembered)
         self._begin_ns = 0
         self._compared: tuple[ModelErrorSize, Floats] | None = None
+        self.frame.clear()
 
     def add(
         self, stamp_ns: int, position: Floats, residual: Floats, turn: Floats, foretold: tuple[float, float]
@@ -183,6 +190,10 @@ class ModelErrorSearch:
                 weight,
             )
         )
+        if decay:
+            before, new = decay * self._file_right(last), self._evidence[-1]
+            departs = float(np.logaddexp.reduce(new.departures[:CONSTANT])) + self._prior
+            self.frame.add(stamp_ns, position, residual, before, self._file_right(new), departs)
 
     def _span(self, stamp_ns: int) -> float:
         """s from the first measurement."""
@@ -209,12 +220,22 @@ class ModelErrorSearch:
         tried = farther & faster
         if not tried.any():
             return none
-        prior = math.log(options.prior / len(self.sizes))
-        likely = np.where(tried, last.departures[:CONSTANT] + prior, -np.inf)
-        file_right = np.logaddexp(last.filter, last.departures[CONSTANT])
+        likely = np.where(tried, last.departures[:CONSTANT] + self._prior, -np.inf)
+        moved = np.logaddexp(self.frame.moving, self.frame.still)
+        file_right = np.logaddexp(self._file_right(last), moved)
         most = max(file_right, float(likely.max()))
         weights: Floats = np.exp(likely - most)
         return weights / (weights.sum() + math.exp(file_right - most))
+
+    @property
+    def _prior(self) -> float:
+        """Logarithm of the prior probability of one departure."""
+        return math.log(self.options.prior / len(self.sizes))
+
+    @staticmethod
+    def _file_right(last: Evidence) -> float:
+        """Logarithm of the evidence of a robot whose file is right."""
+        return float(np.logaddexp(last.filter, last.departures[CONSTANT]))
 
     def found(self, present: ModelErrorSize) -> ModelErrorSize | None:
         """The model error that is believed instead of ``present``, which the filter counts on; None where there is none."""
