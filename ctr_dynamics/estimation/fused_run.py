@@ -230,8 +230,12 @@ class FusedRun:
         note = "poses are older than their stamps, by a time that is not known yet"
         if found is not None:
             delay, deviation = found
-            note = f"poses are {1e3 * (self.ekf.tracker.delay + delay):.0f} ms older than their stamps"
+            whole_ms = 1e3 * (self.ekf.tracker.delay + delay)
+            note = (
+                f"poses are {abs(whole_ms):.0f} ms {'older' if whole_ms > 0.0 else 'newer'} than their stamps"
+            )
             self.ekf.expect_delay(delay, deviation)
+            self._inputs.measurements.early_s = max(-delay, 0.0)
             search.begin_again(delay)
             self._health.distances.clear()
         self._health.note("tracker", "latency", f"{note}; check the tracker's clock, or set tracker.delay_s")

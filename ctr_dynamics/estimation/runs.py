@@ -59,10 +59,11 @@ class Runs:
         ekf = RodEkf(corrected, self.tracker, filter_options(settings))
         self.fused = FusedRun(ekf, self._interpolated, load, inputs, health, innovations)
         no_effect = np.zeros((model.input_count, 0))
+        delays = self.fused.delay_search.delays
         self.open_loop = OpenLoopRun(
             nominal,
             RunInputs(self._interpolated, load, no_effect, np.zeros(0)),
-            ekf.tips.size + math.ceil(self.fused.delay_search.options.longest_s / DT),
+            ekf.tips.size + math.ceil((delays[-1] - delays[0]) / DT),
         )
         self.clear()
 
@@ -174,7 +175,7 @@ class Runs:
         self.open_loop.append_tip(t)
         ekf.propagate(state, both[0], t)
         for _, time_s, position, quaternion in self._inputs.measurements.due(math.inf)[:1]:
-            time_s = min(time_s, t + self.tracker.delay)
+            time_s = min(time_s, t + self.tracker.delay - self._inputs.measurements.early_s)
             self.fused.residuals(time_s, position, quaternion, self.open_loop)
             ekf.update(state, time_s, position, quaternion)
         ekf.tip_estimate()

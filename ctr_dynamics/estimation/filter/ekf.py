@@ -401,9 +401,8 @@ class RodEkf:
         a = x[:r]
         self.bias += x[r:]
         # beyond these a measurement on time would show a tip outside the window, and no later one could mend the delay
-        self.bias[DELAY] = min(
-            max(self.bias[DELAY], -self.simulator.scheme.dt), self._delay + self.options.window
-        )
+        earliest = min(self._delay, 0.0) - self.simulator.scheme.dt
+        self.bias[DELAY] = min(max(self.bias[DELAY], earliest), self._delay + self.options.window)
         self.theta += factor.theta @ a
         np.clip(self.theta, u.lowest, u.highest, out=self.theta)
         self._apply_theta()

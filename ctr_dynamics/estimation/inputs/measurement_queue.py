@@ -1,7 +1,7 @@
 """The measurement queue: tracker poses by stamp, from their arrival until no step is taken again for them.
 
-A pose waits until the steps have come to its own time, which is its stamp minus the tracker's delay. It remembers the step after which it was
-fused, so that it is fused again where that step is corrected.
+A pose waits until the steps have come to its own time, which is its stamp minus the tracker's delay, or later where it is stamped too early. It
+remembers the step after which it was fused, so that it is fused again where that step is corrected.
 """
 
 from __future__ import annotations
@@ -82,6 +82,7 @@ class MeasurementQueue:
 
     Attributes:
         measurements: oldest first.
+        early_s: by which poses are found to be stamped before their time, beyond the nominal delay.
     """
 
     def __init__(
@@ -91,6 +92,7 @@ class MeasurementQueue:
         self._timeline, self._health = timeline, health
         self.options = QueueOptions()
         self.measurements: list[QueuedMeasurement] = []
+        self.early_s = 0.0
 
     def clear(self) -> None:
         """Forget all measurements."""
@@ -149,7 +151,7 @@ class MeasurementQueue:
         due = []
         for measurement in self.measurements:
             stamp_s = (measurement.stamp_ns - t0_ns) * 1e-9
-            if tracker.own_time(stamp_s) - tracker.delay > t + 1e-9:
+            if tracker.own_time(stamp_s) - tracker.delay + self.early_s > t + 1e-9:
                 break  # so are all behind it
             if measurement.fused_k is None:
                 due.append(
@@ -164,7 +166,7 @@ class MeasurementQueue:
         """The first step after ``k`` at which a measurement has been fused or now will be; infinite where there is none."""
         t0_ns = self._timeline.t0_ns
         assert t0_ns is not None
-        delay_ns = self.tracker.delay * 1e9
+        delay_ns = (self.tracker.delay - self.early_s) * 1e9
         first = math.inf
         for measurement in self.measurements:
             if measurement.fused_k is None:

@@ -1,8 +1,8 @@
-"""A tracker whose poses are far older than the robot file says: the delay with which measurements follow the open-loop run.
+"""A tracker whose poses are older than the robot file says, or whose clock is behind: the delay with which measurements follow the open-loop run.
 
 A delay shows while the robot moves, and looks like a force to the filter, whose prior for it is narrow. The open-loop run does not depend on the
-tracker, so every measurement is compared with its tips of the last 0.3 s. Delays and filter compete by how well each foretells the next position
-(prequential evidence, Dawid 1984).
+tracker, so every measurement is compared with its tips from 0.3 s before to 0.1 s after, as soon as these are known. Delays and filter compete by how
+well each foretells the next position (prequential evidence, Dawid 1984).
 """
 
 from __future__ import annotations
@@ -29,7 +29,8 @@ class DelaySearchOptions:
     """When a delay is believed.
 
     Attributes:
-        longest_s: largest delay beyond the nominal one. spacing_s: of those that are tried.
+        earliest_s: poses may be stamped that much before their time, by a clock that is behind. longest_s: largest delay beyond the nominal one.
+            spacing_s: of those that are tried.
         least_s: a smaller difference is left to the filter's own estimate.
         prior: probability that a tracker is late beyond that. One in a hundred has a clock or a driver of that kind.
         believed: probability from which on the estimate begins again with the delay.
@@ -40,6 +41,7 @@ class DelaySearchOptions:
         remembered: measurements that may be taken again.
     """
 
+    earliest_s: float = 0.1
     longest_s: float = 0.3
     spacing_s: float = 0.0025
     least_s: float = 0.005
@@ -50,6 +52,16 @@ class DelaySearchOptions:
     sound_s: float = AdaptationOptions.sound_s
     lasts_s: float = 0.2
     remembered: int = 200
+
+
+class Waiting(NamedTuple):
+    """A measured tip that waits for the open-loop run; see :meth:`DelaySearch.add`."""
+
+    stamp_ns: int
+    time_s: float
+    position: Floats
+    foretold: tuple[float, float]
+    present_s: float
 
 
 class Evidence(NamedTuple):
@@ -93,7 +105,11 @@ class DelaySearch:
     def __init__(self, noise: float, change_s: float, options: DelaySearchOptions | None = None) -> None:
         self.options = options = options or DelaySearchOptions()
         self._noise, self._change_s = noise, change_s
-        self.delays = np.arange(0.0, options.longest_s + 0.5 * options.spacing_s, options.spacing_s)
+        first, last = (
+            round(-options.earliest_s / options.spacing_s),
+            round(options.longest_s / options.spacing_s),
+        )
+        self.delays = options.spacing_s * np.arange(first, last + 1)
         # the first and the last delay are on their neighbours' parabolas
         self._middle = np.clip(np.arange(len(self.delays)), 1, len(self.delays) - 2)
         self.clear()
@@ -101,6 +117,7 @@ class DelaySearch:
     def clear(self) -> None:
         """Forget all measurements."""
         self._evidence: deque[Evidence] = deque(maxlen=self.options.remembered)
+        self._waiting: deque[Waiting] = deque()
         self._belief: tuple[float, Belief] | None = None
 
     def add(
@@ -115,6 +132,8 @@ class DelaySearch:
     ) -> None:
         """Take in a measured tip that the filter has met; one of a stamp that is known takes its place.
 
+        It counts as soon as the open-loop run has come to the last time that it may show.
+
         Args:
             stamp_ns: of its header. time_s: its own time with the nominal delay, s from the first step.
             position: (3,) m, base axes.
@@ -122,8 +141,16 @@ class DelaySearch:
             foretold: what the filter foretold; see :class:`~ctr_dynamics.estimation.filter.filter_records.Update`.
             present_s: s beyond the nominal delay, with which the filter has met it.
         """
-        while self._evidence and self._evidence[-1].stamp_ns >= stamp_ns:
-            self._evidence.pop()  # its step is taken again
+        for known in (self._evidence, self._waiting):
+            while known and known[-1].stamp_ns >= stamp_ns:
+                known.pop()  # its step is taken again
+        self._waiting.append(Waiting(stamp_ns, time_s, position, foretold, present_s))
+        while self._waiting and self._waiting[0].time_s - self.delays[0] <= stamps[-1]:
+            self._take(self._waiting.popleft(), stamps, tips)
+
+    def _take(self, measured: Waiting, stamps: Floats, tips: Floats) -> None:
+        """Have a measurement count that all tips (k, 3) m of the open-loop run are known for; ``stamps`` (k,) s."""
+        stamp_ns, time_s, position, foretold, present_s = measured
         times = time_s - self.delays
         if len(stamps) < 2 or times[-1] < stamps[0]:
             return
@@ -235,7 +262,7 @@ class DelaySearch:
             offset = (place[:, None] - centre) + FINER
             i = centre - 1
             dense = np.minimum(dense, middle[i] + offset * (slope[i] + 0.5 * offset * bent[i]))
-        inside = (delays >= 0.0) & (delays <= self.options.longest_s)
+        inside = (delays >= self.delays[0]) & (delays <= self.delays[-1])
         return delays[inside], dense[inside]
 
     @property
