@@ -14,7 +14,7 @@ from ctr_dynamics.estimation.filter.filter_records import FilterState, TipEstima
 from ctr_dynamics.estimation.inputs.input_buffer import InputBuffer
 from ctr_dynamics.estimation.inputs.measurement_queue import DueMeasurement
 from ctr_dynamics.estimation.inputs.run_inputs import InterpolatedInputs, RunInputs
-from ctr_dynamics.estimation.monitoring.delay_search import DelaySearch, allowance
+from ctr_dynamics.estimation.monitoring.delay_search import CLOCK_BEHIND, DelaySearch, allowance
 from ctr_dynamics.estimation.monitoring.disagreement import Disagreement
 from ctr_dynamics.estimation.monitoring.health import Health
 from ctr_dynamics.estimation.monitoring.innovation_log import InnovationLog
@@ -77,6 +77,7 @@ class FusedRun:
         file = ekf.tracker.state_sigma
         registered = math.hypot(file[TRANSLATION].max(), length * file[ROTATION].max())
         self.delay_search = DelaySearch(noise.position.value, ekf.options.force_change)
+        self.clock_search = DelaySearch(noise.position.value, ekf.options.force_change, CLOCK_BEHIND)
         self.disagreement = Disagreement(noise.position.value)
         self.model_error_search = ModelErrorSearch(
             noise.position.value,
@@ -94,6 +95,7 @@ class FusedRun:
         """Have no state, and the parameters of the robot file."""
         self.ekf.forget_parameters()
         self.delay_search.clear()
+        self.clock_search.clear()
         self.model_error_search.clear()
         self.disagreement.clear()
         self.state, self.measured_ns, self.confirmed, self.late, self.moving = None, None, 0, False, False
@@ -138,14 +140,9 @@ class FusedRun:
             if motion is not None and update.foretold is not None:
                 self._apart = motion.residual
                 own_s = time_s - self.ekf.tracker.age
-                self.delay_search.add(
-                    measurement.stamp_ns,
-                    own_s,
-                    seen,
-                    *open_loop.tips.positions(),
-                    update.foretold,
-                    self.ekf.delay,
-                )
+                tips = open_loop.tips.positions()
+                for search in (self.delay_search, self.clock_search):
+                    search.add(measurement.stamp_ns, own_s, seen, *tips, update.foretold, self.ekf.delay)
                 self.model_error_search.add(
                     measurement.stamp_ns,
                     seen,
@@ -222,9 +219,9 @@ class FusedRun:
         """
         if not self._health.fusing:
             return False
-        search, present = self.delay_search, self.ekf.delay
-        found, was_late = search.found(present), self.late
-        self.late = found is None and search.undecided(present)
+        present, was_late = self.ekf.delay, self.late
+        found = self.delay_search.found(present) or self.clock_search.found(present)
+        self.late = found is None and self.delay_search.undecided(present)
         if found is None and (was_late or not self.late):
             return False
         note = "poses are older than their stamps, by a time that is not known yet"
@@ -236,7 +233,8 @@ class FusedRun:
             )
             self.ekf.expect_delay(delay, deviation)
             self._inputs.measurements.early_s = max(-delay, 0.0)
-            search.begin_again(delay)
+            for search in (self.delay_search, self.clock_search):
+                search.begin_again(delay)
             self._health.distances.clear()
         self._health.note("tracker", "latency", f"{note}; check the tracker's clock, or set tracker.delay_s")
         self.reinitialise(open_loop, k)
@@ -306,7 +304,8 @@ class FusedRun:
         belief = self.delay_search.belief(self.ekf.delay)
         search = self.model_error_search
         moves = search.frame.probability
-        other = max(belief.late, moves, search.probability(self.ekf.model_error))
+        behind = self.clock_search.belief(self.ekf.delay).late
+        other = max(belief.late, behind, moves, search.probability(self.ekf.model_error))
         if not self._health.fusing or other < NEGLIGIBLE:
             return
         if self.not_fused:

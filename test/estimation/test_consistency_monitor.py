@@ -227,12 +227,17 @@ def test_a_clean_bag_is_silent(replayed, name):
     assert monitor.status().level == OK
 
 
-def test_a_late_tracker_is_noticed_and_named(replayed):
-    monitor = replayed("clean_sweep", tracker__delay_s=0.03).estimator.health.consistency
+def test_a_wrong_delay_that_no_search_finds_is_noticed_and_named(replayed):
+    monitor = replayed("clean_sweep", tracker__delay_s=0.12).estimator.health.consistency
     status = monitor.status()
     assert status.level == WARN
     assert "tracker_latency" in status.message
     assert monitor.causes()[0].effect in ("tracker_latency", "actuator_latency")
+
+
+def test_a_delay_that_was_set_wrongly_is_found(replayed):
+    estimator = replayed("clean_sweep", tracker__delay_s=0.03).estimator
+    assert estimator.runs.fused.ekf.delay == pytest.approx(-0.03, abs=0.002)
 
 
 def test_an_unknown_delay_of_the_tracker_is_found_and_is_no_misfit_then(replayed):

@@ -1,8 +1,8 @@
 """A tracker whose poses are older than the robot file says, or whose clock is behind: the delay with which measurements follow the open-loop run.
 
 A delay shows while the robot moves, and looks like a force to the filter, whose prior for it is narrow. The open-loop run does not depend on the
-tracker, so every measurement is compared with its tips from 0.3 s before to 0.1 s after, as soon as these are known. Delays and filter compete by how
-well each foretells the next position (prequential evidence, Dawid 1984).
+tracker, so every measurement is compared with its tips of the last 0.3 s. Delays and filter compete by how well each foretells the next position
+(prequential evidence, Dawid 1984). A clock that is behind makes negative delays. A second search has these too; it must wait for the tips.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ class DelaySearchOptions:
     """When a delay is believed.
 
     Attributes:
-        earliest_s: poses may be stamped that much before their time, by a clock that is behind. longest_s: largest delay beyond the nominal one.
+        earliest_s: by which poses may be stamped before their time. longest_s: largest delay beyond the nominal one.
             spacing_s: of those that are tried.
         least_s: a smaller difference is left to the filter's own estimate.
         prior: probability that a tracker is late beyond that. One in a hundred has a clock or a driver of that kind.
@@ -41,7 +41,7 @@ class DelaySearchOptions:
         remembered: measurements that may be taken again.
     """
 
-    earliest_s: float = 0.1
+    earliest_s: float = 0.0
     longest_s: float = 0.3
     spacing_s: float = 0.0025
     least_s: float = 0.005
@@ -52,6 +52,9 @@ class DelaySearchOptions:
     sound_s: float = AdaptationOptions.sound_s
     lasts_s: float = 0.2
     remembered: int = 200
+
+
+CLOCK_BEHIND = DelaySearchOptions(earliest_s=0.1)
 
 
 class Waiting(NamedTuple):
@@ -296,11 +299,16 @@ class DelaySearch:
         return belief.late > believed >= belief.near
 
     def begin_again(self, present_s: float) -> None:
-        """The filter goes on from the open-loop run with the delay ``present_s``, and foretells as well as that has done."""
+        """The filter goes on from the open-loop run with the delay ``present_s``, and foretells as well as that has done.
+
+        Where no such delay is tried here, it foretells as well as the best that is.
+        """
         self._belief = None
         if self._evidence:
             last = self._evidence.pop()
             same = np.abs(self.delays - present_s) <= self.options.least_s
+            if not same.any():
+                same[:] = True
             best = max([last.filter, *last.delays[same], *last.changed[same]])
             self._evidence.append(last._replace(filter=best))
 

@@ -7,7 +7,8 @@ each of some sizes and times. These and the filter compete by how well each fore
 A robot that is better than its tolerances is foretold by its open-loop run better than by the filter, which counts on them. So the open-loop run
 with a constant departure, that of a registration within its tolerance, competes too. Where it foretells best, the model does not err. That departure
 may jump: a tracker or sensor that was moved departs suddenly, by any distance, and stays there, which no model does. And it may grow steadily: the
-frame of the tracker moves then (:mod:`~ctr_dynamics.estimation.monitoring.frame_motion`).
+frame of the tracker moves then (:mod:`~ctr_dynamics.estimation.monitoring.frame_motion`). Noise of a tracker that is noisier than stated is no
+departure of the robot either (:mod:`~ctr_dynamics.estimation.monitoring.noisy_tracker`).
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from ctr_dynamics.estimation.filter.adapted_variances import AdaptationOptions
 from ctr_dynamics.estimation.filter.filter_records import ModelErrorSize
 from ctr_dynamics.estimation.monitoring.delay_search import density_of_filter, log_density
 from ctr_dynamics.estimation.monitoring.frame_motion import FrameMotion
+from ctr_dynamics.estimation.monitoring.noisy_tracker import NoisyTracker
 
 Floats = NDArray[np.float64]
 CONSTANT, REST = -2, -1  # rows beyond those of the departures
@@ -68,7 +70,7 @@ class Evidence(NamedTuple):
         level: (h + 2, 3) m, as known from the past: the tip's departure for every size and time, one that is constant but for jumps, and the
             position itself of a robot that rests.
         variance: (h + 2,) m^2, of it per axis.
-        departures: (h + 2,) logarithm of the evidence of each; filter: of what the filter foretold.
+        departures: (h + 2,) logarithm of the evidence of each; filter: of what the filter foretold; noisy: of a tracker that is noisier than stated.
         since: (h + 2,) by how much each has foretold better than filter and rest since the time that speaks most for it.
         turned: rad^2, mean square of the rotation between measurements and open-loop run, per axis; weight: of how many measurements.
     """
@@ -78,6 +80,7 @@ class Evidence(NamedTuple):
     variance: Floats
     departures: Floats
     filter: float
+    noisy: float
     since: Floats
     turned: float
     weight: float
@@ -94,7 +97,7 @@ class ModelErrorSearch:
         options: when a model error is believed.
 
     Attributes:
-        frame: evidence for a tracker whose frame moves.
+        frame: evidence for a tracker whose frame moves. noisy: for one that is noisier than stated.
     """
 
     def __init__(
@@ -120,6 +123,7 @@ class ModelErrorSearch:
         self._variances = np.r_[self.sizes, registered, length] ** 2
         self._rates = np.r_[1.0 / self.times, 0.0, 0.0]
         self.frame = FrameMotion(position_noise, length)
+        self.noisy = NoisyTracker(position_noise, length, registered)
         self.clear()
 
     def clear(self) -> None:
@@ -128,6 +132,7 @@ class ModelErrorSearch:
         self._begin_ns = 0
         self._compared: tuple[ModelErrorSize, Floats] | None = None
         self.frame.clear()
+        self.noisy.clear()
 
     def add(
         self, stamp_ns: int, position: Floats, residual: Floats, turn: Floats, foretold: tuple[float, float]
@@ -152,7 +157,7 @@ class ModelErrorSearch:
             level = gain[:, None] * observed
             none = np.zeros(len(square))
             variance = (1.0 - gain) * square
-            self._evidence.append(Evidence(stamp_ns, level, variance, none, 0.0, none, angle, 1.0))
+            self._evidence.append(Evidence(stamp_ns, level, variance, none, 0.0, -math.inf, none, angle, 1.0))
             return
         # 1. The departure decays and gets new randomness.
         last, options = self._evidence[-1], self.options
@@ -185,6 +190,7 @@ class ModelErrorSearch:
                 before * (1.0 - gain),
                 decay * last.departures + density,
                 decay * last.filter + own,
+                self.noisy.add(stamp_ns, residual) if decay else -math.inf,
                 np.maximum(last.since + density - max(own, density[REST]), 0.0),
                 last.turned + (angle - last.turned) / weight,
                 weight,
@@ -234,8 +240,8 @@ class ModelErrorSearch:
 
     @staticmethod
     def _file_right(last: Evidence) -> float:
-        """Logarithm of the evidence of a robot whose file is right."""
-        return float(np.logaddexp(last.filter, last.departures[CONSTANT]))
+        """Logarithm of the evidence of a robot whose file is right, by a tracker of any noise."""
+        return float(np.logaddexp(np.logaddexp(last.filter, last.departures[CONSTANT]), last.noisy))
 
     def found(self, present: ModelErrorSize) -> ModelErrorSize | None:
         """The model error that is believed instead of ``present``, which the filter counts on; None where there is none."""

@@ -1,0 +1,112 @@
+"""A tracker that is noisier than the robot file says, for good: the open-loop run with a constant departure, and noise of every size.
+
+Such noise looks like a tip that departs from its model fast and by as much. It differs in that what comes next has nothing to do with what was.
+Its tails are those of Student's distribution, so that outliers among the measurements do not speak against it (Lange, Little and Taylor 1989).
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class NoisyTrackerOptions:
+    """How noise is looked for.
+
+    Attributes:
+        smallest: by the stated noise; less is left to the filter. The largest is the robot's length. steps: between one size and the next, as a
+            factor.
+        freedom: degrees of Student's distribution; 3 have the least tails for which the variance exists.
+        prior: probability of a tracker that is noisier than its file says.
+        memory_s: s, for which evidence counts.
+        remembered: measurements that may be taken again.
+    """
+
+    smallest: float = 2.0
+    steps: float = 1.6
+    freedom: float = 3.0
+    prior: float = 0.01
+    memory_s: float = 10.0
+    remembered: int = 200
+
+
+class Noise(NamedTuple):
+    """What the measurements up to ``stamp_ns`` say of every size.
+
+    Attributes:
+        level: (n, 3) m, the constant departure. variance: (n,) m^2, of it. evidence: (n,) logarithm.
+    """
+
+    stamp_ns: int
+    level: Floats
+    variance: Floats
+    evidence: Floats
+
+
+class NoisyTracker:
+    """Evidence for every size of the tracker's noise.
+
+    Args:
+        noise: m per axis, as stated.
+        length: m, of the robot outside the base plate at most.
+        registered: m per axis, by which the tip may depart for the registration's tolerance alone.
+        options: how noise is looked for.
+    """
+
+    def __init__(
+        self, noise: float, length: float, registered: float, options: NoisyTrackerOptions | None = None
+    ) -> None:
+        self.options = options = options or NoisyTrackerOptions()
+        least = options.smallest * noise
+        count = 1 + math.ceil(math.log(max(length / least, 1.0)) / math.log(options.steps))
+        self._stated, self._registered = noise**2, registered**2
+        self._squares = np.geomspace(least, max(least, length), count) ** 2
+        self.clear()
+
+    def clear(self) -> None:
+        """Forget all measurements."""
+        self._known: deque[Noise] = deque(maxlen=self.options.remembered)
+
+    def add(self, stamp_ns: int, residual: Floats) -> float:
+        """Take in a measurement that lies ``residual`` (3,) m from the open-loop tip; one of a stamp that is known takes its place.
+
+        Returns:
+            Logarithm of the evidence of a tracker that is noisier than stated by any size, its prior included.
+        """
+        known, options, freedom = self._known, self.options, self.options.freedom
+        while known and known[-1].stamp_ns >= stamp_ns:
+            known.pop()  # its step is taken again
+        count = len(self._squares)
+        last = known[-1] if known else Noise(
+            stamp_ns, np.zeros((count, 3)), np.full(count, self._registered), np.zeros(count)
+        )  # fmt: skip
+        change, total = residual - last.level, last.variance + self._squares
+        square = (change**2).sum(axis=1) / total
+        density = (
+            self._peak
+            - 1.5 * np.log(total / self._stated)
+            - 0.5 * (freedom + 3.0) * np.log1p(square / freedom)
+        )
+        # a far one moves the level less
+        weight = (freedom + 3.0) / (freedom + square)
+        gain = last.variance / (last.variance + self._squares / weight)
+        decay = math.exp(-(stamp_ns - last.stamp_ns) * 1e-9 / options.memory_s)
+        evidence = decay * last.evidence + density
+        known.append(
+            Noise(stamp_ns, last.level + gain[:, None] * change, last.variance * (1.0 - gain), evidence)
+        )
+        return float(np.logaddexp.reduce(evidence)) + math.log(options.prior / count)
+
+    @property
+    def _peak(self) -> float:
+        """Logarithm of Student's density in three dimensions at zero, by that of a normal one of the same scale."""
+        half = 0.5 * self.options.freedom
+        return math.lgamma(half + 1.5) - math.lgamma(half) - 1.5 * math.log(half)
