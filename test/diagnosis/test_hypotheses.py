@@ -14,12 +14,14 @@ from ctr_dynamics.diagnosis.inference.fit_problem import make_problem
 from ctr_dynamics.diagnosis.inference.fit_quality import is_acceptable, is_far_from_noise
 from ctr_dynamics.diagnosis.inference.hypotheses import Hypothesis, best_size_nearby
 from ctr_dynamics.diagnosis.inference.map_fit import fit
+from ctr_dynamics.diagnosis.inference.screening import Screened
 from ctr_dynamics.diagnosis.inference.search_moves import (
     SearchState,
     add_further_cause,
     alternatives,
     begin_again_without_causes,
     fit_alternatives,
+    keep_promises,
 )
 from ctr_dynamics.diagnosis.inference.sensitivities import sensitivities_at
 from ctr_dynamics.diagnosis.run_context import RunContext
@@ -88,6 +90,28 @@ def test_alternatives_begin_at_nominal_nuisances_too(recording, robot, known, mo
     assert starts[1][offset.key] == offset.off
     assert found.fit.point[mass.key] == pytest.approx(3e-4, rel=0.1)
     assert abs(found.fit.point[offset.key]) < offset.tolerance
+
+
+def test_a_fit_that_does_not_keep_what_screening_promised_is_done_again(recording, robot, known):
+    """From nominal nuisances; one that has kept it, and one of which less was promised, are not."""
+    offset, mass = known["encoder_offset", "tube1.offset_rad"], known["payload_mass", "added_kg"]
+    problem = make_problem(robot, [recording], [offset], np.ones(6, bool))
+    every = candidates(list(known.values()), recording.position)
+    right = next(c for c in every if c.effect == "payload_mass")
+    other = next(c for c in every if c.effect == "density")
+    without = fit(problem, (), {})
+    stuck = fit(problem, causes_of([right]), {offset.key: 5.0 * offset.tolerance}, iterations=0)
+    assert stuck.cost > without.cost
+    found = [Hypothesis((), without), Hypothesis((right,), stuck), Hypothesis((other,), stuck)]
+    state = SearchState(problem, [right, other], without, SILENT, list(found))
+    state.add()
+    keep_promises(state, [Screened(50.0, right, None), Screened(1.0, other, None)])
+    (new,) = [e for e in state.found if not any(e is old for old in found)]
+    assert new.effects == ("payload_mass",)
+    assert new.fit.point[mass.key] == pytest.approx(3e-4, rel=0.1)
+    assert state.best is new
+    keep_promises(state, [Screened(50.0, right, None), Screened(1.0, other, None)])
+    assert state.best is new
 
 
 def test_nuisances_that_a_cause_has_led_to_replace_those_without(recording, robot, known):

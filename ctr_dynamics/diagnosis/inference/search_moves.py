@@ -112,6 +112,31 @@ def fit_single_causes(
             )
         )
         settle_tolerances(state)
+    keep_promises(state, first)
+
+
+def keep_promises(state: SearchState, fitted: Sequence[Screened]) -> None:
+    """Fit again what screening promised more of than the best hypothesis has gained, and whose fit gained nothing: it went astray.
+
+    The next fits begin at every finite size and preset, with nuisances as the robot file has them, which do not imitate the cause.
+    """
+    problem, least = state.problem, state.problem.options.search.further_gain
+    nothing = max(e.fit.log_evidence for e in state.found if not e.members)
+    gained = max(state.best.fit.log_evidence - nothing, least)
+    kept = {e.keys for e in state.found if e.members and e.fit.log_evidence > nothing + least}
+    jobs = []
+    for item in fitted:
+        c = item.candidate
+        if item.gain > gained and c.keys not in kept:
+            q = c.quantities[0]
+            for form in (form for form in state.pool if form.keys == c.keys):
+                for size in EFFECTS[c.effect].finite_sizes or (0.0,):
+                    start = {**problem.nominal, **dict(form.start), q.key: q.off + size * q.scale}
+                    jobs.append(delayed(fit_hypothesis)(problem, (form,), start, limit=state.cost_limit))
+    if jobs:
+        state.context.report("once more what did not keep what screening promised")
+        state.add(state.run_fits(jobs))
+        settle_tolerances(state)
 
 
 def settle_tolerances(state: SearchState) -> None:
