@@ -6,10 +6,12 @@ from estimation_cases import bag_messages, play, truth_error
 
 from ctr_dynamics.estimation.monitoring.delay_search import (
     CLOCK_BEHIND,
+    FINER,
     DelaySearch,
     DelaySearchOptions,
     allowance,
 )
+from ctr_dynamics.kernels.parabolas import fill_between
 
 NOISE = 2.5e-4
 
@@ -80,6 +82,21 @@ def test_delays_between_two_points_rise_above_them_only_at_a_smooth_peak():
     np.testing.assert_allclose(dense, -0.5 * ((delays - 0.06125) / 0.003) ** 2, atol=1e-9)
     bent = np.where(np.abs(found.delays - 0.06) < 0.011, -3.0, -500.0)
     assert found._between(bent, -np.inf)[1].max() < -2.9
+
+
+def test_the_kernel_takes_the_lower_of_two_parabolas():
+    """Against polynomials through three points each."""
+    values = np.random.default_rng(5).standard_normal(9)
+    dense = np.empty((9, len(FINER)))
+    fill_between(values, FINER, -np.inf, dense)
+    for i in range(9):
+        for k, offset in enumerate(FINER):
+            sides = (i, i + (1 if offset > 0.0 else -1))
+            through = [np.clip(c, 1, 7) + np.arange(-1, 2) for c in sides]
+            curves = [np.polyval(np.polyfit(at, values[at], 2), i + offset) for at in through]
+            assert dense[i, k] == pytest.approx(min(curves))
+    fill_between(values, FINER, 1e3, dense)
+    assert np.all(dense == -np.inf)
 
 
 @pytest.mark.parametrize("seconds", [9.2, 9.3, 9.4])

@@ -6,7 +6,10 @@ import numpy as np
 import pytest
 from estimation_cases import bag_messages, check_outputs, play, truth_error
 from scipy.spatial.transform import Rotation
+from scipy.stats import multivariate_normal
 from test_model_error_search import NONE, WELL, moving, search, wandering
+
+from ctr_dynamics.kernels.motion_regression import correct_motions
 
 BEGIN = 200  # measurement, 5 s after the first
 BADLY = (-7.0, -7.0)  # as a filter foretells that follows a tracker astray
@@ -110,3 +113,24 @@ def test_the_estimate_does_not_follow_a_frame_that_moves():
     error, deviation = np.linalg.norm(left, axis=1), np.sqrt(np.trace(covariance, axis1=1, axis2=2))
     assert np.all((error < 3e-3) | (error < 3.0 * deviation))
     assert error[run.t[steps] > 5.5].max() < 2e-3
+
+
+def test_the_kernel_is_the_update_of_a_kalman_filter():
+    """Against NumPy, in the words of the textbook."""
+    rng = np.random.default_rng(3)
+    mean, factor = rng.standard_normal((4, 9)), rng.standard_normal((4, 9, 9))
+    covariance = factor @ factor.transpose(0, 2, 1)
+    since, arm, residual, noise = rng.random(4), rng.standard_normal((4, 3)), rng.standard_normal(3), 0.3
+    found_mean, found_covariance, density = mean.copy(), covariance.copy(), np.empty(4)
+    correct_motions(found_mean, found_covariance, since, arm, residual, noise, density)
+    for m, P, tau, a, new_mean, new_covariance, d in zip(
+        mean, covariance, since, arm, found_mean, found_covariance, density, strict=True
+    ):
+        turned = np.array([np.cross(e, a) for e in np.eye(3)]).T  # turn rate x arm
+        H = np.hstack([np.eye(3), tau * np.eye(3), tau * turned])
+        S = H @ P @ H.T + noise * np.eye(3)
+        K, innovation = P @ H.T @ np.linalg.inv(S), residual - H @ m
+        np.testing.assert_allclose(new_mean, m + K @ innovation)
+        np.testing.assert_allclose(new_covariance, P - K @ S @ K.T, atol=1e-12)
+        by_noise = multivariate_normal(np.zeros(3), noise * np.eye(3)).logpdf(np.zeros(3))
+        assert d == pytest.approx(multivariate_normal(H @ m, S).logpdf(residual) - by_noise)

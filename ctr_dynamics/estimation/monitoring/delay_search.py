@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from ctr_dynamics import chi_square
 from ctr_dynamics.estimation.filter.adapted_variances import AdaptationOptions
+from ctr_dynamics.kernels.parabolas import fill_between
 
 Floats = NDArray[np.float64]
 FINER = np.arange(-4.5, 5.0) / 10.0  # places between two delays
@@ -113,8 +114,8 @@ class DelaySearch:
             round(options.longest_s / options.spacing_s),
         )
         self.delays = options.spacing_s * np.arange(first, last + 1)
-        # the first and the last delay are on their neighbours' parabolas
-        self._middle = np.clip(np.arange(len(self.delays)), 1, len(self.delays) - 2)
+        self._dense = self.delays[:, None] + options.spacing_s * FINER
+        self._inside = (self._dense >= self.delays[0]) & (self._dense <= self.delays[-1])
         self.clear()
 
     def clear(self) -> None:
@@ -210,15 +211,16 @@ class DelaySearch:
         if not known:
             return Belief(0.0, present_s, 0.0, 0.0)
         last, options = known[-1], self.options
-        least = max(last.filter, float(last.delays.max())) - IMPOSSIBLE
         ways = [last.delays, self._after_change(present_s, known)] if changes else [last.delays]
+        prior = math.log(options.prior / (len(FINER) * len(self.delays)))
+        least = max(last.filter, float(last.delays.max())) - IMPOSSIBLE
         dense = [self._between(one, least) for one in ways]
         delays, evidence = (np.concatenate(parts) for parts in zip(*dense, strict=True))
         other = np.abs(delays - present_s) > options.least_s
         if not other.any():
             return Belief(0.0, present_s, 0.0, 0.0)
-        as_now = max([last.filter, *evidence[~other]])
-        likely = evidence[other] + math.log(options.prior / (len(FINER) * len(self.delays)))
+        as_now = max(last.filter, float(evidence[~other].max(initial=-math.inf)))
+        likely = evidence[other] + prior
         most = max(as_now, float(likely.max()))
         weights = np.exp(likely - most)
         weights /= weights.sum() + math.exp(as_now - most)
@@ -251,22 +253,12 @@ class DelaySearch:
 
         Between two points there are two parabolas, through the next point on either side. The lower one counts: where both are right they agree, and
         where the evidence bends sharply, as between two times of a change, one of them rises far above all points. Those that cannot reach ``least``
-        are left out: none rises higher above its points than by an eighth of their second difference.
+        are left out.
         """
-        before, middle, after = evidence[:-2], evidence[1:-1], evidence[2:]
-        slope, bent = 0.5 * (after - before), before - 2.0 * middle + after
-        highest = np.maximum(np.maximum(before, after), middle) + 0.125 * np.abs(bent)
-        place = np.flatnonzero(highest[self._middle - 1] >= least)
-        delays = self.delays[place, None] + self.options.spacing_s * FINER
-        sides = np.where(FINER < 0.0, -1, 1)
-        dense = np.full(delays.shape, np.inf)
-        for at in (place[:, None], place[:, None] + sides):
-            centre = np.clip(at, 1, len(evidence) - 2)
-            offset = (place[:, None] - centre) + FINER
-            i = centre - 1
-            dense = np.minimum(dense, middle[i] + offset * (slope[i] + 0.5 * offset * bent[i]))
-        inside = (delays >= self.delays[0]) & (delays <= self.delays[-1])
-        return delays[inside], dense[inside]
+        dense = np.empty((len(evidence), len(FINER)))
+        fill_between(evidence, FINER, least, dense)
+        reached = self._inside & np.isfinite(dense)
+        return self._dense[reached], dense[reached]
 
     @property
     def apart(self) -> float:

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from ctr_dynamics.estimation.filter.adapted_variances import AdaptationOptions
 from ctr_dynamics.estimation.monitoring.delay_search import log_density
+from ctr_dynamics.kernels.motion_regression import correct_motions
 
 Floats = NDArray[np.float64]
 OFFSET, VELOCITY, TURN = slice(0, 3), slice(3, 6), slice(6, 9)
@@ -130,12 +131,16 @@ class FrameMotion:
         # 1. It has moved or stood still since before; the open-loop run goes astray slowly.
         past = self._with_end(last, elapsed)
         past.covariance[:, range(3), range(3)] += noise * elapsed / options.drift_s
-        mean, covariance, density = self._updated(past, stamp_ns, middle, residual)
-        evidence = past.evidence + density
-        began, place = past.began_ns.copy(), past.place.copy()
+        since = (stamp_ns - past.began_ns) * 1e-9
+        since[STILL] = 1.0
+        _, began, place, mean, covariance, evidence, *_ = past
+        density = np.empty(rows)
+        correct_motions(mean, covariance, since, middle - place, residual, noise, density)
+        ended = float(evidence[STILL])
+        evidence += density
         # 2. Or it was turned at once since the measurement before, or begins to move with this one.
         anywhere = log_density(residual @ residual, self._length**2 + noise, noise)
-        still = np.logaddexp(before, past.evidence[STILL]) + begins + anywhere
+        still = np.logaddexp(before, ended) + begins + anywhere
         still_now = max(still, float(evidence[STILL]))
         moving = np.logaddexp(now, still_now) + begins - math.log(rows - 1)
         fresh = np.append(np.full(rows - 1, moving), still)
@@ -168,28 +173,6 @@ class FrameMotion:
             mean[STILL], covariance[STILL] = stops @ mean[best], stops @ covariance[best] @ stops.T
             evidence[STILL] = ended
         return Motion(last.stamp_ns, began, place, mean, covariance, evidence)
-
-    def _updated(
-        self, past: Motion, stamp_ns: int, middle: Floats, residual: Floats
-    ) -> tuple[Floats, Floats, Floats]:
-        """Means, covariances and logarithms of the density, by that of the noise at zero, with the measurement of ``stamp_ns``."""
-        noise = self._noise**2
-        since = (stamp_ns - past.began_ns) * 1e-9
-        since[STILL] = 1.0
-        H = np.zeros((len(since), 3, 9))
-        H[:, range(3), range(3)] = 1.0
-        H[:, range(3), range(3, 6)] = since[:, None]
-        x, y, z = (middle - past.place).T * since
-        H[:, 0, 7], H[:, 0, 8], H[:, 1, 6], H[:, 1, 8], H[:, 2, 6], H[:, 2, 7] = z, -y, -z, x, y, -x
-        PH = past.covariance @ H.transpose(0, 2, 1)
-        S = H @ PH + noise * np.eye(3)
-        innovation = residual - np.einsum("rij,rj->ri", H, past.mean)
-        gain = np.linalg.solve(S, PH.transpose(0, 2, 1)).transpose(0, 2, 1)
-        weighed = np.linalg.solve(S, innovation[:, :, None])[:, :, 0]
-        density = -0.5 * ((innovation * weighed).sum(axis=1) + np.linalg.slogdet(S / noise)[1])
-        after = past.covariance - gain @ PH.transpose(0, 2, 1)
-        mean = past.mean + np.einsum("rij,rj->ri", gain, innovation)
-        return mean, 0.5 * (after + after.transpose(0, 2, 1)), density
 
     @property
     def moving(self) -> float:
