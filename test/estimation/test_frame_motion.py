@@ -86,6 +86,23 @@ def test_what_does_not_grow_steadily_is_no_moving_frame(departures):
         assert not found.frame.moves(False)
 
 
+@pytest.mark.parametrize("period_s", [6.0, 15.0])
+def test_a_model_that_errs_by_where_its_tubes_are_is_no_moving_frame(period_s):
+    """Its departure is smooth, and goes on in a direction for seconds, as on a real robot that is not calibrated (10 Hz, 60 s)."""
+    rng = np.random.default_rng(9)
+    t = 0.1 * np.arange(600)
+    phases, sizes = rng.uniform(0.0, 2.0 * np.pi, (3, 3)), np.array([4e-3, 2e-3, 1e-3])
+    speeds = 2.0 * np.pi / period_s * np.array([1.0, 1.7, 2.9])
+    departures = (sizes * np.sin(t[:, None, None] * speeds + phases)).sum(axis=2)
+    found = search(departures[:0])
+    believed = 0
+    for k, departure in enumerate(departures):
+        residual = departure + 3e-4 * rng.standard_normal(3)
+        found.add(100_000_000 * k, moving(4 * k) + residual, residual, np.zeros(3), (-8.0, -8.0))
+        believed += found.frame.moves(False)
+    assert believed == 0
+
+
 def test_measurements_that_are_taken_again_count_once():
     departures = drifting((2e-3, 0.0, 0.0), (0.0, 0.0, 0.0), 260)
     once, again = fed(departures), fed(departures)

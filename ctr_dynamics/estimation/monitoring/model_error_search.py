@@ -26,6 +26,7 @@ from ctr_dynamics.estimation.filter.filter_records import ModelErrorSize
 from ctr_dynamics.estimation.monitoring.delay_search import density_of_filter, log_density
 from ctr_dynamics.estimation.monitoring.frame_motion import FrameMotion
 from ctr_dynamics.estimation.monitoring.noisy_tracker import NoisyTracker
+from ctr_dynamics.estimation.monitoring.smooth_departure import SmoothDeparture
 
 Floats = NDArray[np.float64]
 CONSTANT, REST = -2, -1  # rows beyond those of the departures
@@ -97,7 +98,7 @@ class ModelErrorSearch:
         options: when a model error is believed.
 
     Attributes:
-        frame: evidence for a tracker whose frame moves. noisy: for one that is noisier than stated.
+        frame: evidence for a tracker whose frame moves. noisy: for one that is noisier than stated. smooth: for a robot that departs smoothly.
     """
 
     def __init__(
@@ -124,6 +125,7 @@ class ModelErrorSearch:
         self._rates = np.r_[1.0 / self.times, 0.0, 0.0]
         self.frame = FrameMotion(position_noise, length)
         self.noisy = NoisyTracker(position_noise, length, registered)
+        self.smooth = SmoothDeparture(position_noise, self.sizes, self.times, options.prior, options.memory_s)
         self.clear()
 
     def clear(self) -> None:
@@ -133,6 +135,7 @@ class ModelErrorSearch:
         self._compared: tuple[ModelErrorSize, Floats] | None = None
         self.frame.clear()
         self.noisy.clear()
+        self.smooth.clear()
 
     def add(
         self, stamp_ns: int, position: Floats, residual: Floats, turn: Floats, foretold: tuple[float, float]
@@ -199,6 +202,7 @@ class ModelErrorSearch:
         if decay:
             before, new = decay * self._file_right(last), self._evidence[-1]
             departs = float(np.logaddexp.reduce(new.departures[:CONSTANT])) + self._prior
+            departs = float(np.logaddexp(departs, self.smooth.add(stamp_ns, residual)))
             self.frame.add(stamp_ns, position, residual, before, self._file_right(new), departs)
 
     def _span(self, stamp_ns: int) -> float:
