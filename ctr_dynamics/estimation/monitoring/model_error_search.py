@@ -230,7 +230,12 @@ class ModelErrorSearch:
         tried = farther & faster
         if not tried.any():
             return none
-        likely = np.where(tried, last.departures[:CONSTANT] + self._prior, -np.inf)
+        departs = last.departures[:CONSTANT]
+        if (
+            not present.position
+        ):  # the filter's model error is rougher, and would be found too small again and again
+            departs = np.logaddexp(departs, self.smooth.evidence)
+        likely = np.where(tried, departs + self._prior, -np.inf)
         moved = np.logaddexp(self.frame.moving, self.frame.still)
         file_right = np.logaddexp(self._file_right(last), moved)
         most = max(file_right, float(likely.max()))
@@ -254,7 +259,8 @@ class ModelErrorSearch:
             return None
         if self._span(self._evidence[-1].stamp_ns) < self.options.least_s:
             return None
-        best = int(weights.argmax())
+        # the filter's model error is of the first order, however smoothly the robot departs
+        best = int(np.where(weights > 0.0, self._evidence[-1].departures[:CONSTANT], -np.inf).argmax())
         turned = self._evidence[-1].turned - self._rotation_noise**2
         rotation = max(math.sqrt(max(turned, 0.0)), present.rotation)
         return ModelErrorSize(float(self.sizes[best]), rotation, float(self.times[best]))

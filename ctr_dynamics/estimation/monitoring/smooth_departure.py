@@ -52,6 +52,11 @@ class SmoothDeparture:
         """Forget all measurements."""
         self._known: deque[Smooth] = deque(maxlen=REMEMBERED)
 
+    @property
+    def evidence(self) -> Floats:
+        """(n,) logarithm of the evidence of every size and time, without prior."""
+        return self._known[-1].evidence if self._known else np.full(len(self._rates), -math.inf)
+
     def add(self, stamp_ns: int, residual: Floats) -> float:
         """Take in a measurement that lies ``residual`` (3,) m from the open-loop tip; one of a stamp that is known takes its place.
 
