@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from ctr_dynamics import chi_square
 from ctr_dynamics.estimation.filter.adapted_variances import AdaptationOptions
+from ctr_dynamics.estimation.monitoring.taken_again import drop_from
 from ctr_dynamics.kernels.parabolas import fill_between
 
 Floats = NDArray[np.float64]
@@ -145,9 +146,8 @@ class DelaySearch:
             foretold: what the filter foretold; see :class:`~ctr_dynamics.estimation.filter.filter_records.Update`.
             present_s: s beyond the nominal delay, with which the filter has met it.
         """
-        for known in (self._evidence, self._waiting):
-            while known and known[-1].stamp_ns >= stamp_ns:
-                known.pop()  # its step is taken again
+        drop_from(self._evidence, stamp_ns)
+        drop_from(self._waiting, stamp_ns)
         self._waiting.append(Waiting(stamp_ns, time_s, position, foretold, present_s))
         while self._waiting and self._waiting[0].time_s - self.delays[0] <= stamps[-1]:
             self._take(self._waiting.popleft(), stamps, tips)

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctr_dynamics import chi_square
+from ctr_dynamics.estimation.monitoring.taken_again import drop_from
 
 Floats = NDArray[np.float64]
 LAST = 8  # residuals that are looked at, 0.2 s at 40 Hz: an error of 0.1 s shows in them
@@ -62,8 +63,7 @@ class Disagreement:
     def add(self, stamp_ns: int, seen: Floats, model: Floats, residual: Floats) -> None:
         """Take in a measurement (see :class:`Measured`); one of a stamp that is known takes its place."""
         known, self._covariance = self._measured, None
-        while known and known[-1].stamp_ns >= stamp_ns:
-            known.pop()  # its step is taken again
+        drop_from(known, stamp_ns)
         jumps = known[-1].jumps + self._jump(stamp_ns, seen, model) if known else np.zeros(3)
         if np.linalg.norm(residual) < self._least:
             jumps = np.zeros(3)  # it is back, or the estimate has followed it

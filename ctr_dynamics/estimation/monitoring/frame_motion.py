@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from ctr_dynamics.estimation.filter.adapted_variances import AdaptationOptions
 from ctr_dynamics.estimation.monitoring.delay_search import log_density
+from ctr_dynamics.estimation.monitoring.taken_again import drop_from
 from ctr_dynamics.kernels.motion_regression import correct_motions
 
 Floats = NDArray[np.float64]
@@ -115,8 +116,7 @@ class FrameMotion:
             other: that of all else that may be right, up to this one.
         """
         known, options, noise = self._known, self.options, self._noise**2
-        while known and known[-1].stamp_ns >= stamp_ns:
-            known.pop()  # its step is taken again
+        drop_from(known, stamp_ns)
         rows = len(self._prior)
         # by Cayley's formula, a rotation moves a point by the cross product of a vector with the middle between its places
         middle = position - 0.5 * residual

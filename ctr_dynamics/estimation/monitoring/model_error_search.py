@@ -27,6 +27,7 @@ from ctr_dynamics.estimation.monitoring.delay_search import density_of_filter, l
 from ctr_dynamics.estimation.monitoring.frame_motion import FrameMotion
 from ctr_dynamics.estimation.monitoring.noisy_tracker import NoisyTracker
 from ctr_dynamics.estimation.monitoring.smooth_departure import SmoothDeparture
+from ctr_dynamics.estimation.monitoring.taken_again import drop_from
 
 Floats = NDArray[np.float64]
 CONSTANT, REST = -2, -1  # rows beyond those of the departures
@@ -147,8 +148,7 @@ class ModelErrorSearch:
             position: (3,) m, measured. residual: (3,) m, measured minus open-loop tip. turn: (a,) rad, rotation between them about the measured axes.
             foretold: what the filter foretold; see :class:`~ctr_dynamics.estimation.filter.filter_records.Update`.
         """
-        while self._evidence and self._evidence[-1].stamp_ns >= stamp_ns:
-            self._evidence.pop()  # its step is taken again
+        drop_from(self._evidence, stamp_ns)
         self._compared = None
         noise, square = self._noise**2, self._variances
         angle = float(turn @ turn) / len(turn) if len(turn) else 0.0

@@ -14,6 +14,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ctr_dynamics.estimation.monitoring.taken_again import drop_from
+
 Floats = NDArray[np.float64]
 
 
@@ -82,8 +84,7 @@ class NoisyTracker:
             Logarithm of the evidence of a tracker that is noisier than stated by any size, its prior included.
         """
         known, options, freedom = self._known, self.options, self.options.freedom
-        while known and known[-1].stamp_ns >= stamp_ns:
-            known.pop()  # its step is taken again
+        drop_from(known, stamp_ns)
         count = len(self._squares)
         last = known[-1] if known else Noise(
             stamp_ns, np.zeros((count, 3)), np.full(count, self._registered), np.zeros(count)

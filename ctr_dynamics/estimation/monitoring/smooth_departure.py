@@ -13,6 +13,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ctr_dynamics.estimation.monitoring.delay_search import log_density
+from ctr_dynamics.estimation.monitoring.taken_again import drop_from
+
 Floats = NDArray[np.float64]
 REMEMBERED = 200  # measurements that may be taken again
 
@@ -64,8 +67,7 @@ class SmoothDeparture:
             Logarithm of the evidence of all sizes and times, prior included.
         """
         known, rates, at_rest = self._known, self._rates, self._stationary
-        while known and known[-1].stamp_ns >= stamp_ns:
-            known.pop()  # its step is taken again
+        drop_from(known, stamp_ns)
         count = len(rates)
         last = known[-1] if known else Smooth(stamp_ns, np.zeros((count, 2, 3)), at_rest, np.zeros(count))
         elapsed = (stamp_ns - last.stamp_ns) * 1e-9
@@ -79,7 +81,7 @@ class SmoothDeparture:
         mean = F @ last.mean
         total = covariance[:, 0, 0] + self._noise
         change = residual - mean[:, 0]
-        density = -0.5 * ((change**2).sum(axis=1) / total + 3.0 * np.log(total / self._noise))
+        density = log_density((change**2).sum(axis=1), total, self._noise)
         gain = covariance[:, :, 0] / total[:, None]
         evidence = math.exp(-elapsed / self._memory_s) * last.evidence + density
         known.append(
