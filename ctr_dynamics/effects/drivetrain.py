@@ -97,6 +97,7 @@ def drivetrain_compliance(plant: Plant, values: Values) -> None:
     EffectParameter("delay_s", "s", 0.0, 0.015, low=-0.1, text="tubes follow their readings this much later"),
     text="The tubes turn later than the encoders report.",
     source="alpha(t) = reading(t - delay)",
+    large_sizes=(-2.0, -1.0, 1.0, 2.0),
 )
 def actuator_latency(plant: Plant, values: Values) -> None:
     plant.change_actuators(delay=plant.actuators.delay + values["delay_s"])

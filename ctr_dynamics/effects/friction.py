@@ -33,7 +33,7 @@ def _coefficient(row: str, name: str, unit: str, factor: float, floor: float, te
         ),
         text=text,
         source="Till et al. (2020), (22)-(24)",
-        large_sizes=(1.0,) if kind == "viscous" else (),
+        large_sizes=(1.0,),
     )
     def apply(plant: Plant, values: Values) -> None:
         plant.put(row, values[name])
@@ -104,6 +104,7 @@ def stribeck(plant: Plant, values: Values) -> None:
     text="Neighbouring tubes rub along their whole overlap, with a torque per length and the smoothing of the Coulomb law.",
     source="Lock and Dupont (2011), friction along concentric tubes",
     extended=True,
+    large_sizes=(1.0,),
 )
 def distributed_friction(plant: Plant, values: Values) -> None:
     if values["torque_Nm_per_m"] != 0.0:

@@ -96,6 +96,7 @@ def precurvature(plant: Plant, values: Values) -> None:
     _one_tube(0.05, "density"),
     text="The tubes are heavier or lighter.",
     source="Till et al. (2020), (13): rho A, rho I",
+    large_sizes=(-2.0, 2.0),
 )
 def density(plant: Plant, values: Values) -> None:
     _scale(plant, values, "mass_per_length", "inertia_per_length")

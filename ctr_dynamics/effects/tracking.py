@@ -92,6 +92,7 @@ def tracker_lever_arm(plant: Plant, values: Values) -> None:
     ),
     text="Tracker poses are older than their stamps.",
     source="reading(stamp) = pose(stamp - delay)",
+    large_sizes=(-2.0, -1.0, 1.0, 2.0),
 )
 def tracker_latency(plant: Plant, values: Values) -> None:
     plant.change_tracker(delay=plant.tracker.delay + values["delay_s"])
@@ -103,6 +104,7 @@ def tracker_latency(plant: Plant, values: Values) -> None:
     EffectParameter("window_s", "s", 0.0, 0.03, low=0.0, text="length of the average before the stamp"),
     text="The tracker averages over a time before its stamp: delay and loss of amplitude.",
     source="moving average",
+    large_sizes=(1.0,),
 )
 def tracker_averaging(plant: Plant, values: Values) -> None:
     plant.change_tracker(averaging=plant.tracker.averaging + values["window_s"])
@@ -113,6 +115,7 @@ def tracker_averaging(plant: Plant, values: Values) -> None:
     EffectParameter("rate", "s/s", 0.0, 2e-3, text="tracker stamp = true time * (1 + rate)"),
     text="The tracker's clock runs at another rate.",
     source="linear clock model",
+    large_sizes=(-1.0, 1.0),
 )
 def clock_skew(plant: Plant, values: Values) -> None:
     plant.change_tracker(skew=plant.tracker.skew + values["rate"])
