@@ -14,7 +14,8 @@ from ctr_dynamics.estimation.filter.filter_records import FilterState, TipEstima
 from ctr_dynamics.estimation.inputs.input_buffer import InputBuffer
 from ctr_dynamics.estimation.inputs.measurement_queue import DueMeasurement
 from ctr_dynamics.estimation.inputs.run_inputs import InterpolatedInputs, RunInputs
-from ctr_dynamics.estimation.monitoring.delay_search import CLOCK_BEHIND, DelaySearch, allowance
+from ctr_dynamics.estimation.monitoring.delay_search import CLOCK_BEHIND, DelaySearch
+from ctr_dynamics.estimation.monitoring.densities import allowance
 from ctr_dynamics.estimation.monitoring.disagreement import Disagreement
 from ctr_dynamics.estimation.monitoring.health import Health
 from ctr_dynamics.estimation.monitoring.innovation_log import InnovationLog
@@ -76,8 +77,9 @@ class FusedRun:
         noise, length = model.robot.tracker.noise, float(model.robot.lengths[0])
         file = ekf.tracker.state_sigma
         registered = math.hypot(file[TRANSLATION].max(), length * file[ROTATION].max())
-        self.delay_search = DelaySearch(noise.position.value, ekf.options.force_change)
-        self.clock_search = DelaySearch(noise.position.value, ekf.options.force_change, CLOCK_BEHIND)
+        moves = noise.position.value, ekf.options.force_change, length, registered
+        self.delay_search = DelaySearch(*moves)
+        self.clock_search = DelaySearch(*moves, CLOCK_BEHIND)
         self.disagreement = Disagreement(noise.position.value)
         self.model_error_search = ModelErrorSearch(
             noise.position.value,

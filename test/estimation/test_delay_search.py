@@ -9,17 +9,17 @@ from ctr_dynamics.estimation.monitoring.delay_search import (
     FINER,
     DelaySearch,
     DelaySearchOptions,
-    allowance,
 )
+from ctr_dynamics.estimation.monitoring.densities import allowance
 from ctr_dynamics.kernels.parabolas import fill_between
 
-NOISE = 2.5e-4
+NOISE, LENGTH, REGISTERED = 2.5e-4, 0.25, 1e-3
 
 
 def search(path, delay, beside=(0.0, 0.0, 0.0), foretold=(-20.0, -2.0), seen=None, seconds=1.0, options=None):
     """Positions at 40 Hz of a tip on ``path``, measured ``delay`` late by a tracker that sees ``seen``, or the same, beside a filter that has
     ``foretold`` every one like that, or that of a time (s): as if a force had changed."""
-    rng, found = np.random.default_rng(3), DelaySearch(NOISE, 20.0, options)
+    rng, found = np.random.default_rng(3), DelaySearch(NOISE, 20.0, LENGTH, REGISTERED, options)
     times = np.arange(0.0, 0.9 + seconds + 0.1, 0.003)
     for k in range(round(40 * seconds)):
         t = 0.9 + 0.025 * k
@@ -76,7 +76,7 @@ def test_a_delay_that_changes_is_found_after_a_long_time_without():
 
 
 def test_delays_between_two_points_rise_above_them_only_at_a_smooth_peak():
-    found = DelaySearch(NOISE, 20.0)
+    found = DelaySearch(NOISE, 20.0, LENGTH, REGISTERED)
     smooth = -0.5 * ((found.delays - 0.06125) / 0.003) ** 2  # its peak lies halfway
     delays, dense = found._between(smooth, -np.inf)
     np.testing.assert_allclose(dense, -0.5 * ((delays - 0.06125) / 0.003) ** 2, atol=1e-9)
@@ -188,3 +188,19 @@ def test_the_estimate_follows_a_tracker_whose_clock_is_behind():
     assert (np.linalg.norm(errors, axis=-1) < np.maximum(3.0 * deviation, 3e-3)).all()
     errors, _ = truth_error(run, "clean_sweep", "p_trk", since=2.5)
     assert np.linalg.norm(errors, axis=-1).max() < 1e-3
+
+
+def test_a_tracker_that_comes_back_is_not_late():
+    """It jumps back by where the robot was 0.2 s ago. The filter foretells that badly, and the next poses, until it has found it."""
+    back, along = 10.0, np.array([0.02, 0.015, 0.0])
+
+    def straight(t):
+        return t[:, None] * along
+
+    def seen(t):
+        return straight(t) + np.where(t < back, 0.2, 0.0)[:, None] * along
+
+    told = lambda t: (-200.0, -14.0) if back <= t < back + 0.15 else WELL  # noqa: E731
+    found = search(straight, 0.0, foretold=told, seen=seen, seconds=9.6)
+    assert found.belief(0.0).late < 0.5
+    assert found.found(0.0) is None

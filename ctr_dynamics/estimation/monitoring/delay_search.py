@@ -11,13 +11,14 @@ import math
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ctr_dynamics import chi_square
 from ctr_dynamics.estimation.filter.adapted_variances import AdaptationOptions
+from ctr_dynamics.estimation.monitoring.densities import density_of_filter, log_density
+from ctr_dynamics.estimation.monitoring.moved_tracker import Moved, MovedTracker
 from ctr_dynamics.estimation.monitoring.taken_again import drop_from
 from ctr_dynamics.kernels.parabolas import fill_between
 
@@ -77,6 +78,7 @@ class Evidence(NamedTuple):
         delays: (d,) logarithm of the evidence of every delay; filter: of what the filter foretold.
         changed: (d,) the same of a latency that has changed to every delay, at the time that speaks most for it; began_ns: (d,) stamp before that;
             changed_level: (d, 3) m, the level since then.
+        moved: the same of a tracker that has been moved instead.
     """
 
     stamp_ns: int
@@ -87,6 +89,7 @@ class Evidence(NamedTuple):
     changed: Floats
     began_ns: NDArray[np.int64]
     changed_level: Floats
+    moved: Moved
 
 
 class Belief(NamedTuple):
@@ -104,12 +107,21 @@ class DelaySearch:
     Args:
         noise: m per axis, deviation of a measured position.
         change_s: mean time between two changes of the unknown force. The filter may have met one with every measurement.
+        length: m, of the robot outside the base plate at most. registered: m per axis, tolerance of the registration at the tip.
         options: when a delay is believed.
     """
 
-    def __init__(self, noise: float, change_s: float, options: DelaySearchOptions | None = None) -> None:
+    def __init__(
+        self,
+        noise: float,
+        change_s: float,
+        length: float,
+        registered: float,
+        options: DelaySearchOptions | None = None,
+    ) -> None:
         self.options = options = options or DelaySearchOptions()
         self._noise, self._change_s = noise, change_s
+        self._moved = MovedTracker(noise, length, registered)
         first, last = (
             round(-options.earliest_s / options.spacing_s),
             round(options.longest_s / options.spacing_s),
@@ -163,7 +175,10 @@ class DelaySearch:
         noise = self._noise**2
         if not self._evidence:
             none, began = np.zeros(len(times)), np.full(len(times), stamp_ns)
-            self._evidence.append(Evidence(stamp_ns, residual, noise, none, 0.0, none, began, residual))
+            moved = self._moved.begin(residual[int(np.argmin(np.abs(self.delays - present_s)))])
+            self._evidence.append(
+                Evidence(stamp_ns, residual, noise, none, 0.0, none, began, residual, moved)
+            )
             return
         # 1. The registration and the drift of the open-loop run: a random walk.
         last, options = self._evidence[-1], self.options
@@ -185,23 +200,26 @@ class DelaySearch:
         now = math.log(-math.expm1(-elapsed / options.sound_s))
         begun = right_before + now + log_density((begins**2).sum(axis=1), total, noise)
         new = begun > on
+        # 5. Or the tracker has been moved just now.
+        moved = self._moved.add(last.moved, residual[present], elapsed, decay, right_before)
         self._evidence.append(
             Evidence(
                 stamp_ns,
                 last.level + gain * change,
                 before * (1.0 - gain),
                 decay * last.delays + density,
-                decay * last.filter + own,
+                self._moved.filter_goes_on(last.filter, last.moved, elapsed, decay) + own,
                 np.where(new, begun, on),
                 np.where(new, last.stamp_ns, last.began_ns),
                 residual - (1.0 - gain) * np.where(new[:, None], begins, goes_on),
+                moved,
             )
         )
 
     def belief(self, present_s: float) -> Belief:
         """How likely another delay than ``present_s`` (s, beyond the nominal one) is.
 
-        The filter may be right; so may the open-loop run with the delay that the filter has, and so may it with any other.
+        The filter may be right; so may the open-loop run with the delay that the filter has, the tracker moved or not, and so may it with any other.
         """
         if self._belief is None or self._belief[0] != present_s:
             self._belief = present_s, self._compare(present_s, self._evidence)
@@ -219,7 +237,7 @@ class DelaySearch:
         other = np.abs(delays - present_s) > options.least_s
         if not other.any():
             return Belief(0.0, present_s, 0.0, 0.0)
-        as_now = max(last.filter, float(evidence[~other].max(initial=-math.inf)))
+        as_now = max(last.filter, last.moved.evidence, float(evidence[~other].max(initial=-math.inf)))
         likely = evidence[other] + prior
         most = max(as_now, float(likely.max()))
         weights = np.exp(likely - most)
@@ -302,27 +320,4 @@ class DelaySearch:
             if not same.any():
                 same[:] = True
             best = max([last.filter, *last.delays[same], *last.changed[same]])
-            self._evidence.append(last._replace(filter=best))
-
-
-def log_density(square: Any, variance: Any, noise: float) -> Any:
-    """Logarithm of a normal density of three axes, of ``variance`` (m^2) each, at a squared distance ``square`` (m^2), by that of ``noise`` at 0."""
-    return -0.5 * (square / variance + 3.0 * np.log(variance / noise))
-
-
-def density_of_filter(foretold: tuple[float, float], changes: float) -> float:
-    """Logarithm of the density that a filter gave to a measured position, of which it ``foretold`` one for either case.
-
-    The unknown force may have met a change since the measurement before: ``changes`` are expected in that time.
-    """
-    known, changed = foretold
-    likely = -math.expm1(-changes)
-    return float(np.logaddexp(known + math.log1p(-likely), changed + math.log(likely)))
-
-
-def allowance(probability: float) -> float:
-    """By how much the variance grows for each squared deviation of another estimate that is right with that ``probability``.
-
-    The other estimate must not lie farther out than a normal error of that probability, in three dimensions.
-    """
-    return 1.0 / chi_square.quantile(1.0 - max(probability, 1e-9), 3) if probability < 0.5 else 1.0
+            self._evidence.append(last._replace(filter=best, moved=last.moved._replace(evidence=-math.inf)))

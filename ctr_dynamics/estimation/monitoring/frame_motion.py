@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctr_dynamics.estimation.filter.adapted_variances import AdaptationOptions
-from ctr_dynamics.estimation.monitoring.delay_search import log_density
+from ctr_dynamics.estimation.monitoring.densities import log_density
 from ctr_dynamics.estimation.monitoring.taken_again import drop_from
 from ctr_dynamics.kernels.motion_regression import correct_motions
 

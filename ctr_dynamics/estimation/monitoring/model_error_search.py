@@ -23,8 +23,9 @@ from numpy.typing import NDArray
 
 from ctr_dynamics.estimation.filter.adapted_variances import AdaptationOptions
 from ctr_dynamics.estimation.filter.filter_records import ModelErrorSize
-from ctr_dynamics.estimation.monitoring.delay_search import density_of_filter, log_density
+from ctr_dynamics.estimation.monitoring.densities import density_of_filter, log_density
 from ctr_dynamics.estimation.monitoring.frame_motion import FrameMotion
+from ctr_dynamics.estimation.monitoring.moved_tracker import Moved, MovedTracker
 from ctr_dynamics.estimation.monitoring.noisy_tracker import NoisyTracker
 from ctr_dynamics.estimation.monitoring.smooth_departure import SmoothDeparture
 from ctr_dynamics.estimation.monitoring.taken_again import drop_from
@@ -73,6 +74,7 @@ class Evidence(NamedTuple):
             position itself of a robot that rests.
         variance: (h + 2,) m^2, of it per axis.
         departures: (h + 2,) logarithm of the evidence of each; filter: of what the filter foretold; noisy: of a tracker that is noisier than stated.
+        moved: the filter finds such a move later; see :mod:`~ctr_dynamics.estimation.monitoring.moved_tracker`.
         since: (h + 2,) by how much each has foretold better than filter and rest since the time that speaks most for it.
         turned: rad^2, mean square of the rotation between measurements and open-loop run, per axis; weight: of how many measurements.
     """
@@ -82,6 +84,7 @@ class Evidence(NamedTuple):
     variance: Floats
     departures: Floats
     filter: float
+    moved: Moved
     noisy: float
     since: Floats
     turned: float
@@ -124,6 +127,7 @@ class ModelErrorSearch:
         )
         self._variances = np.r_[self.sizes, registered, length] ** 2
         self._rates = np.r_[1.0 / self.times, 0.0, 0.0]
+        self._moved = MovedTracker(position_noise, length, registered)
         self.frame = FrameMotion(position_noise, length)
         self.noisy = NoisyTracker(position_noise, length, registered)
         self.smooth = SmoothDeparture(position_noise, self.sizes, self.times, options.prior, options.memory_s)
@@ -160,7 +164,10 @@ class ModelErrorSearch:
             level = gain[:, None] * observed
             none = np.zeros(len(square))
             variance = (1.0 - gain) * square
-            self._evidence.append(Evidence(stamp_ns, level, variance, none, 0.0, -math.inf, none, angle, 1.0))
+            moved = self._moved.begin(residual)
+            self._evidence.append(
+                Evidence(stamp_ns, level, variance, none, 0.0, moved, -math.inf, none, angle, 1.0)
+            )
             return
         # 1. The departure decays and gets new randomness.
         last, options = self._evidence[-1], self.options
@@ -185,6 +192,10 @@ class ModelErrorSearch:
         if self._span(stamp_ns) < options.learning_s:
             decay = own = 0.0
             density[:] = 0.0
+            moved, right = self._moved.begin(residual), 0.0
+        else:
+            moved = self._moved.add(last.moved, residual, elapsed, decay, decay * self._file_right(last))
+            right = self._moved.filter_goes_on(last.filter, last.moved, elapsed, decay)
         weight = decay * last.weight + 1.0
         self._evidence.append(
             Evidence(
@@ -192,7 +203,8 @@ class ModelErrorSearch:
                 level + gain[:, None] * change,
                 before * (1.0 - gain),
                 decay * last.departures + density,
-                decay * last.filter + own,
+                right + own,
+                moved,
                 self.noisy.add(stamp_ns, residual) if decay else -math.inf,
                 np.maximum(last.since + density - max(own, density[REST]), 0.0),
                 last.turned + (angle - last.turned) / weight,
@@ -250,7 +262,8 @@ class ModelErrorSearch:
     @staticmethod
     def _file_right(last: Evidence) -> float:
         """Logarithm of the evidence of a robot whose file is right, by a tracker of any noise."""
-        return float(np.logaddexp(np.logaddexp(last.filter, last.departures[CONSTANT]), last.noisy))
+        ways = last.filter, last.moved.evidence, last.departures[CONSTANT], last.noisy
+        return float(np.logaddexp.reduce(ways))
 
     def found(self, present: ModelErrorSize) -> ModelErrorSize | None:
         """The model error that is believed instead of ``present``, which the filter counts on; None where there is none."""

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ctr_dynamics.estimation.monitoring.delay_search import log_density
+from ctr_dynamics.estimation.monitoring.densities import log_density
 from ctr_dynamics.estimation.monitoring.taken_again import drop_from
 
 Floats = NDArray[np.float64]

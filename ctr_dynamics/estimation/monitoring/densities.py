@@ -1,0 +1,33 @@
+"""How well positions are foretold: logarithms of densities, by that of the tracker's stated noise at zero."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from ctr_dynamics import chi_square
+
+
+def log_density(square: Any, variance: Any, noise: float) -> Any:
+    """Logarithm of a normal density of three axes, of ``variance`` (m^2) each, at a squared distance ``square`` (m^2), by that of ``noise`` at 0."""
+    return -0.5 * (square / variance + 3.0 * np.log(variance / noise))
+
+
+def density_of_filter(foretold: tuple[float, float], changes: float) -> float:
+    """Logarithm of the density that a filter gave to a measured position, of which it ``foretold`` one for either case.
+
+    The unknown force may have met a change since the measurement before: ``changes`` are expected in that time.
+    """
+    known, changed = foretold
+    likely = -math.expm1(-changes)
+    return float(np.logaddexp(known + math.log1p(-likely), changed + math.log(likely)))
+
+
+def allowance(probability: float) -> float:
+    """By how much the variance grows for each squared deviation of another estimate that is right with that ``probability``.
+
+    The other estimate must not lie farther out than a normal error of that probability, in three dimensions.
+    """
+    return 1.0 / chi_square.quantile(1.0 - max(probability, 1e-9), 3) if probability < 0.5 else 1.0
