@@ -129,6 +129,20 @@ def late(seconds: float, begin_s: float = 0.0) -> Edit:
     return change
 
 
+def scattered(deviation_s: float) -> Edit:
+    """Stamps that are off at random, whatever the poses show."""
+
+    def change(messages: Messages) -> Messages:
+        rng = np.random.default_rng(3)
+        off = [round(1e9 * deviation_s * rng.standard_normal()) for _ in messages]
+        return [
+            m._replace(data=shifted(m.data, ns)) if m.topic == T else m
+            for m, ns in zip(messages, off, strict=True)
+        ]
+
+    return change
+
+
 def one_joint_state(edit: Callable[[RawMessage], RawMessage]) -> Edit:
     """The joint state in the middle of the span changed."""
 
@@ -192,6 +206,7 @@ FAULTS: dict[str, tuple[Edit, float]] = {  # the change, and when it ends (s); i
     "a frame that turns by 0.03 rad/s": (moving_frame(0.0, 0.03), math.inf),
     "poses of 1e160 for 2 s": (in_span(T, pose(huge)), END_S),
     "poses 80 ms late, not told": (late(0.08), math.inf),
+    "stamps that scatter by 5 ms": (scattered(0.005), math.inf),
     "latency that jumps by 60 ms": (late(0.06, BEGIN_S), math.inf),
     "joints stopped for 1 s": (stopped, BEGIN_S + 1.0),
     "an encoder slips by 0.2 rad": (in_span(J, turned_on(0.2), math.inf), math.inf),

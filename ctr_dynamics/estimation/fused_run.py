@@ -17,6 +17,7 @@ from ctr_dynamics.estimation.inputs.run_inputs import InterpolatedInputs, RunInp
 from ctr_dynamics.estimation.monitoring.delay_search import CLOCK_BEHIND, DelaySearch
 from ctr_dynamics.estimation.monitoring.densities import allowance
 from ctr_dynamics.estimation.monitoring.disagreement import Disagreement
+from ctr_dynamics.estimation.monitoring.end_of_jitter import EndOfJitter
 from ctr_dynamics.estimation.monitoring.health import Health
 from ctr_dynamics.estimation.monitoring.innovation_log import InnovationLog
 from ctr_dynamics.estimation.monitoring.model_error_search import ModelErrorSearch
@@ -81,6 +82,7 @@ class FusedRun:
         self.delay_search = DelaySearch(*moves)
         self.clock_search = DelaySearch(*moves, CLOCK_BEHIND)
         self.disagreement = Disagreement(noise.position.value)
+        self.end_of_jitter = EndOfJitter()
         self.model_error_search = ModelErrorSearch(
             noise.position.value,
             noise.rotation.value,
@@ -91,6 +93,7 @@ class FusedRun:
         self.state: State | None = None
         self.measured_ns: int | None = None
         self.confirmed, self.late, self.moving = 0, False, False
+        self._scatters_since = 0  # step, since when stamps probably scatter
         self._apart = np.zeros(3)  # m, the last measurement from the open-loop run
 
     def clear(self) -> None:
@@ -100,6 +103,7 @@ class FusedRun:
         self.clock_search.clear()
         self.model_error_search.clear()
         self.disagreement.clear()
+        self.end_of_jitter.clear()
         self.state, self.measured_ns, self.confirmed, self.late, self.moving = None, None, 0, False, False
 
     def start(self, state: State, t: float) -> None:
@@ -141,6 +145,7 @@ class FusedRun:
                 self.disagreement.add(measurement.stamp_ns, seen, motion.position, residual)
             if motion is not None and update.foretold is not None:
                 self._apart = motion.residual
+                self.end_of_jitter.add(measurement.stamp_ns, update.steadier)
                 own_s = time_s - self.ekf.tracker.age
                 tips = open_loop.tips.positions()
                 for search in (self.delay_search, self.clock_search):
@@ -149,6 +154,8 @@ class FusedRun:
                     measurement.stamp_ns,
                     seen,
                     motion.residual,
+                    motion.velocity,
+                    motion.acceleration,
                     self._turn(quaternion, motion.quaternion),
                     update.foretold,
                 )
@@ -209,6 +216,7 @@ class FusedRun:
         """Go on from the open-loop run at step ``k`` if measurements show that something else is right than the filter counts on."""
         return (
             self.follow_delay(open_loop, k)
+            or self.follow_jitter(open_loop, k)
             or self.leave_moving_frame(open_loop, k)
             or self.follow_model_error(open_loop, k)
             or self.leave_refuted(open_loop, k)
@@ -239,6 +247,37 @@ class FusedRun:
                 search.begin_again(delay)
             self._health.distances.clear()
         self._health.note("tracker", "latency", f"{note}; check the tracker's clock, or set tracker.delay_s")
+        self.reinitialise(open_loop, k)
+        return True
+
+    def follow_jitter(self, open_loop: OpenLoopRun, k: int) -> bool:
+        """Go on from the open-loop run at step ``k`` with stamps that scatter, if measurements follow it far better with that than the filter.
+
+        Where they scatter less than they did, the filter goes on as it is, with half of that.
+        """
+        if not self._health.fusing or self.not_fused:
+            return False
+        search = self.model_error_search
+        if self.ekf.jitter and self.end_of_jitter.less:
+            half = 0.5 * self.ekf.jitter
+            self.ekf.jitter = half if half > 0.5 * search.jitter.options.smallest_s else 0.0
+            self.end_of_jitter.clear()
+        probability, deviation = search.stamp_jitter(self.ekf.jitter)
+        if probability <= 0.5:
+            self._scatters_since = k
+        lasts = seconds(k - self._scatters_since) > search.jitter.options.lasts_s
+        if probability <= search.options.believed or not lasts:
+            return False
+        self.ekf.jitter = deviation
+        self.end_of_jitter.clear()
+        search.begin_again()
+        for other in (self.delay_search, self.clock_search):
+            other.begin_again(self.ekf.delay)
+        self._health.note(
+            "tracker",
+            "jitter",
+            f"stamps scatter by {1e3 * deviation:.0f} ms; stamp poses when they are measured, not when they arrive",
+        )
         self.reinitialise(open_loop, k)
         return True
 
@@ -307,7 +346,8 @@ class FusedRun:
         search = self.model_error_search
         moves = search.frame.probability
         behind = self.clock_search.belief(self.ekf.delay).late
-        other = max(belief.late, behind, moves, search.probability(self.ekf.model_error))
+        scatter = search.stamp_jitter(self.ekf.jitter)[0]
+        other = max(belief.late, behind, moves, scatter, search.probability(self.ekf.model_error))
         if not self._health.fusing or other < NEGLIGIBLE:
             return
         if self.not_fused:

@@ -7,7 +7,7 @@ import pytest
 from estimation_cases import bag_messages, check_outputs, play, truth_error
 from scipy.spatial.transform import Rotation
 from scipy.stats import multivariate_normal
-from test_model_error_search import NONE, WELL, moving, search, wandering
+from test_model_error_search import AT_REST, NONE, WELL, moving, search, wandering
 
 from ctr_dynamics.kernels.motion_regression import correct_motions
 
@@ -34,7 +34,7 @@ def fed(departures):
     rng = np.random.default_rng(7)
     for k in range(BEGIN, len(departures)):
         residual = departures[k] + 3e-4 * rng.standard_normal(3)
-        found.add(25_000_000 * k, moving(k) + residual, residual, np.zeros(3), told(k))
+        found.add(25_000_000 * k, moving(k) + residual, residual, *AT_REST, np.zeros(3), told(k))
     return found
 
 
@@ -82,7 +82,7 @@ def test_what_does_not_grow_steadily_is_no_moving_frame(departures):
     found = search(departures[:BEGIN], foretold=(WELL, WELL))
     for k in range(BEGIN, len(departures)):
         residual = departures[k] + 3e-4 * rng.standard_normal(3)
-        found.add(25_000_000 * k, moving(k) + residual, residual, np.zeros(3), (-4.0, -4.0))
+        found.add(25_000_000 * k, moving(k) + residual, residual, *AT_REST, np.zeros(3), (-4.0, -4.0))
         assert not found.frame.moves(False)
 
 
@@ -98,7 +98,7 @@ def test_a_model_that_errs_by_where_its_tubes_are_is_no_moving_frame(period_s):
     believed = 0
     for k, departure in enumerate(departures):
         residual = departure + 3e-4 * rng.standard_normal(3)
-        found.add(100_000_000 * k, moving(4 * k) + residual, residual, np.zeros(3), (-8.0, -8.0))
+        found.add(100_000_000 * k, moving(4 * k) + residual, residual, *AT_REST, np.zeros(3), (-8.0, -8.0))
         believed += found.frame.moves(False)
     assert believed == 0
 
@@ -110,7 +110,7 @@ def test_measurements_that_are_taken_again_count_once():
     for k in range(BEGIN, 260):
         residual = departures[k] + 3e-4 * rng.standard_normal(3)
         if k >= 220:
-            again.add(25_000_000 * k, moving(k) + residual, residual, np.zeros(3), told(k))
+            again.add(25_000_000 * k, moving(k) + residual, residual, *AT_REST, np.zeros(3), told(k))
     assert again.frame.moving == pytest.approx(once.frame.moving, abs=1e-9)
 
 

@@ -11,6 +11,7 @@ from ctr_dynamics.robot_files import load_robot
 
 NOISE, ROTATION_NOISE, LENGTH, REGISTERED = 3e-4, 3e-3, 0.2, 5e-4
 NONE = ModelErrorSize(0.0, 0.0, 1.0)
+AT_REST = np.zeros(3), np.zeros(3)  # velocity and acceleration of the tip: jitter of stamps does not show
 WELL = -1.7  # as a filter foretells whose model is right: 3 ln(1 + 1/4) / 2 and the innovation's square
 
 
@@ -28,7 +29,7 @@ def search(departures, turn=0.0, foretold=(-20.0, -4.0), seed=1, tip=moving):
     for k, departure_m in enumerate(departures):
         turned = np.array([turn, turn, turn]) + ROTATION_NOISE * rng.standard_normal(3)
         residual = departure_m + NOISE * rng.standard_normal(3)
-        found.add(25_000_000 * k, tip(k) + residual, residual, turned, foretold)
+        found.add(25_000_000 * k, tip(k) + residual, residual, *AT_REST, turned, foretold)
     return found
 
 
@@ -106,7 +107,7 @@ def test_what_the_filter_foretells_while_it_learns_does_not_count():
     rng = np.random.default_rng(4)
     for k in range(16, 200):
         residual = departures[k] + NOISE * rng.standard_normal(3)
-        found.add(25_000_000 * k, moving(k) + residual, residual, np.zeros(3), (WELL, WELL))
+        found.add(25_000_000 * k, moving(k) + residual, residual, *AT_REST, np.zeros(3), (WELL, WELL))
     assert found.found(NONE) is None
 
 
@@ -118,7 +119,7 @@ def test_measurements_that_are_taken_again_count_once():
         turned, noise = ROTATION_NOISE * rng.standard_normal(3), NOISE * rng.standard_normal(3)
         if k >= 30:
             residual = departure_m + noise
-            twice.add(25_000_000 * k, moving(k) + residual, residual, turned, (-20.0, -4.0))
+            twice.add(25_000_000 * k, moving(k) + residual, residual, *AT_REST, turned, (-20.0, -4.0))
     assert twice.probability(NONE) == pytest.approx(once.probability(NONE), abs=1e-9)
 
 
@@ -145,7 +146,7 @@ def test_a_filter_that_has_lost_the_robot_is_astray_within_a_second_whatever_was
     while not found.astray and taken < 40:
         residual = departures[400 + taken] + NOISE * rng.standard_normal(3)
         position = moving(400 + taken) + residual
-        found.add(25_000_000 * (400 + taken), position, residual, np.zeros(3), (-8.0, -8.0))
+        found.add(25_000_000 * (400 + taken), position, residual, *AT_REST, np.zeros(3), (-8.0, -8.0))
         taken += 1
     assert 3 <= taken <= 12
     found.forgive()

@@ -25,7 +25,12 @@ from ctr_dynamics.estimation.filter.filter_records import (
     Update,
 )
 from ctr_dynamics.estimation.filter.gating import Gate
-from ctr_dynamics.estimation.filter.parameter_priors import force_range, model_uncertainty
+from ctr_dynamics.estimation.filter.jitter_noise import with_jitter
+from ctr_dynamics.estimation.filter.parameter_priors import (
+    force_range,
+    model_uncertainty,
+    values_and_deviations,
+)
 from ctr_dynamics.estimation.filter.process_noise import ProcessNoise
 from ctr_dynamics.estimation.filter.rational_step import ColumnStrides, Stride, exposed
 from ctr_dynamics.estimation.filter.tip_window import TipWindow, insertion_fraction
@@ -59,6 +64,7 @@ class RodEkf:
         theta: (p,) estimated changes of the uncertain parameters. bias: (22,) tracker states b. pi: (r + 22, r + 22) Pi.
         factor: V. tips: those of the last steps. adapted: of the unknown tip force. gate: counts rejections. stride: of the columns in the last step.
         refuted: whether the estimate refutes the tolerances of the robot file. The delay is not estimated then.
+        jitter: s, by which stamps are known to scatter; whoever sets it decides whether to :meth:`start` again.
         insertion_fraction: of beta's rate, what the model's velocities hold already.
     """
 
@@ -89,7 +95,7 @@ class RodEkf:
         noise = self.model.robot.tracker.noise.position.value
         self.adapted = AdaptedVariances(force, noise, self.model.robot.tubes[0].length)
         self._tolerances = Tolerances(self.uncertainty.names, self.uncertainty.sigma, tracker.state_sigma)
-        self.refuted = False
+        self.refuted, self.jitter = False, 0.0
         self._noise = ProcessNoise(self.model.robot, dt, self._force, options.force_time, self.adapted)
         self.schedule = FactorSchedule()
         self._strides: ColumnStrides | None = None
@@ -264,7 +270,7 @@ class RodEkf:
         compared = self._comparison(stamp, position, quaternion)
         if isinstance(compared, Update):
             return compared
-        nu, H, S, record = compared
+        nu, H, S, more, record = compared
         dof, R = record.dof, self.tracker.noise
         # 2. What the innovation says of the sizes of tip force, tracker shift and tracker noise.
         if not self.adapted.noisy:
@@ -272,7 +278,7 @@ class RodEkf:
         constants = Constants(self._tolerances.rows(self.factor.theta), self.pi)
         self.pi += self.adapted.adapt(stamp, nu, H, S, R, constants)
         if self._sees_position:
-            changed = H @ self.pi @ H.T + self.adapted.noise * R
+            changed = H @ self.pi @ H.T + self.adapted.noise * R + more
             foretold = position_density(nu, S, R), position_density(nu, changed, R)
             record = record._replace(foretold=foretold)
         # 3. Gate: a single measurement outside is rejected, and so are all that the tracker's state explains.
@@ -282,7 +288,7 @@ class RodEkf:
             if not (self.adapted.sound and self.gate.recovers):
                 return record._replace(reason="outside the gate")
             # 4. After several rejections in a row, inflation until the measurement is plausible.
-            inflated = self.gate.inflate(nu, H, R, self.pi, self.factor.theta.shape[1], self.adapted)
+            inflated = self.gate.inflate(nu, H, R + more, self.pi, self.factor.theta.shape[1], self.adapted)
             if inflated is None:
                 return record._replace(reason="outside the gate, farther than any covariance reaches")
             self.pi = inflated
@@ -291,24 +297,25 @@ class RodEkf:
             )
         # 5. Gain and covariance, then what is left of a shift that is over; correction by both.
         x = self._judge_tolerances(nu, H)
-        x += self._fuse(nu, H, R)
+        x += self._fuse(nu, H, R, more)
         self._end_shift(x)
         self._correct(state, x)
         self.schedule.since_correction = 0
         return record._replace(accepted=True)
 
-    def _fuse(self, nu: Floats, H: Floats, R: Floats) -> Floats:
-        """The correction (r + 22,) by an innovation ``nu`` (k,) of derivative ``H`` (k, r + 22) and stated noise ``R`` (k, k), and the covariance
-        after it: Joseph form."""
+    def _fuse(self, nu: Floats, H: Floats, R: Floats, more: Floats) -> Floats:
+        """The correction (r + 22,) by an innovation ``nu`` (k,) of derivative ``H`` (k, r + 22), noise ``R`` as stated and ``more``, (k, k)
+        each, and the covariance after it: Joseph form."""
+        noise = self.adapted.noise * R + more
         if self.refuted:
-            K, self.pi = gain_beside(len(self.pi) - STATES + DELAY, self.pi, H, self.adapted.noise * R)
+            K, self.pi = gain_beside(len(self.pi) - STATES + DELAY, self.pi, H, noise)
             self.adapted.correct(K, H, R)
             return K @ nu
         size, dof = len(self.pi), len(nu)
         if (size, dof) not in self._filters:
             self._filters[size, dof] = ExtendedKalmanFilter(dim_x=size, dim_z=dof)
         ekf = self._filters[size, dof]
-        ekf.x, ekf.P, ekf.R = np.zeros((size, 1)), self.pi, self.adapted.noise * R
+        ekf.x, ekf.P, ekf.R = np.zeros((size, 1)), self.pi, noise
         ekf.update(nu[:, None], HJacobian=lambda x: H, Hx=lambda x: np.zeros((dof, 1)))
         self.pi = 0.5 * (ekf.P + ekf.P.T)
         self.adapted.correct(ekf.K, H, R)
@@ -365,7 +372,7 @@ class RodEkf:
         compared = self._comparison(stamp, position, quaternion)
         if isinstance(compared, Update):
             return compared
-        nu, _, S, record = compared
+        nu, _, S, _, record = compared
         outside = self.gate.outside(record.nis, record.dof)
         if self._sees_position:
             foretold = position_density(nu, S, self.tracker.noise)
@@ -378,20 +385,26 @@ class RodEkf:
 
     def _comparison(self, stamp: float, position: Floats, quaternion: Floats) -> Update | Comparison:
         """A measurement against the tip of its time; the record alone where there is nothing to compare it with."""
-        tip = self.tracker.observed_tip(self._tip_at, stamp - self.tracker.delay - self.bias[DELAY])
+        time = stamp - self.tracker.delay - self.bias[DELAY]
+        tip = self.tracker.observed_tip(self._tip_at, time)
         if tip is None:
             return Update.impossible("outside the window of stored steps")
         nu, H, S, whitened = self.tracker.innovation(self.bias, tip, self.pi, position, quaternion)
         if not math.isfinite(nu.sum() + S.sum() + whitened.sum()):
             return Update.impossible("the innovation is not finite")
-        if self.adapted.noisy:
-            S += (self.adapted.noise - 1.0) * self.tracker.noise
+        more, steadier, noise, dt = np.zeros_like(S), 0.0, self.tracker.noise, self.simulator.scheme.dt
+        if self.adapted.noisy or self.jitter:
+            S += (self.adapted.noise - 1.0 if self.adapted.noisy else 0.0) * noise
+            if self.jitter:
+                before, at = self._tip_at(time - dt) or tip, len(self.pi) - STATES + DELAY
+                earlier = self.tracker.innovation(self.bias, before, self.pi, position, quaternion)[1]
+                nu, S, more, steadier = with_jitter(nu, S, noise, self.jitter, -H[:, at], -earlier[:, at], dt)
             whitened = np.linalg.solve(np.linalg.cholesky(S), nu)
-        axes = self.tracker.axes
-        residual, variance, white = np.full((3, 6), np.nan)
+        axes, (residual, variance, white) = self.tracker.axes, np.full((3, 6), np.nan)
         residual[axes], variance[axes], white[axes] = nu, S.diagonal(), whitened
         nis = float(whitened @ whitened)
-        return Comparison(nu, H, S, Update(residual, variance, nis, len(nu), False, "", white))
+        record = Update(residual, variance, nis, len(nu), False, "", white, steadier=steadier)
+        return Comparison(nu, H, S, more, record)
 
     def _correct(self, state: State, x: Floats) -> None:
         """Move everything by the correction ``x`` = (a, b) (r + 22,)."""
@@ -454,15 +467,7 @@ class RodEkf:
     def parameters(self, known: bool = True) -> dict[str, dict[str, float | None]]:
         """Value and deviation of every uncertain parameter by its name; no deviations unless they are ``known``."""
         rows = self.factor.theta if known else None
-        sigma: list[float | None] = [None] * len(self.theta)
-        if rows is not None:
-            r = rows.shape[1]
-            variance = np.einsum("ij,jk,ik->i", rows, self.pi[:r, :r], rows)
-            sigma = np.sqrt(np.maximum(variance, 0.0)).tolist()
-        return {
-            name: {"value": float(value), "sigma": deviation}
-            for name, value, deviation in zip(self.uncertainty.names, self.theta, sigma, strict=True)
-        }
+        return values_and_deviations(self.uncertainty.names, self.theta, rows, self.pi)
 
     # -- checkpoints --
 

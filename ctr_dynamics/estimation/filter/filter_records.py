@@ -63,6 +63,7 @@ class Update(NamedTuple):
         white: (6,) residual by the inverse root of its covariance. NaN on axes that are not measured, here and in the others.
         foretold: logarithm of the density of the measured position by what was known before it, and by the variances that it led to; 0 is that of
             the stated noise at its middle. None where it was not compared.
+        steadier: logarithm of that density with half the jitter that is counted on, less that with all of it.
     """
 
     residual: Floats
@@ -73,6 +74,7 @@ class Update(NamedTuple):
     reason: str
     white: Floats
     foretold: tuple[float, float] | None = None
+    steadier: float = 0.0
 
     @classmethod
     def impossible(cls, reason: str) -> Update:
@@ -82,11 +84,13 @@ class Update(NamedTuple):
 
 
 class Comparison(NamedTuple):
-    """A measurement against the tip of its time: innovation ``nu`` (k,), ``H`` (k, r + 22), ``S`` (k, k), and the record of it."""
+    """A measurement against the tip of its time: innovation ``nu`` (k,), ``H`` (k, r + 22), ``S`` (k, k), what of it is ``more`` by jitter, and the
+    record of it."""
 
     nu: Floats
     H: Floats
     S: Floats
+    more: Floats
     record: Update
 
 

@@ -6,13 +6,17 @@ drift) enter the measurement only and are states of their own.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ctr_dynamics.kernels.factor_operations import leaves_range
 from ctr_dynamics.model.model import Model
 from ctr_dynamics.robot import Robot
+
+Floats = NDArray[np.float64]
 
 FORCE = ("tip_force.x", "tip_force.y", "tip_force.z")
 
@@ -167,3 +171,18 @@ def model_uncertainty(model: Model) -> ModelUncertainty:
         ranges.append((-np.inf, np.inf))
     lowest, highest = np.array(ranges).T
     return ModelUncertainty(tuple(names), np.array(sigma), np.array(effect).T, lowest, highest)
+
+
+def values_and_deviations(
+    names: Sequence[str], theta: Floats, rows: Floats | None, pi: Floats
+) -> dict[str, dict[str, float | None]]:
+    """Estimated changes ``theta`` (p,) of parameters by their ``names``, with deviations by ``rows`` (p, r) and the covariance ``pi``, or without."""
+    sigma: list[float | None] = [None] * len(theta)
+    if rows is not None:
+        r = rows.shape[1]
+        variance = np.einsum("ij,jk,ik->i", rows, pi[:r, :r], rows)
+        sigma = np.sqrt(np.maximum(variance, 0.0)).tolist()
+    return {
+        name: {"value": float(value), "sigma": deviation}
+        for name, value, deviation in zip(names, theta, sigma, strict=True)
+    }

@@ -201,14 +201,15 @@ class DelaySearch:
         begun = right_before + now + log_density((begins**2).sum(axis=1), total, noise)
         new = begun > on
         # 5. Or the tracker has been moved just now.
-        moved = self._moved.add(last.moved, residual[present], elapsed, decay, right_before)
+        of_filter = own + self._moved.filter_goes_on(last.filter, last.moved.evidence, elapsed, decay)
+        moved = self._moved.add(last.moved, residual[present], elapsed, decay, right_before, of_filter)
         self._evidence.append(
             Evidence(
                 stamp_ns,
                 last.level + gain * change,
                 before * (1.0 - gain),
                 decay * last.delays + density,
-                self._moved.filter_goes_on(last.filter, last.moved, elapsed, decay) + own,
+                of_filter,
                 np.where(new, begun, on),
                 np.where(new, last.stamp_ns, last.began_ns),
                 residual - (1.0 - gain) * np.where(new[:, None], begins, goes_on),

@@ -8,7 +8,8 @@ A robot that is better than its tolerances is foretold by its open-loop run bett
 with a constant departure, that of a registration within its tolerance, competes too. Where it foretells best, the model does not err. That departure
 may jump: a tracker or sensor that was moved departs suddenly, by any distance, and stays there, which no model does. And it may grow steadily: the
 frame of the tracker moves then (:mod:`~ctr_dynamics.estimation.monitoring.frame_motion`). Noise of a tracker that is noisier than stated is no
-departure of the robot either (:mod:`~ctr_dynamics.estimation.monitoring.noisy_tracker`).
+departure of the robot either (:mod:`~ctr_dynamics.estimation.monitoring.noisy_tracker`), nor are stamps that scatter
+(:mod:`~ctr_dynamics.estimation.monitoring.stamp_jitter`).
 """
 
 from __future__ import annotations
@@ -28,6 +29,7 @@ from ctr_dynamics.estimation.monitoring.frame_motion import FrameMotion
 from ctr_dynamics.estimation.monitoring.moved_tracker import Moved, MovedTracker
 from ctr_dynamics.estimation.monitoring.noisy_tracker import NoisyTracker
 from ctr_dynamics.estimation.monitoring.smooth_departure import SmoothDeparture
+from ctr_dynamics.estimation.monitoring.stamp_jitter import StampJitter
 from ctr_dynamics.estimation.monitoring.taken_again import drop_from
 
 Floats = NDArray[np.float64]
@@ -73,7 +75,8 @@ class Evidence(NamedTuple):
         level: (h + 2, 3) m, as known from the past: the tip's departure for every size and time, one that is constant but for jumps, and the
             position itself of a robot that rests.
         variance: (h + 2,) m^2, of it per axis.
-        departures: (h + 2,) logarithm of the evidence of each; filter: of what the filter foretold; noisy: of a tracker that is noisier than stated.
+        departures: (h + 2,) logarithm of the evidence of each; filter: of what the filter foretold; noisy: of a tracker that is noisier than stated;
+            jitter: of one whose stamps scatter.
         moved: the filter finds such a move later; see :mod:`~ctr_dynamics.estimation.monitoring.moved_tracker`.
         since: (h + 2,) by how much each has foretold better than filter and rest since the time that speaks most for it.
         turned: rad^2, mean square of the rotation between measurements and open-loop run, per axis; weight: of how many measurements.
@@ -86,6 +89,7 @@ class Evidence(NamedTuple):
     filter: float
     moved: Moved
     noisy: float
+    jitter: float
     since: Floats
     turned: float
     weight: float
@@ -102,7 +106,8 @@ class ModelErrorSearch:
         options: when a model error is believed.
 
     Attributes:
-        frame: evidence for a tracker whose frame moves. noisy: for one that is noisier than stated. smooth: for a robot that departs smoothly.
+        frame: evidence for a tracker whose frame moves. noisy: for one that is noisier than stated. jitter: for one whose
+            stamps scatter. smooth: for a robot that departs smoothly.
     """
 
     def __init__(
@@ -130,6 +135,7 @@ class ModelErrorSearch:
         self._moved = MovedTracker(position_noise, length, registered)
         self.frame = FrameMotion(position_noise, length)
         self.noisy = NoisyTracker(position_noise, length, registered)
+        self.jitter = StampJitter(position_noise, registered)
         self.smooth = SmoothDeparture(position_noise, self.sizes, self.times, options.prior, options.memory_s)
         self.clear()
 
@@ -140,16 +146,25 @@ class ModelErrorSearch:
         self._compared: tuple[ModelErrorSize, Floats] | None = None
         self.frame.clear()
         self.noisy.clear()
+        self.jitter.clear()
         self.smooth.clear()
 
     def add(
-        self, stamp_ns: int, position: Floats, residual: Floats, turn: Floats, foretold: tuple[float, float]
+        self,
+        stamp_ns: int,
+        position: Floats,
+        residual: Floats,
+        velocity: Floats,
+        acceleration: Floats,
+        turn: Floats,
+        foretold: tuple[float, float],
     ) -> None:
         """Take in a measured tip that the filter has met; one of a stamp that is known takes its place.
 
         Args:
             stamp_ns: of its header.
-            position: (3,) m, measured. residual: (3,) m, measured minus open-loop tip. turn: (a,) rad, rotation between them about the measured axes.
+            position: (3,) m, measured. residual: (3,) m, measured minus open-loop tip, whose ``velocity`` (3,) m/s that was.
+            turn: (a,) rad, rotation between them about the measured axes.
             foretold: what the filter foretold; see :class:`~ctr_dynamics.estimation.filter.filter_records.Update`.
         """
         drop_from(self._evidence, stamp_ns)
@@ -166,7 +181,7 @@ class ModelErrorSearch:
             variance = (1.0 - gain) * square
             moved = self._moved.begin(residual)
             self._evidence.append(
-                Evidence(stamp_ns, level, variance, none, 0.0, moved, -math.inf, none, angle, 1.0)
+                Evidence(stamp_ns, level, variance, none, 0.0, moved, -math.inf, -math.inf, none, angle, 1.0)
             )
             return
         # 1. The departure decays and gets new randomness.
@@ -192,10 +207,12 @@ class ModelErrorSearch:
         if self._span(stamp_ns) < options.learning_s:
             decay = own = 0.0
             density[:] = 0.0
-            moved, right = self._moved.begin(residual), 0.0
+            moved, of_filter = self._moved.begin(residual), own
         else:
-            moved = self._moved.add(last.moved, residual, elapsed, decay, decay * self._file_right(last))
-            right = self._moved.filter_goes_on(last.filter, last.moved, elapsed, decay)
+            right = decay * self._file_right(last)
+            fault = float(np.logaddexp.reduce([last.moved.evidence, last.noisy, last.jitter]))
+            of_filter = own + self._moved.filter_goes_on(last.filter, fault, elapsed, decay)
+            moved = self._moved.add(last.moved, residual, elapsed, decay, right, of_filter)
         weight = decay * last.weight + 1.0
         self._evidence.append(
             Evidence(
@@ -203,9 +220,10 @@ class ModelErrorSearch:
                 level + gain[:, None] * change,
                 before * (1.0 - gain),
                 decay * last.departures + density,
-                right + own,
+                of_filter,
                 moved,
                 self.noisy.add(stamp_ns, residual) if decay else -math.inf,
+                self.jitter.add(stamp_ns, residual, velocity, acceleration) if decay else -math.inf,
                 np.maximum(last.since + density - max(own, density[REST]), 0.0),
                 last.turned + (angle - last.turned) / weight,
                 weight,
@@ -262,7 +280,7 @@ class ModelErrorSearch:
     @staticmethod
     def _file_right(last: Evidence) -> float:
         """Logarithm of the evidence of a robot whose file is right, by a tracker of any noise."""
-        ways = last.filter, last.moved.evidence, last.departures[CONSTANT], last.noisy
+        ways = last.filter, last.moved.evidence, last.departures[CONSTANT], last.noisy, last.jitter
         return float(np.logaddexp.reduce(ways))
 
     def found(self, present: ModelErrorSize) -> ModelErrorSize | None:
@@ -277,6 +295,19 @@ class ModelErrorSearch:
         turned = self._evidence[-1].turned - self._rotation_noise**2
         rotation = max(math.sqrt(max(turned, 0.0)), present.rotation)
         return ModelErrorSize(float(self.sizes[best]), rotation, float(self.times[best]))
+
+    def stamp_jitter(self, present_s: float) -> tuple[float, float]:
+        """Probability that stamps scatter by more than ``present_s`` (s), which the filter counts on, and by how much most likely."""
+        if not self._evidence:
+            return 0.0, present_s
+        last, sizes, evidence = self._evidence[-1], self.jitter.sizes, self.jitter.evidence
+        more = sizes > max(math.sqrt(self.jitter.options.steps) * present_s, 0.0)
+        likely = np.where(more, evidence, -np.inf)
+        sound = [last.filter, last.moved.evidence, last.departures[CONSTANT], last.noisy]
+        departs = np.logaddexp.reduce([*last.departures[:CONSTANT], *self.smooth.evidence]) + self._prior
+        others = [*sound, *evidence[sizes == 0.0], departs, self.frame.moving, self.frame.still]
+        odds = np.logaddexp.reduce(likely) - np.logaddexp.reduce(others)
+        return 1.0 / (1.0 + math.exp(min(-odds, 700.0))), float(sizes[likely.argmax()])
 
     @property
     def astray(self) -> bool:
@@ -298,9 +329,10 @@ class ModelErrorSearch:
             self._evidence.append(last._replace(since=np.zeros_like(last.since)))
 
     def begin_again(self) -> None:
-        """The filter goes on from the open-loop run with the model error that was found, and foretells as well as that has done."""
+        """The filter goes on from the open-loop run with the model error or the jitter that was found, and foretells as well as that has done."""
         self.forgive()
         if self._evidence:
             self._compared = None
             last = self._evidence.pop()
-            self._evidence.append(last._replace(filter=float(max(last.filter, last.departures[:REST].max()))))
+            best = max(last.filter, last.departures[:REST].max(), self.jitter.evidence.max())
+            self._evidence.append(last._replace(filter=float(best)))

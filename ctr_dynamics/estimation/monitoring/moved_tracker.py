@@ -67,31 +67,34 @@ class MovedTracker:
         """What the first measurement says, which lies ``residual`` (3,) m from the open-loop tip."""
         return Moved(residual, self._noise, -math.inf)
 
-    def add(self, last: Moved, residual: Floats, elapsed: float, decay: float, before: float) -> Moved:
+    def add(
+        self, last: Moved, residual: Floats, elapsed: float, decay: float, before: float, now: float
+    ) -> Moved:
         """What the measurements say with another one, ``elapsed`` s after the ``last``.
 
         Args:
             residual: (3,) m, measured minus open-loop tip.
             decay: part of the evidence so far that counts.
             before: logarithm of the evidence of a tracker that had not been moved yet, as it counts now.
+            now: that of the filter, with this measurement.
         """
         # 1. It has been moved before.
         walked = last.variance + self._noise * elapsed / self.options.drift_s
         stays = residual - last.level
         on = decay * last.evidence + log_density(stays @ stays, walked + self._noise, self._noise)
-        # 2. Or since the last one.
+        # 2. Or since the last one; or it is where it was, and a fault that is over has led the filter astray.
         moves = math.log(-math.expm1(-elapsed / self.options.sound_s))
         there = [log_density(residual @ residual, square, self._noise) for square in self._places]
-        now = before + moves + float(np.logaddexp(*there)) - math.log(len(there))
-        if now > on:
-            return Moved(residual, self._noise, now)
+        begins = moves + max(before + float(np.logaddexp(*there)) - math.log(len(there)), now)
+        if begins > on:
+            return Moved(residual, self._noise, begins)
         gain = walked / (walked + self._noise)
         return Moved(last.level + gain * stays, walked * (1.0 - gain), on)
 
-    def filter_goes_on(self, filter_before: float, last: Moved, elapsed: float, decay: float) -> float:
-        """Logarithm of the evidence of the filter before a measurement, ``elapsed`` s after the ``last``, if it may have found the move since then.
+    def filter_goes_on(self, filter_before: float, fault: float, elapsed: float, decay: float) -> float:
+        """Logarithm of the evidence of the filter before a measurement, ``elapsed`` s after the last, if it may have got over a fault since then.
 
-        ``filter_before``: up to the last one.
+        ``filter_before``: up to the last one; ``fault``: likewise, of the fault of the tracker.
         """
-        found = math.log(-math.expm1(-elapsed / self.options.found_s))
-        return float(np.logaddexp(decay * filter_before, decay * last.evidence + found))
+        over = math.log(-math.expm1(-elapsed / self.options.found_s))
+        return float(np.logaddexp(decay * filter_before, decay * fault + over))
