@@ -7,7 +7,9 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from ctr_dynamics.diagnosis.diagnosis_options import DiagnosisOptions
 from ctr_dynamics.diagnosis.forward_model import ForwardModel
+from ctr_dynamics.diagnosis.inference import evidence
 from ctr_dynamics.diagnosis.inference.discrepancy import (
     CorrelatedNoise,
     CorrelatedProblem,
@@ -18,6 +20,7 @@ from ctr_dynamics.diagnosis.inference.evidence import take_away
 from ctr_dynamics.diagnosis.inference.fit_problem import make_problem
 from ctr_dynamics.diagnosis.inference.gaussian_posterior import tail_gain
 from ctr_dynamics.diagnosis.inference.map_fit import fit
+from ctr_dynamics.diagnosis.run_context import RunContext
 
 SEEDS = range(12)
 
@@ -165,3 +168,31 @@ def test_a_cause_beside_a_discrepancy_takes_away_what_remains(left_m, expected):
     ]
     counts = take_away(asked, 0.5)
     assert [names for names, there in zip(left_m, counts, strict=True) if there] == expected
+
+
+def test_priors_count_in_full_and_evidence_by_its_temperature(monkeypatch):
+    """With a discrepancy as good as each hypothesis by itself, odds are those of the priors where evidence is the same."""
+    priors = {"": 0.6, "a": 0.3, "b": 0.1}
+    gained = {"": 0.0, "a": 0.0, "b": 4.0}
+    beside = SimpleNamespace(process=None, rms_m=1e-3, log_evidence=0.0)
+    monkeypatch.setattr(evidence, "every_process", lambda problem, context: [None])
+    monkeypatch.setattr(evidence, "discrepancy_of", lambda *arguments: beside)
+    monkeypatch.setattr(evidence, "log_prior", lambda members, pool, o: np.log(priors[members]))
+    monkeypatch.setattr(evidence, "_refit_likeliest", lambda *arguments: None)
+    asked = [
+        SimpleNamespace(
+            members=names, keys=frozenset(names), effects=tuple(names), fit=None, discrepancy=None,
+            fitted_score=gained[names] + np.log(priors[names]),
+        )
+        for names in priors
+    ]  # fmt: skip
+    options = DiagnosisOptions()
+    found = SimpleNamespace(best=asked[2], no_cause=asked[0], hypotheses=asked, pool=[])
+    weighed = evidence.weigh_discrepancy(found, SimpleNamespace(options=options), RunContext(workers=1))
+    alone = dict(weighed.alone)
+    assert alone[()] / alone["a",] == pytest.approx(2.0)
+    gain = np.exp(4.0 / options.evidence.temperature)
+    assert alone["b",] / alone["a",] == pytest.approx(gain / 3.0)
+    outside = options.prior.discrepancy
+    assert dict(weighed.beside)[()] / alone[()] == pytest.approx(outside / (1.0 - outside))
+    assert weighed.leading is asked[2]

@@ -2,6 +2,7 @@
 
 import copy
 from dataclasses import replace
+from math import comb
 
 import numpy as np
 import pytest
@@ -71,10 +72,10 @@ def test_correlated_noise_is_told_from_white():
     assert size[0.0] <= 0.3 < size[3.0]
 
 
-def test_prior_of_a_choice_sums_to_one():
-    from math import comb
-
-    assert sum(comb(6, k) * np.exp(log_choice(k, 6)) for k in range(7)) == pytest.approx(1.0)
+@pytest.mark.parametrize("columns", [1, 2, 6])
+def test_prior_of_a_choice_sums_to_one(columns):
+    every = sum(comb(columns, k) * np.exp(log_choice(k, columns)) for k in range(columns + 1))
+    assert every == pytest.approx(1.0)
 
 
 def test_smoothing_leaves_the_noise():

@@ -1,6 +1,7 @@
 """What the filter does with masks, outliers, geometry of the tracker, switched-off fusion; and that it repeats itself."""
 
 import copy
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -198,6 +199,32 @@ def test_fusion_off_is_the_model_alone(release):
     assert run.estimator.summary()["residual_rms_m"]["fused"] is None
     open_loop = play([m for m in release if m.kind != "pose"])
     assert np.abs(run.column("tip_position") - open_loop.column("tip_position")).max() < 1e-6
+
+
+@pytest.mark.parametrize("scale", [0.0, 1.0])
+def test_the_last_node_of_the_backbone_moves_as_the_tip_does_while_tubes_are_inserted(scale):
+    """Whether the model has the terms of moving tubes or not. Nodes of the grid then move by themselves, each at its own speed."""
+
+    own = robot_to_dict(load_robot("till2020_tissue"))
+    robot = robot_from_dict({**own, "extensions": {"insertion_velocity": {"scale": scale}}})
+
+    def inserted(m):
+        if m.kind != "joints":
+            return m
+        names, values = m.content
+        step = 1e-3 * (1.0 - math.cos(3e-9 * m.stamp))
+        return replace(
+            m,
+            content=(
+                names,
+                [v + step * n.endswith("translation") for n, v in zip(names, values, strict=True)],
+            ),
+        )
+
+    run = play([inserted(m) for m in bag_messages("clean_sweep", 3.0) if m.kind != "pose"], robot=robot)
+    assert np.ptp(run.column("beta")[:, 0]) > 1e-3
+    moves = run.column("backbone")[:, -1, 8:11]
+    np.testing.assert_allclose(moves, run.column("tip_velocity")[:, :3], atol=1e-4)
 
 
 def test_predicted_pose_is_never_corrected(release, plain):
