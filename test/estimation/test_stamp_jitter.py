@@ -9,6 +9,7 @@ from estimation_cases import bag_messages, play, truth_error
 from ctr_dynamics.estimation.filter.jitter_noise import jitter_noise
 from ctr_dynamics.estimation.monitoring.end_of_jitter import ODDS, EndOfJitter
 from ctr_dynamics.estimation.monitoring.stamp_jitter import StampJitter
+from ctr_dynamics.kernels.jitter_update import correct_departures
 
 NOISE, REGISTERED, HERTZ = 2.5e-4, 1e-3, 5.6
 FREQUENCY = 2.0 * math.pi * HERTZ
@@ -89,6 +90,26 @@ def test_less_jitter_is_noticed_and_the_same_is_not():
             ends.add(25_000_000 * k, density(value, 0.5 * deviation) - density(value, deviation))
         assert ends.less == less
     assert ODDS > 200
+
+
+def test_the_kernel_is_its_numpy_twin():
+    rng, sizes, noise, freedom = np.random.default_rng(7), np.array([0.0, 0.004, 0.02]), NOISE**2, 3.0
+    level, factor = 1e-3 * rng.standard_normal((3, 3)), 1e-3 * rng.standard_normal((3, 3, 3))
+    covariance = factor @ factor.transpose(0, 2, 1)
+    residual, velocity, acceleration = motion = rng.standard_normal((3, 3)) * [[1e-3], [0.3], [20.0]]
+    found_level, found_covariance, density = level.copy(), covariance.copy(), np.empty(3)
+    correct_departures(found_level, found_covariance, sizes, motion, noise, freedom, density)
+    for s, P, m, d, new_P, new_m in zip(
+        sizes, covariance, level, density, found_covariance, found_level, strict=True
+    ):
+        mean, more = jitter_noise(s, velocity, acceleration)
+        N, change = noise * np.eye(3) + more, residual - m - mean
+        square = change @ np.linalg.solve(P + N, change)
+        log_det = np.linalg.slogdet((P + N) / noise)[1]
+        assert d == pytest.approx(-0.5 * (log_det + (freedom + 3.0) * np.log1p(square / freedom)))
+        K = P @ np.linalg.inv(P + N * (freedom + square) / (freedom + 3.0))
+        np.testing.assert_allclose(new_m, m + K @ change)
+        np.testing.assert_allclose(new_P, P - K @ P, atol=1e-14)
 
 
 @pytest.mark.parametrize("jitter", [0.003, 0.01])

@@ -144,6 +144,7 @@ class ModelErrorSearch:
         self._evidence: deque[Evidence] = deque(maxlen=self.options.remembered)
         self._begin_ns = 0
         self._compared: tuple[ModelErrorSize, Floats] | None = None
+        self._scatter: tuple[float, tuple[float, float]] | None = None
         self.frame.clear()
         self.noisy.clear()
         self.jitter.clear()
@@ -168,7 +169,7 @@ class ModelErrorSearch:
             foretold: what the filter foretold; see :class:`~ctr_dynamics.estimation.filter.filter_records.Update`.
         """
         drop_from(self._evidence, stamp_ns)
-        self._compared = None
+        self._compared = self._scatter = None
         noise, square = self._noise**2, self._variances
         angle = float(turn @ turn) / len(turn) if len(turn) else 0.0
         observed = np.repeat(residual[None], len(square), axis=0)
@@ -298,11 +299,15 @@ class ModelErrorSearch:
 
     def stamp_jitter(self, present_s: float) -> tuple[float, float]:
         """Probability that stamps scatter by more than ``present_s`` (s), which the filter counts on, and by how much most likely."""
+        if self._scatter is None or self._scatter[0] != present_s:
+            self._scatter = present_s, self._compare_jitter(present_s)
+        return self._scatter[1]
+
+    def _compare_jitter(self, present_s: float) -> tuple[float, float]:
         if not self._evidence:
             return 0.0, present_s
         last, sizes, evidence = self._evidence[-1], self.jitter.sizes, self.jitter.evidence
-        more = sizes > max(math.sqrt(self.jitter.options.steps) * present_s, 0.0)
-        likely = np.where(more, evidence, -np.inf)
+        likely = np.where(sizes > math.sqrt(self.jitter.options.steps) * present_s, evidence, -np.inf)
         sound = [last.filter, last.moved.evidence, last.departures[CONSTANT], last.noisy]
         departs = np.logaddexp.reduce([*last.departures[:CONSTANT], *self.smooth.evidence]) + self._prior
         others = [*sound, *evidence[sizes == 0.0], departs, self.frame.moving, self.frame.still]
@@ -332,7 +337,7 @@ class ModelErrorSearch:
         """The filter goes on from the open-loop run with the model error or the jitter that was found, and foretells as well as that has done."""
         self.forgive()
         if self._evidence:
-            self._compared = None
+            self._compared = self._scatter = None
             last = self._evidence.pop()
             best = max(last.filter, last.departures[:REST].max(), self.jitter.evidence.max())
             self._evidence.append(last._replace(filter=float(best)))

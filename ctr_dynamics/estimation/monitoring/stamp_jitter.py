@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctr_dynamics.estimation.monitoring.taken_again import drop_from
+from ctr_dynamics.kernels.jitter_update import correct_departures
 
 Floats = NDArray[np.float64]
 
@@ -78,6 +79,9 @@ class StampJitter:
         self.sizes = np.tile(sizes, len(options.drifts_s))
         self._drifts = np.repeat(np.array(options.drifts_s), count)
         self._noise, self._registered = noise**2, registered**2
+        half = 0.5 * options.freedom
+        # Student's density at zero, by that of a normal one of the same scale
+        self._peak = math.lgamma(half + 1.5) - math.lgamma(half) - 1.5 * math.log(half)
         self.clear()
 
     def clear(self) -> None:
@@ -93,42 +97,23 @@ class StampJitter:
         """
         known, options = self._known, self.options
         drop_from(known, stamp_ns)
-        count, unit = len(self.sizes), np.eye(3)
+        count = len(self.sizes)
         last = known[-1] if known else Jitter(
-            stamp_ns, np.zeros((count, 3)), np.tile(self._registered * unit, (count, 1, 1)),
+            stamp_ns, np.zeros((count, 3)), np.tile(self._registered * np.eye(3), (count, 1, 1)),
             np.full(count, math.log(options.prior / count)),
         )  # fmt: skip
         elapsed = (stamp_ns - last.stamp_ns) * 1e-9
-        before = last.covariance + (self._noise * elapsed / self._drifts)[:, None, None] * unit
-        # a stamp that is off by tau: -v tau + a tau^2 / 2
-        square = self.sizes[:, None, None] ** 2
-        way = square * np.multiply.outer(velocity, velocity) + 0.5 * square**2 * np.multiply.outer(
-            acceleration, acceleration
-        )
-        noise = self._noise * unit + way
-        total = before + noise
-        change = residual - last.level - 0.5 * self.sizes[:, None] ** 2 * acceleration
-        white = np.linalg.solve(total, change[:, :, None])[:, :, 0]
-        distance = (change * white).sum(axis=1)
-        nu = options.freedom
-        density = (
-            self._peak
-            - 0.5 * np.log(np.linalg.det(total / self._noise))
-            - 0.5 * (nu + 3.0) * np.log1p(distance / nu)
-        )
-        weight = (nu + 3.0) / (nu + distance)
-        gain = before @ np.linalg.inv(before + noise / weight[:, None, None])
+        level, covariance, density = last.level.copy(), last.covariance.copy(), np.empty(count)
+        covariance[:, range(3), range(3)] += (self._noise * elapsed / self._drifts)[:, None]
+        motion = np.stack([residual, velocity, acceleration])
+        correct_departures(level, covariance, self.sizes, motion, self._noise, options.freedom, density)
         # evidence of the past counts less and less, the prior does not
         prior = math.log(options.prior / count)
-        evidence = prior + math.exp(-elapsed / options.memory_s) * (last.evidence - prior) + density
-        level = last.level + (gain @ change[:, :, None])[:, :, 0]
-        known.append(Jitter(stamp_ns, level, before - gain @ before, evidence))
+        evidence = (
+            prior + math.exp(-elapsed / options.memory_s) * (last.evidence - prior) + density + self._peak
+        )
+        known.append(Jitter(stamp_ns, level, covariance, evidence))
         return float(np.logaddexp.reduce(evidence))
-
-    @property
-    def _peak(self) -> float:
-        half = 0.5 * self.options.freedom
-        return math.lgamma(half + 1.5) - math.lgamma(half) - 1.5 * math.log(half)
 
     @property
     def evidence(self) -> Floats:
