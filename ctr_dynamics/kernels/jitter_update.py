@@ -13,6 +13,27 @@ compiled = njit(cache=True, nogil=True, error_model="numpy")
 
 
 @compiled
+def sum_root(P, factor, N, L):
+    """Fill the lower root ``L`` (3, 3) of ``P`` + ``factor`` ``N``."""
+    for i in range(3):
+        for j in range(i + 1):
+            total = P[i, j] + factor * N[i, j]
+            for k in range(j):
+                total -= L[i, k] * L[j, k]
+            L[i, j] = math.sqrt(total) if i == j else total / L[j, j]
+
+
+@compiled
+def solve_lower(L, values, solved):
+    """Fill ``solved`` (3,) with L^-1 ``values``."""
+    for i in range(3):
+        total = values[i]
+        for k in range(i):
+            total -= L[i, k] * solved[k]
+        solved[i] = total / L[i, i]
+
+
+@compiled
 def correct_departures(level, covariance, sizes, motion, noise, freedom, density):
     """Correct every row of ``level`` (s, 3) and ``covariance`` (s, 3, 3), in place, by a measured departure.
 
@@ -30,38 +51,18 @@ def correct_departures(level, covariance, sizes, motion, noise, freedom, density
                 way = motion[1, i] * motion[1, j] + 0.5 * variance * motion[2, i] * motion[2, j]
                 N[i, j] = variance * way + (noise if i == j else 0.0)
         # 1. The density, by P + N = L L^T
+        sum_root(covariance[s], 1.0, N, L)
+        solve_lower(L, change, white)
         square = log_det = 0.0
         for i in range(3):
-            value = change[i]
-            for j in range(i + 1):
-                total = covariance[s, i, j] + N[i, j]
-                for k in range(j):
-                    total -= L[i, k] * L[j, k]
-                L[i, j] = math.sqrt(total) if i == j else total / L[j, j]
-            for j in range(i):
-                value -= L[i, j] * white[j]
-            white[i] = value / L[i, i]
             square += white[i] * white[i]
             log_det += math.log(L[i, i] * L[i, i] / noise)
         density[s] = -0.5 * (log_det + (freedom + 3.0) * math.log1p(square / freedom))
         # 2. The gain, with noise that is larger for what lies far out: P + N / w = L L^T, K = P L^-T
-        larger = (freedom + square) / (freedom + 3.0)
+        sum_root(covariance[s], (freedom + square) / (freedom + 3.0), N, L)
+        solve_lower(L, change, white)
         for i in range(3):
-            for j in range(i + 1):
-                total = covariance[s, i, j] + larger * N[i, j]
-                for k in range(j):
-                    total -= L[i, k] * L[j, k]
-                L[i, j] = math.sqrt(total) if i == j else total / L[j, j]
-        for i in range(3):
-            value = change[i]
-            for j in range(i):
-                value -= L[i, j] * white[j]
-            white[i] = value / L[i, i]
-            for j in range(3):
-                total = covariance[s, i, j]
-                for k in range(j):
-                    total -= K[i, k] * L[j, k]
-                K[i, j] = total / L[j, j]
+            solve_lower(L, covariance[s, i], K[i])
         for i in range(3):
             for j in range(3):
                 level[s, i] += K[i, j] * white[j]

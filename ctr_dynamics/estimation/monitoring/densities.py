@@ -15,6 +15,12 @@ def log_density(square: Any, variance: Any, noise: float) -> Any:
     return -0.5 * (square / variance + 3.0 * np.log(variance / noise))
 
 
+def student_peak(freedom: float) -> float:
+    """Logarithm of Student's density of ``freedom`` degrees in three dimensions at zero, by that of a normal one of the same scale."""
+    half = 0.5 * freedom
+    return math.lgamma(half + 1.5) - math.lgamma(half) - 1.5 * math.log(half)
+
+
 def density_of_filter(foretold: tuple[float, float], changes: float) -> float:
     """Logarithm of the density that a filter gave to a measured position, of which it ``foretold`` one for either case.
 

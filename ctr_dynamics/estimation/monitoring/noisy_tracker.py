@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ctr_dynamics.estimation.monitoring.densities import student_peak
 from ctr_dynamics.estimation.monitoring.taken_again import drop_from
 
 Floats = NDArray[np.float64]
@@ -92,7 +93,7 @@ class NoisyTracker:
         change, total = residual - last.level, last.variance + self._squares
         square = (change**2).sum(axis=1) / total
         density = (
-            self._peak
+            student_peak(freedom)
             - 1.5 * np.log(total / self._stated)
             - 0.5 * (freedom + 3.0) * np.log1p(square / freedom)
         )
@@ -105,9 +106,3 @@ class NoisyTracker:
             Noise(stamp_ns, last.level + gain[:, None] * change, last.variance * (1.0 - gain), evidence)
         )
         return float(np.logaddexp.reduce(evidence)) + math.log(options.prior / count)
-
-    @property
-    def _peak(self) -> float:
-        """Logarithm of Student's density in three dimensions at zero, by that of a normal one of the same scale."""
-        half = 0.5 * self.options.freedom
-        return math.lgamma(half + 1.5) - math.lgamma(half) - 1.5 * math.log(half)

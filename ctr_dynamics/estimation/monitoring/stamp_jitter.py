@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ctr_dynamics.estimation.monitoring.densities import student_peak
 from ctr_dynamics.estimation.monitoring.taken_again import drop_from
 from ctr_dynamics.kernels.jitter_update import correct_departures
 
@@ -50,7 +51,7 @@ class Jitter(NamedTuple):
     """What the measurements up to ``stamp_ns`` say of every size.
 
     Attributes:
-        level: (s, 3) m, the departure, which drifts. covariance: (s, 3, 3) m^2, of it. evidence: (s,) logarithm, with the prior.
+        level: (s, 3) m, the departure, which drifts. covariance: (s, 3, 3) m^2, of it. evidence: (s,) logarithm.
     """
 
     stamp_ns: int
@@ -79,9 +80,7 @@ class StampJitter:
         self.sizes = np.tile(sizes, len(options.drifts_s))
         self._drifts = np.repeat(np.array(options.drifts_s), count)
         self._noise, self._registered = noise**2, registered**2
-        half = 0.5 * options.freedom
-        # Student's density at zero, by that of a normal one of the same scale
-        self._peak = math.lgamma(half + 1.5) - math.lgamma(half) - 1.5 * math.log(half)
+        self._prior = math.log(options.prior / len(self.sizes))
         self.clear()
 
     def clear(self) -> None:
@@ -100,22 +99,19 @@ class StampJitter:
         count = len(self.sizes)
         last = known[-1] if known else Jitter(
             stamp_ns, np.zeros((count, 3)), np.tile(self._registered * np.eye(3), (count, 1, 1)),
-            np.full(count, math.log(options.prior / count)),
+            np.zeros(count),
         )  # fmt: skip
         elapsed = (stamp_ns - last.stamp_ns) * 1e-9
         level, covariance, density = last.level.copy(), last.covariance.copy(), np.empty(count)
         covariance[:, range(3), range(3)] += (self._noise * elapsed / self._drifts)[:, None]
         motion = np.stack([residual, velocity, acceleration])
         correct_departures(level, covariance, self.sizes, motion, self._noise, options.freedom, density)
-        # evidence of the past counts less and less, the prior does not
-        prior = math.log(options.prior / count)
-        evidence = (
-            prior + math.exp(-elapsed / options.memory_s) * (last.evidence - prior) + density + self._peak
-        )
+        decay = math.exp(-elapsed / options.memory_s)
+        evidence = decay * last.evidence + density + student_peak(options.freedom)
         known.append(Jitter(stamp_ns, level, covariance, evidence))
-        return float(np.logaddexp.reduce(evidence))
+        return float(np.logaddexp.reduce(evidence)) + self._prior
 
     @property
     def evidence(self) -> Floats:
         """(s,) logarithm of the evidence of every size, its prior included."""
-        return self._known[-1].evidence if self._known else np.full(len(self.sizes), -math.inf)
+        return self._known[-1].evidence + self._prior if self._known else np.full(len(self.sizes), -math.inf)
