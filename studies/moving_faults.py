@@ -143,6 +143,29 @@ def scattered(deviation_s: float) -> Edit:
     return change
 
 
+def smoothed(time_s: float) -> Edit:
+    """Poses that a driver passes through a low-pass filter of that time constant."""
+
+    def change(messages: Messages) -> Messages:
+        state: list[tuple[int, Floats]] = []
+
+        def slow(p: cdr.PoseIn) -> cdr.PoseIn:
+            now = np.array([*p.position, *p.quaternion_xyzw])
+            if state:
+                before_ns, before = state[-1]
+                now[3:] *= math.copysign(1.0, float(now[3:] @ before[3:]))
+                now = before - math.expm1(-(p.stamp_ns - before_ns) * 1e-9 / time_s) * (now - before)
+            state[:] = [(p.stamp_ns, now)]
+            x, y, z = now[:3].tolist()
+            i, j, k, w = (now[3:] / np.linalg.norm(now[3:])).tolist()
+            return p._replace(position=(x, y, z), quaternion_xyzw=(i, j, k, w))
+
+        edit = pose(slow)
+        return [n for m in messages for n in (edit(m) if m.topic == T else [m])]
+
+    return change
+
+
 def one_joint_state(edit: Callable[[RawMessage], RawMessage]) -> Edit:
     """The joint state in the middle of the span changed."""
 
@@ -207,6 +230,7 @@ FAULTS: dict[str, tuple[Edit, float]] = {  # the change, and when it ends (s); i
     "poses of 1e160 for 2 s": (in_span(T, pose(huge)), END_S),
     "poses 80 ms late, not told": (late(0.08), math.inf),
     "stamps that scatter by 5 ms": (scattered(0.005), math.inf),
+    "a low-pass filter of 60 ms on the poses": (smoothed(0.06), math.inf),
     "latency that jumps by 60 ms": (late(0.06, BEGIN_S), math.inf),
     "joints stopped for 1 s": (stopped, BEGIN_S + 1.0),
     "an encoder slips by 0.2 rad": (in_span(J, turned_on(0.2), math.inf), math.inf),

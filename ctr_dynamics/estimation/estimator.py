@@ -423,7 +423,8 @@ class Estimator:
             return self._invalid(k, too_old, innovations)
         fused.inflate_covariance(tip, self.runs.open_loop, self._largest_deviation)
         self._unexpected.inflate(tip.covariance, stamp)
-        self._twist_error.inflate(tip, stamp, open_loop, fused.ekf, self.inputs.joint_period_s)
+        modes = self._modes.measure(fused.state, k)
+        self._twist_error.inflate(tip, stamp, open_loop, fused.ekf, self.inputs.periods_s, modes)
         self._driven_m = self.inputs.actuator_error.inflate(
             tip.covariance, tip.position, self._length, stamp, late.lag * STEP_NS
         )
@@ -432,7 +433,7 @@ class Estimator:
         problem = health.problem = self._problem(stamp, tip.position_deviation, unsettled)
         return StepOutput(
             stamp, k, not problem, problem, tip.position, tip.quaternion, tip.covariance[:6, :6], tip.twist, tip.covariance[6:, 6:],
-            predicted[:3], predicted[3:], self._backbone.rows(fused.state), self._modes.measure(fused.state, k), fused.ekf.force,
+            predicted[:3], predicted[3:], self._backbone.rows(fused.state), modes, fused.ekf.force,
             tip.force_sigma, innovations, SolverStats(result.iterations, result.sweeps, result.reason),
             fused.state.inputs.beta.tolist(), self._jacobian.measure(fused.state),
         )  # fmt: skip
@@ -454,7 +455,7 @@ class Estimator:
             return unsettled
         deviations = Deviations(deviation, self._driven_m, self._largest_deviation)
         fused = self.runs.fused
-        return deviations.problem(self.health, fused.delay_search.apart if fused.late else None)
+        return deviations.problem(self.health, fused.timing.late.apart if fused.late else None)
 
     def _look_for_motion(self) -> None:
         """Have outputs wait after a gap of the joints, or after a start, in which the robot moved."""

@@ -14,13 +14,14 @@ from ctr_dynamics.estimation.filter.filter_records import FilterState, TipEstima
 from ctr_dynamics.estimation.inputs.input_buffer import InputBuffer
 from ctr_dynamics.estimation.inputs.measurement_queue import DueMeasurement
 from ctr_dynamics.estimation.inputs.run_inputs import InterpolatedInputs, RunInputs
-from ctr_dynamics.estimation.monitoring.delay_search import CLOCK_BEHIND, DelaySearch
 from ctr_dynamics.estimation.monitoring.densities import allowance
 from ctr_dynamics.estimation.monitoring.disagreement import Disagreement
 from ctr_dynamics.estimation.monitoring.end_of_jitter import EndOfJitter
 from ctr_dynamics.estimation.monitoring.health import Health
 from ctr_dynamics.estimation.monitoring.innovation_log import InnovationLog
 from ctr_dynamics.estimation.monitoring.model_error_search import ModelErrorSearch
+from ctr_dynamics.estimation.monitoring.response_search import in_words
+from ctr_dynamics.estimation.monitoring.tracker_timing import TrackerTiming
 from ctr_dynamics.estimation.open_loop import OpenLoopRun
 from ctr_dynamics.estimation.step_output import (
     FUSION_OFF,
@@ -79,8 +80,7 @@ class FusedRun:
         file = ekf.tracker.state_sigma
         registered = math.hypot(file[TRANSLATION].max(), length * file[ROTATION].max())
         moves = noise.position.value, ekf.options.force_change, length, registered
-        self.delay_search = DelaySearch(*moves)
-        self.clock_search = DelaySearch(*moves, CLOCK_BEHIND)
+        self.timing = TrackerTiming(*moves)
         self.disagreement = Disagreement(noise.position.value)
         self.end_of_jitter = EndOfJitter()
         self.model_error_search = ModelErrorSearch(
@@ -99,8 +99,7 @@ class FusedRun:
     def clear(self) -> None:
         """Have no state, and the parameters of the robot file."""
         self.ekf.forget_parameters()
-        self.delay_search.clear()
-        self.clock_search.clear()
+        self.timing.clear()
         self.model_error_search.clear()
         self.disagreement.clear()
         self.end_of_jitter.clear()
@@ -146,10 +145,11 @@ class FusedRun:
             if motion is not None and update.foretold is not None:
                 self._apart = motion.residual
                 self.end_of_jitter.add(measurement.stamp_ns, update.steadier)
-                own_s = time_s - self.ekf.tracker.age
-                tips = open_loop.tips.positions()
-                for search in (self.delay_search, self.clock_search):
-                    search.add(measurement.stamp_ns, own_s, seen, *tips, update.foretold, self.ekf.delay)
+                expected, tips = self.ekf.expected, open_loop.tips.positions()
+                newest_s = time_s - expected.model.delay
+                self.timing.add(
+                    measurement.stamp_ns, newest_s, seen, tips, update.foretold, expected, self.ekf.delay
+                )
                 self.model_error_search.add(
                     measurement.stamp_ns,
                     seen,
@@ -184,7 +184,7 @@ class FusedRun:
     ) -> tuple[MotionPoint | None, Floats | None]:
         """How far a measurement lies from both runs, before its update: the open-loop run there, and the residual (3,) m of the fused tip."""
         tracker, inputs, n = self.ekf.tracker, self._inputs, self.ekf.model.n
-        own_s = time_s - tracker.delay - self.ekf.expected_delay
+        own_s = time_s - tracker.delay - self.ekf.expected.delay
         fused = tracker.observed_tip(lambda s: self.ekf.tips.at(s, DT, columns=False), own_s)
         found = open_loop.observed(tracker, own_s)
         if fused is None or found is None:
@@ -193,7 +193,7 @@ class FusedRun:
         position, _ = tracker.to_base(position, quaternion, fused.quaternion)
         estimate = tracker.registered(self.ekf.bias, fused)[:3]
         assert inputs.t0_ns is not None
-        joints, rates = inputs.joints.at(inputs.t0_ns + (own_s - 0.5 * tracker.averaging) * 1e9)
+        joints, rates = inputs.joints.at(inputs.t0_ns + (own_s - tracker.age + tracker.delay) * 1e9)
         motion = MotionPoint(
             position - tip.position, tip.position, tip.quaternion, tip.velocity, acceleration,
             joints[:n], rates[:n], rates[n:],
@@ -215,38 +215,43 @@ class FusedRun:
     def begin_again(self, open_loop: OpenLoopRun, k: int) -> bool:
         """Go on from the open-loop run at step ``k`` if measurements show that something else is right than the filter counts on."""
         return (
-            self.follow_delay(open_loop, k)
+            self.follow_timing(open_loop, k)
             or self.follow_jitter(open_loop, k)
             or self.leave_moving_frame(open_loop, k)
             or self.follow_model_error(open_loop, k)
             or self.leave_refuted(open_loop, k)
         )
 
-    def follow_delay(self, open_loop: OpenLoopRun, k: int) -> bool:
-        """Go on from the open-loop run at step ``k`` with another delay of the tracker, if measurements follow it far better with that.
+    def follow_timing(self, open_loop: OpenLoopRun, k: int) -> bool:
+        """Go on from the open-loop run at step ``k`` with another delay or response of the tracker, if measurements follow it far better with that.
 
         Where they do with many delays, as before a late tracker shows the first motion, they are not fused until one is found.
         """
         if not self._health.fusing:
             return False
-        present, was_late = self.ekf.delay, self.late
-        found = self.delay_search.found(present) or self.clock_search.found(present)
-        self.late = found is None and self.delay_search.undecided(present)
+        expected, delay, was_late = self.ekf.expected, self.ekf.delay, self.late
+        found = self.timing.found(expected, delay)
+        self.late = found is None and self.timing.undecided(expected, delay)
+        if found is None and expected.response_sigma:
+            expected.responds(*self.timing.response.refined(expected.response))
         if found is None and (was_late or not self.late):
             return False
-        note = "poses are older than their stamps, by a time that is not known yet"
+        kind, note = "latency", "poses are older than their stamps, by a time that is not known yet"
         if found is not None:
-            delay, deviation = found
-            whole_ms = 1e3 * (self.ekf.tracker.delay + delay)
-            note = (
-                f"poses are {abs(whole_ms):.0f} ms {'older' if whole_ms > 0.0 else 'newer'} than their stamps"
-            )
-            self.ekf.expect_delay(delay, deviation)
-            self._inputs.measurements.early_s = max(-delay, 0.0)
-            for search in (self.delay_search, self.clock_search):
-                search.begin_again(delay)
+            if found.response is not None:
+                expected.responds(found.response, found.deviation)
+                expected.late_by(0.0, 0.0)  # a response tells by itself how late a tracker is
+                kind, note = "response", in_words(found.response)
+            elif found.delay is not None:
+                expected.late_by(found.delay, found.deviation)
+                whole_ms = 1e3 * expected.newest_s
+                note = f"poses are {abs(whole_ms):.0f} ms {'older' if whole_ms > 0.0 else 'newer'} than their stamps"
+            queue = self._inputs.measurements
+            queue.early_s = max(queue.tracker.delay - expected.newest_s, 0.0)
+            self.timing.followed(found)
             self._health.distances.clear()
-        self._health.note("tracker", "latency", f"{note}; check the tracker's clock, or set tracker.delay_s")
+        advice = "; check the tracker's clock, or set tracker.delay_s" if kind == "latency" else ""
+        self._health.note("tracker", kind, note + advice)
         self.reinitialise(open_loop, k)
         return True
 
@@ -258,21 +263,20 @@ class FusedRun:
         if not self._health.fusing or self.not_fused:
             return False
         search = self.model_error_search
-        if self.ekf.jitter and self.end_of_jitter.less:
-            half = 0.5 * self.ekf.jitter
-            self.ekf.jitter = half if half > 0.5 * search.jitter.options.smallest_s else 0.0
+        if self.ekf.expected.jitter and self.end_of_jitter.less:
+            half = 0.5 * self.ekf.expected.jitter
+            self.ekf.expected.jitter = half if half > 0.5 * search.jitter.options.smallest_s else 0.0
             self.end_of_jitter.clear()
-        probability, deviation = search.stamp_jitter(self.ekf.jitter)
-        if probability <= 0.5:
+        probability, deviation = search.stamp_jitter(self.ekf.expected.jitter)
+        if probability <= 0.5 or self.timing.other(self.ekf.expected, self.ekf.delay) > 0.5:
             self._scatters_since = k
         lasts = seconds(k - self._scatters_since) > search.jitter.options.lasts_s
         if probability <= search.options.believed or not lasts:
             return False
-        self.ekf.jitter = deviation
+        self.ekf.expected.jitter = deviation
         self.end_of_jitter.clear()
         search.begin_again()
-        for other in (self.delay_search, self.clock_search):
-            other.begin_again(self.ekf.delay)
+        self.timing.begin_again(self.ekf.expected, self.ekf.delay)
         self._health.note(
             "tracker",
             "jitter",
@@ -342,16 +346,13 @@ class FusedRun:
             shift = self.ekf.shift_in_base()
             if math.hypot(*shift.tolist()) < farthest:
                 tip.covariance[:3, :3] += np.multiply.outer(shift, shift)
-        belief = self.delay_search.belief(self.ekf.delay)
-        search = self.model_error_search
-        moves = search.frame.probability
-        behind = self.clock_search.belief(self.ekf.delay).late
-        scatter = search.stamp_jitter(self.ekf.jitter)[0]
-        other = max(belief.late, behind, moves, scatter, search.probability(self.ekf.model_error))
+        timing, search = self.timing.other(self.ekf.expected, self.ekf.delay), self.model_error_search
+        moves, scatter = search.frame.probability, search.stamp_jitter(self.ekf.expected.jitter)[0]
+        other = max(timing, moves, scatter, search.probability(self.ekf.model_error))
         if not self._health.fusing or other < NEGLIGIBLE:
             return
         if self.not_fused:
-            fusing = 1.0 - (belief.late if self.late else moves)
+            fusing = 1.0 - (timing if self.late else moves)
             tip.covariance[:3, :3] += allowance(fusing) * np.multiply.outer(self._apart, self._apart)
             return
         mean = open_loop.tips.last.mean

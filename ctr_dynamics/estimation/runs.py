@@ -59,11 +59,10 @@ class Runs:
         ekf = RodEkf(corrected, self.tracker, filter_options(settings))
         self.fused = FusedRun(ekf, self._interpolated, load, inputs, health, innovations)
         no_effect = np.zeros((model.input_count, 0))
-        delays = self.fused.clock_search.delays
         self.open_loop = OpenLoopRun(
             nominal,
             RunInputs(self._interpolated, load, no_effect, np.zeros(0)),
-            ekf.tips.size + math.ceil((delays[-1] - delays[0]) / DT),
+            ekf.tips.size + math.ceil(self.fused.timing.reach_s / DT),
         )
         self.clear()
 

@@ -81,6 +81,33 @@ def add_by_modes(variances, of_one, covariance):
 
 
 @compiled
+def add_hidden_vibrations(
+    tolerance, told, most, fastest, frequency, amplitude, rate, direction, covariance
+):  # fmt: skip
+    """Add to ``covariance`` (12, 12) what a linear filter errs by in vibrations whose phases it does not hold for certain.
+
+    ``tolerance``: relative deviation of a frequency; ``told`` (m,): 1/(m^2 s), what poses tell of the phase of a vibration, by the square of its
+    amplitude; ``most``: of an unknown phase, by the mean square of the vibration; ``fastest``: Hz, of modes that the steps follow. ``frequency``,
+    ``amplitude``, ``rate`` (m,) in Hz, m and m/s and ``direction`` (m, 3) of the modes.
+    """
+    for mode in range(len(frequency)):
+        omega = 2.0 * math.pi * frequency[mode]
+        square = amplitude[mode] ** 2 + (rate[mode] / omega) ** 2
+        if square == 0.0 or frequency[mode] > fastest:
+            continue
+        part = most
+        if told[mode] > 0.0:
+            phase = (6.0 * tolerance * omega / (told[mode] * square)) ** (2.0 / 3.0) / 3.0
+            part = min(0.75 * phase**2, most)
+        variance = 0.5 * square * part
+        for i in range(3):
+            for k in range(3):
+                along = variance * direction[mode, i] * direction[mode, k]
+                covariance[i, k] += along
+                covariance[6 + i, 6 + k] += omega**2 * along
+
+
+@compiled
 def add_actuator_error(error, length, actuators, position, duration, covariance):
     """Add to ``covariance`` (12, 12) what deviations ``error`` (2 N,) of the ``actuators`` (2 N,) make, in a ``duration`` (s) for the twist.
 

@@ -1,6 +1,6 @@
 """The tip tracker: from the tip to a measurement, back, and how both change (docs/filter.md).
 
-A measurement of stamp t shows the time t / (1 + skew) - delay, averaged over a window before it:
+A measurement of stamp t shows the time t / (1 + skew) - delay, averaged over a window before it or smoothed:
 
     position = R_reg scale (p + R lever) + t_reg + drift t,        rotation = R_reg R,
 
@@ -11,6 +11,7 @@ and then passes the corrections. The estimator carries errors of registration, l
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -53,9 +54,18 @@ ROTATION, TRANSLATION, LEVER = slice(0, 3), slice(3, 6), slice(6, 9)
 MODEL_POSITION, MODEL_ROTATION = slice(9, 12), slice(12, 15)
 DELAY, DRIFT, SHIFT = 15, slice(16, 19), slice(19, 22)
 
-# Gauss and Legendre's rule of five points on [0, 1]: the mean over the averaging window
+# Gauss and Legendre's rule of five points on [0, 1]
 AVERAGE_POINTS = np.array([0.04691008, 0.23076534, 0.5, 0.76923466, 0.95308992])
 AVERAGE_WEIGHTS = np.array([0.11846344, 0.23931434, 0.28444444, 0.23931434, 0.11846344])
+SMOOTHED = 4.0  # time constants of a low-pass filter that are looked back: 2 % of its response is older
+PART_S = 0.015  # s, over which the rule is good for vibrations that a model follows in steps of 3 ms
+
+
+def _points(length: float) -> tuple[Floats, Floats]:
+    """Points (k,) s and weights (k,) of the mean over a ``length`` (s), part by part."""
+    parts = math.ceil(length / PART_S)
+    points = (np.arange(parts)[:, None] + AVERAGE_POINTS).ravel() * (length / parts)
+    return points, np.tile(AVERAGE_WEIGHTS, parts) / parts
 
 
 def free_axis(mask: NDArray[np.bool_]) -> int:
@@ -113,7 +123,8 @@ class TrackerModel:
         variance: (6,) white noise. state_sigma: (22,) prior deviations of ``STATE_NAMES``; those of
             the robot itself are 0.
         scale: reported over true distance; drift: (3,) m/s; skew: s/s, stamp = true time (1 + skew).
-        averaging: s, length of the window over which poses are averaged. corrections: further links, in order.
+        averaging: s, length of the window over which poses are averaged. smoothing: s, time constant of a low-pass filter of first order that they
+            pass. corrections: further links, in order.
     """
 
     rotation: Floats
@@ -127,6 +138,7 @@ class TrackerModel:
     drift: Floats = field(default_factory=lambda: np.zeros(3))
     skew: float = 0.0
     averaging: float = 0.0
+    smoothing: float = 0.0
     corrections: tuple[TrackerCorrection, ...] = ()
 
     @classmethod
@@ -199,16 +211,21 @@ class TrackerModel:
 
     @cached_property
     def window(self) -> tuple[tuple[float, float], ...]:
-        """(age in s, weight) of the poses that are averaged."""
-        if self.averaging <= 0.0:
-            return ((0.0, 1.0),)
-        parts = zip(AVERAGE_POINTS, AVERAGE_WEIGHTS, strict=True)
-        return tuple((float(x) * self.averaging, float(w)) for x, w in parts)
+        """(age in s, weight) of the poses that a measurement shows the mean of."""
+        ages, weights = np.zeros(1), np.ones(1)
+        if self.averaging > 0.0:
+            ages, weights = _points(self.averaging)
+        if self.smoothing > 0.0:
+            older, less = _points(SMOOTHED * self.smoothing)
+            less = less * np.exp(-older / self.smoothing)
+            ages = np.add.outer(older, ages).ravel()
+            weights = np.multiply.outer(less / less.sum(), weights).ravel()
+        return tuple(zip(ages.tolist(), weights.tolist(), strict=True))
 
     @property
     def age(self) -> float:
         """How much older than its stamp a measurement is in the mean, s."""
-        return self.delay + 0.5 * self.averaging
+        return self.delay + 0.5 * self.averaging + self.smoothing
 
     def observed_times(self, stamps: Floats) -> Floats:
         """Newest times (s,) of the robot that measurements of ``stamps`` (s,) show."""
@@ -223,7 +240,7 @@ class TrackerModel:
 
     def observed_tip(self, at: Callable[[float], Tip | None], time: float) -> Tip | None:
         """The tip that the tracker sees over the window that ends at ``time`` (s), when ``at`` gives that of one time; None where that does."""
-        if self.averaging <= 0.0:
+        if len(self.window) == 1:
             return at(time)
         tips = [at(time - age) for age, _ in self.window]
         seen = [tip for tip in tips if tip is not None]
@@ -246,7 +263,7 @@ class TrackerModel:
         """
         rows = self.averaged(tip_at, self.observed_times(stamps))
         h = rows[:, 3:]
-        if self.averaging > 0.0:
+        if len(self.window) > 1:
             h = h / np.linalg.norm(h, axis=1, keepdims=True)
         return self.reported(stamps, rows[:, :3], h)
 

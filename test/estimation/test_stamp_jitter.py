@@ -137,4 +137,4 @@ def test_jitter_that_ends_is_forgotten():
     ]
     run = play(messages)
     assert "stamps scatter" in run.estimator.health.tracker["jitter"].last
-    assert run.estimator.runs.fused.ekf.jitter < 0.003
+    assert run.estimator.runs.fused.ekf.expected.jitter < 0.003

@@ -5,19 +5,24 @@ import numpy as np
 import pytest
 
 from ctr_dynamics.estimation.discretisation import VibrationErrors, discretise
+from ctr_dynamics.estimation.filter.expected_tracker import ExpectedTracker
 from ctr_dynamics.estimation.monitoring.twist_error import (
     EncoderVibration,
     FrameError,
+    HiddenVibration,
     LoadVibration,
     MotionFrequency,
 )
+from ctr_dynamics.estimation.step_output import Modes
 from ctr_dynamics.estimation.vibration_modes import lanes_of, modal_basis, tip_response
 from ctr_dynamics.model.model import Model
 from ctr_dynamics.model.statics import Statics
 from ctr_dynamics.robot_files import load_robot
+from ctr_dynamics.sensing import TrackerModel
 
 SECOND = 1_000_000_000
 MU = np.array([-0.5 + 30.0j, -2.0 + 900.0j])
+TRACKER = ExpectedTracker(TrackerModel.of_robot(load_robot("till2020_tissue")))
 FORCE = np.array([0.0, 0.5, 0.0, 0.0, 0.0, 0.0])
 
 
@@ -223,3 +228,69 @@ def test_registration_and_lever_arm_turn_and_move_the_twist():
     expected = np.cov(seen.T)
     assert covariance[6:, 6:] == pytest.approx(expected, abs=0.03 * np.abs(expected).max())
     assert not covariance[:6].any()
+
+
+def filter_of_a_sine(omega, deviation, amplitude, noise, period_s, poses, runs=400):
+    """Extended Kalman filters of phase and frequency of a sine: mean squares of their errors, and their variances of the sine's value."""
+    rng = np.random.default_rng(3)
+    away = rng.normal(0.0, deviation, runs)
+    phase, faster = np.zeros(runs), np.zeros(runs)
+    P, F = np.zeros((runs, 2, 2)), np.array([[1.0, period_s], [0.0, 1.0]])
+    P[:, 1, 1] = deviation**2
+    squares, variances = [], []
+    for k in range(1, poses):
+        phase, P = phase + (omega + faster) * period_s, F @ P @ F.T
+        error = amplitude * (np.sin((omega + away) * k * period_s) - np.sin(phase))
+        slope = amplitude * np.cos(phase)
+        variance = slope**2 * P[:, 0, 0]
+        squares.append(error**2)
+        variances.append(variance)
+        gain = P[:, :, 0] * (slope / (variance + noise**2))[:, None]
+        P = P - np.einsum("ri,rj->rij", gain, gain) * (variance + noise**2)[:, None, None]
+        seen = error + rng.normal(0.0, noise, runs)
+        phase, faster = phase + gain[:, 0] * seen, faster + gain[:, 1] * seen
+    return np.mean(squares), np.mean(variances)
+
+
+@pytest.mark.parametrize("deviation", [0.3, 1.0, 2.0, 4.0])
+@pytest.mark.parametrize("amplitude", [1e-4, 2e-4, 5e-4])
+def test_a_linear_filter_errs_by_as_much_as_is_added_for_a_phase_that_it_does_not_hold(deviation, amplitude):
+    """Too little to say by itself where the phase is hardly known; with what is added, neither too little nor much too much."""
+    omega, noise, period = 578.0, 3.5e-4, 0.025
+    square, variance = filter_of_a_sine(omega, deviation, amplitude, noise, period, 400)
+    found = HiddenVibration(deviation / omega, noise)
+    values = np.array([0.6 * amplitude]), np.array([0.8 * amplitude * omega])  # at some phase
+    direction = np.array([[0.0, 0.6, 0.8]])
+    covariance = np.zeros((12, 12))
+    found.inflate(
+        covariance, Modes(np.array([omega / (2 * np.pi)]), np.zeros(1), *values, direction), period, TRACKER
+    )
+    added = covariance[:3, :3].trace()
+    assert 0.45 * (variance + added) < square < 1.3 * (variance + added)
+    np.testing.assert_allclose(covariance[:3, :3], added * np.outer(direction, direction))
+    np.testing.assert_allclose(covariance[6:9, 6:9], omega**2 * covariance[:3, :3])
+    if deviation == 4.0 and amplitude == 2e-4:
+        assert square > 2.0 * variance
+
+
+def test_a_phase_that_is_certain_or_measured_exactly_adds_nothing_nor_does_a_mode_too_fast_for_the_steps():
+    slow = Modes(np.array([20.0, 90.0]), np.zeros(2), np.zeros(2), np.array([1e-2, 0.0]), np.eye(3)[:2])
+    fast = slow._replace(frequency_hz=np.array([200.0, 300.0]))
+    for tolerance, noise, modes in ((0.0, 3e-4, slow), (0.01, 0.0, slow), (0.01, 3e-4, fast)):
+        covariance = np.zeros((12, 12))
+        HiddenVibration(tolerance, noise).inflate(covariance, modes, 0.025, TRACKER)
+        assert not covariance.any()
+
+
+def test_what_the_tracker_hides_stays_while_no_modes_are_known():
+    found = HiddenVibration(0.01, 3.5e-4)
+    modes = Modes(np.array([20.0]), np.zeros(1), np.array([1e-3]), np.zeros(1), np.array([[0.0, 1.0, 0.0]]))
+    hidden = ExpectedTracker(TRACKER.model)
+    hidden.responds(-0.025, 0.0)  # a mean over one period
+    first, then, sound = (np.zeros((12, 12)) for _ in range(3))
+    found.inflate(first, modes, 0.025, hidden)
+    assert first[1, 1] == pytest.approx(1e-6)  # of an unknown phase, as much as it vibrates
+    found.inflate(then, Modes.none(), 0.025, hidden)
+    np.testing.assert_array_equal(then, first)
+    found.inflate(sound, modes, 0.025, TRACKER)
+    assert sound[1, 1] < 0.01 * first[1, 1]

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from ctr_dynamics.estimation.filter.adapted_variances import AdaptedVariances, Constants, ForceRange
 from ctr_dynamics.estimation.filter.covariance_factor import CovarianceFactor
+from ctr_dynamics.estimation.filter.expected_tracker import ExpectedTracker
 from ctr_dynamics.estimation.filter.factor_reduction import reduced
 from ctr_dynamics.estimation.filter.factor_schedule import FactorSchedule
 from ctr_dynamics.estimation.filter.filter_records import (
@@ -25,7 +26,6 @@ from ctr_dynamics.estimation.filter.filter_records import (
     Update,
 )
 from ctr_dynamics.estimation.filter.gating import Gate
-from ctr_dynamics.estimation.filter.jitter_noise import with_jitter
 from ctr_dynamics.estimation.filter.parameter_priors import (
     force_range,
     model_uncertainty,
@@ -33,6 +33,7 @@ from ctr_dynamics.estimation.filter.parameter_priors import (
 )
 from ctr_dynamics.estimation.filter.process_noise import ProcessNoise
 from ctr_dynamics.estimation.filter.rational_step import ColumnStrides, Stride, exposed
+from ctr_dynamics.estimation.filter.tip_comparison import compare_with_tip
 from ctr_dynamics.estimation.filter.tip_window import TipWindow, insertion_fraction
 from ctr_dynamics.estimation.filter.tolerances import Tolerances, gain_beside, release
 from ctr_dynamics.estimation.step_output import FUSION_OFF
@@ -64,12 +65,12 @@ class RodEkf:
         theta: (p,) estimated changes of the uncertain parameters. bias: (22,) tracker states b. pi: (r + 22, r + 22) Pi.
         factor: V. tips: those of the last steps. adapted: of the unknown tip force. gate: counts rejections. stride: of the columns in the last step.
         refuted: whether the estimate refutes the tolerances of the robot file. The delay is not estimated then.
-        jitter: s, by which stamps are known to scatter; whoever sets it decides whether to :meth:`start` again.
+        expected: the tracker as the filter counts on it; whoever changes its timing has :meth:`start` called next.
         insertion_fraction: of beta's rate, what the model's velocities hold already.
     """
 
     def __init__(self, simulator: Simulator, tracker: TrackerModel, options: FilterOptions) -> None:
-        self.simulator, self.tracker, self.options = simulator, tracker, options
+        self.simulator, self.expected, self.options = simulator, ExpectedTracker(tracker), options
         self.model: Model = simulator.model
         self.uncertainty = model_uncertainty(self.model)
         self._force = self.uncertainty.force
@@ -83,19 +84,13 @@ class RodEkf:
         self.bias = np.zeros(STATES)
         self.pi = np.zeros((0, 0))
         self.factor = CovarianceFactor(self.model, self.uncertainty, options.rank)
-        # a measurement at the edge of the window shows tips that are older still by the delay and the tracker's averaging
         dt = simulator.scheme.dt
-        self._delay, self._delay_sigma = (
-            0.0,
-            float(tracker.state_sigma[DELAY]),
-        )  # expected, beyond the nominal one
-        oldest = options.window + max(0.0, tracker.delay) + tracker.averaging
-        self.tips = TipWindow(math.ceil(oldest / dt) + 5)
+        self.tips = TipWindow(self._tips_stored)
         force = ForceRange(least, most, options.force_change)
         noise = self.model.robot.tracker.noise.position.value
         self.adapted = AdaptedVariances(force, noise, self.model.robot.tubes[0].length)
         self._tolerances = Tolerances(self.uncertainty.names, self.uncertainty.sigma, tracker.state_sigma)
-        self.refuted, self.jitter = False, 0.0
+        self.refuted = False
         self._noise = ProcessNoise(self.model.robot, dt, self._force, options.force_time, self.adapted)
         self.schedule = FactorSchedule()
         self._strides: ColumnStrides | None = None
@@ -120,11 +115,11 @@ class RodEkf:
         r = len(pi_aa)
         self.refuted = False
         self.bias[:] = 0.0
-        self.bias[DELAY] = self._delay
+        self.bias[DELAY] = self.expected.delay
         self.pi = np.zeros((r + STATES, r + STATES))
         self.pi[:r, :r] = pi_aa
         self.pi[r:, r:] = np.diag(self.tracker.state_sigma**2)
-        self.pi[r + DELAY, r + DELAY] = self._delay_sigma**2
+        self.pi[r + DELAY, r + DELAY] = self.expected.delay_sigma**2
         for part, sigma in (
             (MODEL_POSITION, self.model_error.position),
             (MODEL_ROTATION, self.model_error.rotation),
@@ -137,26 +132,26 @@ class RodEkf:
             i = self._force.start + axis
             self.pi[i, i] = (self._least_force / size) ** 2
         self.adapted.start(self.pi, self._force)
+        self.tips.size = self._tips_stored
         self.tips.clear(r)
         self._reduce()
         self.schedule.start(state.key)
         self._append_tip(state, stamp)
 
     @property
+    def tracker(self) -> TrackerModel:
+        """The tracker as the filter counts on it."""
+        return self.expected.model
+
+    @property
+    def _tips_stored(self) -> int:
+        """Steps of which the tip is stored: a measurement at the edge of the window shows tips that are older still."""
+        return math.ceil((self.options.window + self.expected.reach_s) / self.simulator.scheme.dt) + 5
+
+    @property
     def delay(self) -> float:
         """Estimated delay of the tracker beyond the nominal one, s."""
         return float(self.bias[DELAY])
-
-    @property
-    def expected_delay(self) -> float:
-        """Delay of the tracker beyond the nominal one that the filter has begun with, s."""
-        return self._delay
-
-    def expect_delay(self, delay: float, sigma: float) -> None:
-        """Start with another ``delay`` of the tracker beyond the nominal one, and its deviation ``sigma``, both s; :meth:`start` is next."""
-        dt = self.simulator.scheme.dt
-        self.tips.size += math.ceil(max(delay, 0.0) / dt) - math.ceil(max(self._delay, 0.0) / dt)
-        self._delay, self._delay_sigma = delay, max(sigma, float(self.tracker.state_sigma[DELAY]))
 
     @property
     def model_error(self) -> ModelErrorSize:
@@ -333,7 +328,7 @@ class RodEkf:
         if before or not self.refuted or not self.pi[at, at] > 0.0:
             return np.zeros(len(self.pi))
         # nobody knows which is right: the delay that was expected, or the one that was found
-        gain = release(at, math.hypot(self._delay_sigma, states[DELAY]), self.pi)
+        gain = release(at, math.hypot(self.expected.delay_sigma, states[DELAY]), self.pi)
         correction: Floats = -states[DELAY] * gain
         nu -= H @ correction
         known = np.zeros((1, len(gain)))
@@ -344,7 +339,7 @@ class RodEkf:
     def _from_file(self) -> Floats:
         """(22,) tracker states, less what is expected of them."""
         states = self.bias.copy()
-        states[DELAY] -= self._delay
+        states[DELAY] -= self.expected.delay
         return states
 
     def _end_shift(self, x: Floats) -> None:
@@ -385,26 +380,9 @@ class RodEkf:
 
     def _comparison(self, stamp: float, position: Floats, quaternion: Floats) -> Update | Comparison:
         """A measurement against the tip of its time; the record alone where there is nothing to compare it with."""
-        time = stamp - self.tracker.delay - self.bias[DELAY]
-        tip = self.tracker.observed_tip(self._tip_at, time)
-        if tip is None:
-            return Update.impossible("outside the window of stored steps")
-        nu, H, S, whitened = self.tracker.innovation(self.bias, tip, self.pi, position, quaternion)
-        if not math.isfinite(nu.sum() + S.sum() + whitened.sum()):
-            return Update.impossible("the innovation is not finite")
-        more, steadier, noise, dt = np.zeros_like(S), 0.0, self.tracker.noise, self.simulator.scheme.dt
-        if self.adapted.noisy or self.jitter:
-            S += (self.adapted.noise - 1.0 if self.adapted.noisy else 0.0) * noise
-            if self.jitter:
-                before, at = self._tip_at(time - dt) or tip, len(self.pi) - STATES + DELAY
-                earlier = self.tracker.innovation(self.bias, before, self.pi, position, quaternion)[1]
-                nu, S, more, steadier = with_jitter(nu, S, noise, self.jitter, -H[:, at], -earlier[:, at], dt)
-            whitened = np.linalg.solve(np.linalg.cholesky(S), nu)
-        axes, (residual, variance, white) = self.tracker.axes, np.full((3, 6), np.nan)
-        residual[axes], variance[axes], white[axes] = nu, S.diagonal(), whitened
-        nis = float(whitened @ whitened)
-        record = Update(residual, variance, nis, len(nu), False, "", white, steadier=steadier)
-        return Comparison(nu, H, S, more, record)
+        return compare_with_tip(
+            self.expected, self._tip_at, self.simulator.scheme.dt, self.bias, self.pi, self.adapted, stamp, position, quaternion
+        )  # fmt: skip
 
     def _correct(self, state: State, x: Floats) -> None:
         """Move everything by the correction ``x`` = (a, b) (r + 22,)."""
@@ -414,8 +392,8 @@ class RodEkf:
         a = x[:r]
         self.bias += x[r:]
         # beyond these a measurement on time would show a tip outside the window, and no later one could mend the delay
-        earliest = min(self._delay, 0.0) - self.simulator.scheme.dt
-        self.bias[DELAY] = min(max(self.bias[DELAY], earliest), self._delay + self.options.window)
+        earliest = min(self.expected.delay, 0.0) - self.simulator.scheme.dt
+        self.bias[DELAY] = min(max(self.bias[DELAY], earliest), self.expected.delay + self.options.window)
         self.theta += factor.theta @ a
         np.clip(self.theta, u.lowest, u.highest, out=self.theta)
         self._apply_theta()

@@ -98,6 +98,13 @@ class MeasurementQueue:
         """Forget all measurements."""
         self.measurements.clear()
 
+    @property
+    def period_s(self) -> float:
+        """s between the two newest poses; infinite before there are two."""
+        if len(self.measurements) < 2:
+            return math.inf
+        return (self.measurements[-1].stamp_ns - self.measurements[-2].stamp_ns) * 1e-9
+
     def add(
         self,
         stamp_ns: int,

@@ -37,10 +37,12 @@ class DelaySearchOptions:
         least_s: a smaller difference is left to the filter's own estimate.
         prior: probability that a tracker is late beyond that. One in a hundred has a clock or a driver of that kind.
         believed: probability from which on the estimate begins again with the delay.
+        near: probability of being near the likeliest delay, from which on that is known.
         drift_s: time in which the open-loop run goes astray by about the tracker's noise, beside a registration that is wrong for good.
         memory_s: s, for which evidence counts. Latency is the same for long. A vibration that gets out of phase was in phase before.
-        sound_s: s, mean time after which it changes, as that of a network or of a driver that starts again.
+        changes: whether it may change at all. sound_s: s, mean time after which it does, as that of a network or of a driver that starts again.
         lasts_s: s, for which a change has been likely before it is believed. Other faults look like a latency for a moment, one that grows.
+        settles_s: s, for which a delay since the start has been likely before it is believed.
         remembered: measurements that may be taken again.
     """
 
@@ -50,10 +52,13 @@ class DelaySearchOptions:
     least_s: float = 0.005
     prior: float = 0.01
     believed: float = 0.99
+    near: float = 0.99
     drift_s: float = 1.0
     memory_s: float = 10.0
+    changes: bool = True
     sound_s: float = AdaptationOptions.sound_s
     lasts_s: float = 0.2
+    settles_s: float = 0.0
     remembered: int = 200
 
 
@@ -93,12 +98,16 @@ class Evidence(NamedTuple):
 
 
 class Belief(NamedTuple):
-    """Probability that the tracker is ``late``; the most likely ``delay`` and its deviation ``spread``, s; probability of being ``near`` it."""
+    """Probability that the tracker is ``late``; the most likely ``delay`` and its deviation ``spread``, s; probability of being ``near`` it.
+
+    ``odds``: logarithm of the odds of being late.
+    """
 
     late: float
     delay: float
     spread: float
     near: float
+    odds: float = -math.inf
 
 
 class DelaySearch:
@@ -161,20 +170,31 @@ class DelaySearch:
         drop_from(self._evidence, stamp_ns)
         drop_from(self._waiting, stamp_ns)
         self._waiting.append(Waiting(stamp_ns, time_s, position, foretold, present_s))
-        while self._waiting and self._waiting[0].time_s - self.delays[0] <= stamps[-1]:
+        while len(stamps) and self._waiting and self.newest(self._waiting[0].time_s) <= stamps[-1]:
             self._take(self._waiting.popleft(), stamps, tips)
+
+    def newest(self, time_s: float) -> float:
+        """The newest time (s) of the open-loop run that a measurement of ``time_s`` may show."""
+        return time_s - float(self.delays[0])
+
+    def shown(self, time_s: float, stamps: Floats, tips: Floats) -> Floats | None:
+        """(d, 3) m of the open-loop run, that measurements of ``time_s`` (s) show with every delay; None where that is not known."""
+        times = time_s - self.delays
+        if len(stamps) < 2 or times[-1] < stamps[0]:
+            return None
+        return np.stack([np.interp(times, stamps, tips[:, axis]) for axis in range(3)], axis=1)
 
     def _take(self, measured: Waiting, stamps: Floats, tips: Floats) -> None:
         """Have a measurement count that all tips (k, 3) m of the open-loop run are known for; ``stamps`` (k,) s."""
         stamp_ns, time_s, position, foretold, present_s = measured
-        times = time_s - self.delays
-        if len(stamps) < 2 or times[-1] < stamps[0]:
+        shown = self.shown(time_s, stamps, tips)
+        if shown is None:
             return
         self._belief = None
-        residual = position - np.stack([np.interp(times, stamps, tips[:, axis]) for axis in range(3)], axis=1)
+        residual = position - shown
         noise = self._noise**2
         if not self._evidence:
-            none, began = np.zeros(len(times)), np.full(len(times), stamp_ns)
+            none, began = np.zeros(len(shown)), np.full(len(shown), stamp_ns)
             moved = self._moved.begin(residual[int(np.argmin(np.abs(self.delays - present_s)))])
             self._evidence.append(
                 Evidence(stamp_ns, residual, noise, none, 0.0, none, began, residual, moved)
@@ -223,7 +243,7 @@ class DelaySearch:
         The filter may be right; so may the open-loop run with the delay that the filter has, the tracker moved or not, and so may it with any other.
         """
         if self._belief is None or self._belief[0] != present_s:
-            self._belief = present_s, self._compare(present_s, self._evidence)
+            self._belief = present_s, self._compare(present_s, self._evidence, self.options.changes)
         return self._belief[1]
 
     def _compare(self, present_s: float, known: Sequence[Evidence], changes: bool = True) -> Belief:
@@ -242,15 +262,17 @@ class DelaySearch:
         likely = evidence[other] + prior
         most = max(as_now, float(likely.max()))
         weights = np.exp(likely - most)
+        top = float(likely.max())
+        odds = top + math.log(np.exp(likely - top).sum()) - as_now
         weights /= weights.sum() + math.exp(as_now - most)
         delays = delays[other]
         near = np.abs(delays - delays[weights.argmax()]) <= 2.0 * options.least_s
         around = float(weights[near].sum())
         if not around:
-            return Belief(float(weights.sum()), present_s, 0.0, 0.0)
+            return Belief(float(weights.sum()), present_s, 0.0, 0.0, odds)
         delay = float(weights[near] @ delays[near]) / around
         spread = math.sqrt(float(weights[near] @ (delays[near] - delay) ** 2) / around)
-        return Belief(float(weights.sum()), delay, spread, around)
+        return Belief(float(weights.sum()), delay, spread, around, odds)
 
     def _after_change(self, present_s: float, known: Sequence[Evidence]) -> Floats:
         """(d,) logarithm of the evidence of every delay, if the latency has changed from ``present_s``.
@@ -291,15 +313,27 @@ class DelaySearch:
         does has shown by then: before, a long delay says that it has yet to come.
         """
         belief = self.belief(present_s)
-        if belief.near <= self.options.believed:
+        if not self._sure(belief):
             return None
         always = self._compare(present_s, self._evidence, changes=False)
-        if always.near > self.options.believed:
+        settles_s = self.options.settles_s
+        if self._sure(always) and (
+            not settles_s or self._compare(present_s, self._until(settles_s), changes=False).late > 0.5
+        ):
             return always.delay, always.spread
-        until_ns = self._evidence[-1].stamp_ns - round(max(belief.delay, self.options.lasts_s) * 1e9)
-        before = self._compare(present_s, [e for e in self._evidence if e.stamp_ns <= until_ns])
+        if not self.options.changes:
+            return None
+        before = self._compare(present_s, self._until(max(abs(belief.delay), self.options.lasts_s)))
         same = abs(before.delay - belief.delay) <= 2.0 * self.options.least_s
         return (belief.delay, belief.spread) if same and before.near > 0.5 else None
+
+    def _until(self, seconds: float) -> list[Evidence]:
+        """What was known ``seconds`` before the last measurement."""
+        until_ns = self._evidence[-1].stamp_ns - round(seconds * 1e9)
+        return [e for e in self._evidence if e.stamp_ns <= until_ns]
+
+    def _sure(self, belief: Belief) -> bool:
+        return belief.late > self.options.believed and belief.near > self.options.near
 
     def undecided(self, present_s: float) -> bool:
         """Whether the tracker has been late since the start, by a time that is not known yet."""
@@ -307,14 +341,21 @@ class DelaySearch:
         if self.belief(present_s).late <= believed:
             return False
         belief = self._compare(present_s, self._evidence, changes=False)
-        return belief.late > believed >= belief.near
+        return belief.late > believed and not self._sure(belief)
 
-    def begin_again(self, present_s: float) -> None:
+    def foretells_better(self, gain: float) -> None:
+        """The filter goes on with something else, by which its evidence grows by the logarithm ``gain``."""
+        self._belief = None
+        if self._evidence:
+            last = self._evidence.pop()
+            self._evidence.append(last._replace(filter=last.filter + gain))
+
+    def begin_again(self, present_s: float) -> float:
         """The filter goes on from the open-loop run with the delay ``present_s``, and foretells as well as that has done.
 
-        Where no such delay is tried here, it foretells as well as the best that is.
+        Where no such delay is tried here, it foretells as well as the best that is. Returns by how much its evidence grows.
         """
-        self._belief = None
+        gain, self._belief = 0.0, None
         if self._evidence:
             last = self._evidence.pop()
             same = np.abs(self.delays - present_s) <= self.options.least_s
@@ -322,3 +363,5 @@ class DelaySearch:
                 same[:] = True
             best = max([last.filter, *last.delays[same], *last.changed[same]])
             self._evidence.append(last._replace(filter=best, moved=last.moved._replace(evidence=-math.inf)))
+            gain = best - last.filter
+        return gain

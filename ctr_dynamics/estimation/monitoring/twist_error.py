@@ -11,13 +11,16 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from ctr_dynamics.estimation.discretisation import VibrationErrors
+from ctr_dynamics.estimation.discretisation import RESOLVED_HZ, VibrationErrors
 from ctr_dynamics.estimation.filter.ekf import RodEkf
+from ctr_dynamics.estimation.filter.expected_tracker import ExpectedTracker
 from ctr_dynamics.estimation.filter.filter_records import TipEstimate
 from ctr_dynamics.estimation.filter.rational_step import FOLLOWED_S, Stride, error_rates
+from ctr_dynamics.estimation.step_output import Modes
 from ctr_dynamics.kernels.output_errors import (
     add_by_modes,
     add_frame_error,
+    add_hidden_vibrations,
     add_motion_error,
     follow_motion,
     motion_square,
@@ -168,6 +171,40 @@ class EncoderVibration:
         add_by_modes(self._variance, self._of_one, covariance)
 
 
+class HiddenVibration:
+    """Vibrations whose phases a linear filter does not hold for certain, as a tracker that averages or smooths hides them.
+
+    The tolerances leave a frequency open by w (rad/s). Of the phase of a vibration of amplitude a, poses tell i = g^2 a^2 / (2 s^2 T) in a second,
+    with their noise s and period T, and the part g of the amplitude that the tracker certainly shows. After t the phase has the variance
+    t^2 / (1 / w^2 + i t^3 / 3), at most v = (6 w / i)^(2/3) / 3. The filter takes the sine for its tangent and errs by the next term. Its mean
+    square is 3/4 v^2 times that of the vibration; at most, the phase is unknown.
+    In modes that are too fast for the steps, the model has no vibration, but follows the motion of the others.
+
+    Args:
+        tolerance: relative deviation of a frequency. noise: of a measured position, m.
+    """
+
+    def __init__(self, tolerance: float, noise: float) -> None:
+        self._tolerance, self._noise = tolerance, noise
+        self._known = np.zeros((12, 12))  # what was added last
+
+    def inflate(self, covariance: Floats, modes: Modes, period_s: float, expected: ExpectedTracker) -> None:
+        """Add them to the ``covariance`` (12, 12) of the tip, in place; ``period_s``: between two poses of the ``expected`` tracker.
+
+        While no modes are known, as after a correction, it is what it was.
+        """
+        if not len(modes.frequency_hz):
+            covariance += self._known
+            return
+        of_poses = self._noise**2 * period_s
+        told = expected.seen_of(modes.frequency_hz) ** 2 * (0.5 / of_poses if of_poses > 0.0 else math.inf)
+        self._known = np.zeros((12, 12))
+        add_hidden_vibrations(
+            self._tolerance, told, MOST, RESOLVED_HZ, modes.frequency_hz, modes.amplitude, modes.rate, modes.direction, self._known,
+        )  # fmt: skip
+        covariance += self._known
+
+
 def of_modes(modes: VibrationErrors) -> Floats:
     """(m, 144) covariance (12, 12) of pose and twist of the tip, row by row, by each modal coordinate of variance 1 and any phase."""
     whole = np.hstack([modes.twist / modes.exponent[:, None], modes.twist])
@@ -191,8 +228,8 @@ class FrameError:
 
 
 class TwistError:
-    """All: errors of the twist by the frequency of the motion, by vibrations that a load has left, by the noise of the encoders, and by the
-    tracker's frame and sensor.
+    """All: errors of the twist by the frequency of the motion, by vibrations that a load has left or that the tracker hides, by the noise of the
+    encoders, and by the tracker's frame and sensor.
 
     Args:
         modes: how the robot vibrates at rest, and how well that is followed.
@@ -206,6 +243,7 @@ class TwistError:
         self._frame = FrameError(
             np.array(tracker.registration_rotation.tolerance), np.array(tracker.lever_arm.tolerance)
         )
+        self._hidden = HiddenVibration(modes.tolerance, tracker.noise.position.value)
         self._frequency_hz = modes.exponent.imag / (2 * np.pi)
         self._stride: Stride | None = None  # of the columns, and what they lose by it
         self._lost = np.zeros(len(self._frequency_hz))
@@ -214,10 +252,19 @@ class TwistError:
         """The known load (6,) N, N m has changed evenly by ``difference`` between two stamps."""
         self._vibration.load_changed(from_ns, to_ns, difference)
 
-    def inflate(self, tip: TipEstimate, stamp_ns: int, open_loop: Tip, ekf: RodEkf, period_s: float) -> None:
+    def inflate(
+        self,
+        tip: TipEstimate,
+        stamp_ns: int,
+        open_loop: Tip,
+        ekf: RodEkf,
+        periods_s: tuple[float, float],
+        vibrating: Modes,
+    ) -> None:
         """Add to the covariance of ``tip`` at ``stamp_ns``, in place.
 
-        ``open_loop``: the tip that measurements do not move. ``period_s``: between two joint states.
+        ``open_loop``: the tip that measurements do not move. ``periods_s``: between two joint states, and between two poses. ``vibrating``: the
+        modes now.
         """
         covariance = tip.covariance
         self._motion.add(stamp_ns, open_loop.mean[:3], open_loop.mean[7:10])
@@ -228,6 +275,8 @@ class TwistError:
                 self._lost = error_rates(ekf.stride.fraction, self._frequency_hz, over_s)
             self._vibration.inflate(covariance, stamp_ns, self._lost)
         self._frame.inflate(covariance, tip.twist, tip.quaternion)
-        if period_s > 0.0:
-            self._encoders.add(stamp_ns, period_s)
+        if periods_s[0] > 0.0:
+            self._encoders.add(stamp_ns, periods_s[0])
+        if ekf.expected.response and math.isfinite(periods_s[1]):
+            self._hidden.inflate(covariance, vibrating, periods_s[1], ekf.expected)
         self._encoders.inflate(covariance)

@@ -1,0 +1,88 @@
+"""What the filter counts on of the tracker: what the robot file says, until measurements show another delay or another response."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ctr_dynamics.sensing import TrackerModel
+from ctr_dynamics.sensing.tracker import DELAY
+
+Floats = NDArray[np.float64]
+
+
+def response_of(tracker: TrackerModel) -> float:
+    """s, the response of ``tracker``: the mean age of what it shows. Negative for a mean over a window, positive for a low-pass filter."""
+    return tracker.smoothing if tracker.smoothing else -0.5 * tracker.averaging
+
+
+def averaging_and_smoothing(response: float) -> tuple[float, float]:
+    """s, window of the mean and time constant of the low-pass filter of that ``response`` (s)."""
+    return max(-2.0 * response, 0.0), max(response, 0.0)
+
+
+class ExpectedTracker:
+    """A tracker and its timing, as the filter begins with it.
+
+    Args:
+        model: by the robot file.
+
+    Attributes:
+        model: with the response that is known now. delay: s, expected beyond the nominal one; delay_sigma: s, its deviation.
+        jitter: s, by which stamps are known to scatter. response_sigma: s, deviation of the response.
+    """
+
+    def __init__(self, model: TrackerModel) -> None:
+        self.model = model
+        self.delay, self.delay_sigma = 0.0, float(model.state_sigma[DELAY])
+        self.jitter = self.response_sigma = 0.0
+
+    @property
+    def reach_s(self) -> float:
+        """How much older than its stamp the oldest tip is that a measurement shows, s."""
+        oldest, _ = self.model.window[-1]
+        return max(0.0, self.model.delay) + max(0.0, self.delay) + oldest
+
+    @property
+    def newest_s(self) -> float:
+        """How much older than its stamp the newest one is, s; negative where stamps are early."""
+        return self.model.delay + self.delay
+
+    def late_by(self, delay: float, sigma: float) -> None:
+        """Another ``delay`` beyond the nominal one and its deviation ``sigma``, both s."""
+        self.delay, self.delay_sigma = delay, max(sigma, float(self.model.state_sigma[DELAY]))
+
+    @property
+    def response(self) -> float:
+        """s, see :func:`response_of`."""
+        return response_of(self.model)
+
+    def responds(self, response: float, sigma: float) -> None:
+        """Another ``response`` and its deviation ``sigma``, both s."""
+        averaging, smoothing = averaging_and_smoothing(response)
+        self.model = replace(self.model, averaging=averaging, smoothing=smoothing)
+        self.response_sigma = sigma
+
+    @property
+    def slower(self) -> TrackerModel:
+        """The tracker whose response is slower by its deviation."""
+        longer = self.response + math.copysign(self.response_sigma, self.response)
+        averaging, smoothing = averaging_and_smoothing(longer)
+        return replace(self.model, averaging=averaging, smoothing=smoothing)
+
+    def seen_of(self, frequency_hz: Floats) -> Floats:
+        """(m,) parts of the amplitudes that vibrations of these frequencies (m,) certainly have in what the tracker shows."""
+        gain = gain_at(self.model, frequency_hz)
+        unsure = np.abs(gain_at(self.slower, frequency_hz) - gain) if self.response_sigma else 0.0
+        found: Floats = np.maximum(np.abs(gain) - unsure, 0.0)
+        return found
+
+
+def gain_at(tracker: TrackerModel, frequency_hz: Floats) -> NDArray[np.complex128]:
+    """(m,) complex gain of ``tracker`` for vibrations of these frequencies (m,)."""
+    ages, weights = (np.array(part) for part in zip(*tracker.window, strict=True))
+    found: NDArray[np.complex128] = np.exp(-2j * np.pi * np.outer(frequency_hz, ages)) @ weights
+    return found

@@ -1,0 +1,67 @@
+"""A measurement against the tip of its time: innovation, covariance and noise, with what is known of the tracker's timing."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ctr_dynamics.estimation.filter.adapted_variances import AdaptedVariances
+from ctr_dynamics.estimation.filter.expected_tracker import ExpectedTracker
+from ctr_dynamics.estimation.filter.filter_records import Comparison, Update
+from ctr_dynamics.estimation.filter.jitter_noise import with_jitter
+from ctr_dynamics.sensing import Tip
+from ctr_dynamics.sensing.tracker import DELAY, STATES
+
+Floats = NDArray[np.float64]
+
+
+def compare_with_tip(
+    expected: ExpectedTracker,
+    tip_at: Callable[[float], Tip | None],
+    dt: float,
+    bias: Floats,
+    pi: Floats,
+    adapted: AdaptedVariances,
+    stamp: float,
+    position: Floats,
+    quaternion: Floats,
+) -> Update | Comparison:
+    """A measurement against the tip of its time; the record alone where there is nothing to compare it with.
+
+    Args:
+        expected: the tracker.
+        tip_at: the tip with its columns at a time (s); None outside the window. dt: s, of a step.
+        bias: (22,) tracker states. pi: (r + 22, r + 22) covariance. adapted: noise of the tracker.
+        stamp, position, quaternion: of the measurement; see :meth:`~ctr_dynamics.estimation.filter.ekf.RodEkf.update`.
+    """
+    tracker = expected.model
+    time = stamp - tracker.delay - bias[DELAY]
+    tip = tracker.observed_tip(tip_at, time)
+    if tip is None:
+        return Update.impossible("outside the window of stored steps")
+    nu, H, S, whitened = tracker.innovation(bias, tip, pi, position, quaternion)
+    if not math.isfinite(nu.sum() + S.sum() + whitened.sum()):
+        return Update.impossible("the innovation is not finite")
+    more, steadier, noise = np.zeros_like(S), 0.0, tracker.noise
+    if adapted.noisy or expected.jitter or expected.response_sigma:
+        S += (adapted.noise - 1.0 if adapted.noisy else 0.0) * noise
+        slower = expected.slower.observed_tip(tip_at, time) if expected.response_sigma else None
+        if slower is not None:
+            change = tracker.innovation(bias, slower, pi, position, quaternion)[0] - nu
+            more += np.multiply.outer(change, change)
+            S += more
+        if expected.jitter:
+            before, at = tip_at(time - dt) or tip, len(pi) - STATES + DELAY
+            earlier = tracker.innovation(bias, before, pi, position, quaternion)[1]
+            scattered = with_jitter(nu, S, noise, expected.jitter, -H[:, at], -earlier[:, at], dt)
+            nu, S, steadier = scattered.nu, scattered.S, scattered.steadier
+            more += scattered.more
+        whitened = np.linalg.solve(np.linalg.cholesky(S), nu)
+    axes, (residual, variance, white) = tracker.axes, np.full((3, 6), np.nan)
+    residual[axes], variance[axes], white[axes] = nu, S.diagonal(), whitened
+    nis = float(whitened @ whitened)
+    record = Update(residual, variance, nis, len(nu), False, "", white, steadier=steadier)
+    return Comparison(nu, H, S, more, record)

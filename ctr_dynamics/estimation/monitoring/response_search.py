@@ -1,0 +1,115 @@
+"""A tracker that responds late: it averages over some time, or its driver smooths what it sends, as many do against noise.
+
+It shows less of a vibration than there was. The filter would take the robot to be as still. So responses compete with the filter as delays do
+(:mod:`ctr_dynamics.estimation.monitoring.delay_search`), by how the open-loop run looks through them. One number tells both kinds: its size is the
+mean age of what a pose shows, and it is negative for an average and positive for a low-pass filter.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ctr_dynamics.estimation.filter.expected_tracker import averaging_and_smoothing, response_of
+from ctr_dynamics.estimation.monitoring.delay_search import FINER, DelaySearch, DelaySearchOptions
+from ctr_dynamics.estimation.timeline import DT
+from ctr_dynamics.kernels.parabolas import fill_between
+from ctr_dynamics.sensing.tracker import SMOOTHED, TrackerModel
+
+Floats = NDArray[np.float64]
+# A mean and a low-pass filter of one age may both explain what was seen so far: the likelier one is near enough until more is seen. The first
+# tenths of a second of a vibration, of which a slow tracker shows little, leave it open by a fifth. In slow motion a response is like a delay; it
+# is taken for one unless it is a hundred times as likely. A tracker does not begin to smooth while it runs; joints that are suddenly wrong look so.
+RESPONSES = DelaySearchOptions(
+    earliest_s=0.075, longest_s=0.12, near=0.5, settles_s=0.2, prior=0.01 * DelaySearchOptions.prior, changes=False,
+)  # fmt: skip
+PARTS = 20  # of a step, to which the integral of a response is taken
+
+
+def in_words(response: float) -> str:
+    """What poses of that ``response`` (s) are."""
+    averaging, smoothing = averaging_and_smoothing(response)
+    if averaging:
+        return f"poses are means over {1e3 * averaging:.0f} ms; switch the averaging off, or tell it by the effect tracker_averaging"
+    if smoothing:
+        return f"poses pass a low-pass filter of {1e3 * smoothing:.0f} ms; switch it off: it hides vibrations"
+    return "poses are neither averaged nor smoothed any more"
+
+
+def weights_of(response: float, steps: int) -> Floats:
+    """(steps,) what tips 0, 1, 2 .. steps of 3 ms ago, with straight lines between them, count in a pose of that ``response`` (s)."""
+    weights = np.zeros(steps)
+    window, tau = averaging_and_smoothing(response)
+    if not response:
+        weights[0] = 1.0
+        return weights
+    ages = (np.arange(PARTS * (steps - 1)) + 0.5) * DT / PARTS
+    density = (ages < window).astype(float) if window else np.exp(-ages / tau)
+    density /= density.sum()
+    before = ages / DT
+    i = before.astype(int)
+    np.add.at(weights, i, density * (1.0 - (before - i)))
+    np.add.at(weights, i + 1, density * (before - i))
+    return weights
+
+
+class ResponseSearch(DelaySearch):
+    """Evidence for every response of the tracker against that of the filter; the arguments are those of :class:`DelaySearch`.
+
+    Attributes:
+        reach_s: s, how far into the past the slowest looks.
+    """
+
+    def __init__(self, noise: float, change_s: float, length: float, registered: float) -> None:
+        super().__init__(noise, change_s, length, registered, RESPONSES)
+        steps = math.ceil(SMOOTHED * RESPONSES.longest_s / DT)
+        self._weights = np.stack([weights_of(u, steps) for u in np.round(self.delays, 6)])
+        self._ages = DT * np.arange(steps)
+        self.reach_s = float(self._ages[-1])
+
+    def newest(self, time_s: float) -> float:
+        """The newest time (s) of the open-loop run that a measurement of ``time_s`` may show."""
+        return time_s
+
+    def shown(self, time_s: float, stamps: Floats, tips: Floats) -> Floats | None:
+        """(d, 3) m of the open-loop run, that measurements of ``time_s`` (s) show with every response; None where that is not known."""
+        if len(stamps) < 2 or time_s < stamps[0]:
+            return None
+        times = time_s - self._ages
+        past = np.stack([np.interp(times, stamps, tips[:, axis]) for axis in range(3)], axis=1)
+        found: Floats = self._weights @ past
+        return found
+
+    def undecided(self, present_s: float) -> bool:
+        """Whether another response is believed, which has yet to settle; to be asked where none is :meth:`found`."""
+        return self.belief(present_s).late > self.options.believed
+
+    def refined(self, present_s: float) -> tuple[float, float]:
+        """The response around ``present_s`` and its deviation (s), by all measurements."""
+        evidence = self._evidence[-1].delays
+        near = np.abs(self._dense - present_s) <= self.options.least_s
+        dense = np.empty(self._dense.shape)
+        fill_between(evidence, FINER, -np.inf, dense)
+        near &= self._inside & np.isfinite(dense)
+        if not near.any():
+            return present_s, self.options.least_s
+        values, weights = self._dense[near], np.exp(dense[near] - dense[near].max())
+        weights /= weights.sum()
+        mean = float(weights @ values)
+        return mean, math.sqrt(float(weights @ (values - mean) ** 2))
+
+
+def through(tracker: TrackerModel, stamps: Floats, tips: Floats) -> tuple[Floats, Floats]:
+    """Stamps (k,) s and positions (k, 3) m of the tips as ``tracker`` shows them: those of which enough of the past is known."""
+    response = response_of(tracker)
+    if not response:
+        return stamps, tips
+    window, tau = averaging_and_smoothing(response)
+    steps = 2 + math.ceil((window or SMOOTHED * tau) / DT)
+    if len(tips) < steps:
+        return stamps[:0], tips[:0]
+    weights = weights_of(response, steps)
+    seen = [np.convolve(tips[:, axis], weights, "valid") for axis in range(3)]
+    return stamps[steps - 1 :], np.stack(seen, axis=1)

@@ -1,0 +1,114 @@
+"""When measurements show the robot: on time, late by a delay, newer than their stamps, or through a slow response.
+
+All are compared with the same open-loop run. What explains the measurements best is followed; a delay that fits by chance does not come before a
+response that fits better. While none is sure, the tracker is not fused.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ctr_dynamics.estimation.filter.expected_tracker import ExpectedTracker
+from ctr_dynamics.estimation.monitoring.delay_search import CLOCK_BEHIND, DelaySearch
+from ctr_dynamics.estimation.monitoring.response_search import ResponseSearch, through
+
+Floats = NDArray[np.float64]
+
+
+class Found(NamedTuple):
+    """Another ``delay`` beyond the nominal one, or another ``response``, and its ``deviation``, s; the other one is None."""
+
+    delay: float | None
+    response: float | None
+    deviation: float
+
+
+class TrackerTiming:
+    """Evidence for every delay and response of the tracker against that of the filter.
+
+    Args:
+        noise: m per axis, deviation of a measured position.
+        change_s: mean time between two changes of the unknown force. The filter may have met one with every measurement.
+        length: m, of the robot outside the base plate at most. registered: m per axis, tolerance of the registration at the tip.
+    """
+
+    def __init__(self, noise: float, change_s: float, length: float, registered: float) -> None:
+        moves = noise, change_s, length, registered
+        self.late, self.behind = DelaySearch(*moves), DelaySearch(*moves, CLOCK_BEHIND)
+        self.response = ResponseSearch(*moves)
+
+    @property
+    def reach_s(self) -> float:
+        """How far into the past of the open-loop run the searches look at most, s."""
+        return float(self.late.delays[-1] - self.behind.delays[0]) + self.response.reach_s
+
+    def clear(self) -> None:
+        """Forget all measurements."""
+        for search in (self.late, self.behind, self.response):
+            search.clear()
+
+    def add(
+        self, stamp_ns: int, time_s: float, position: Floats, tips: tuple[Floats, Floats], foretold: tuple[float, float],
+        expected: ExpectedTracker, delay: float,
+    ) -> None:  # fmt: skip
+        """Take in a measured tip that the filter has met.
+
+        Args:
+            stamp_ns: of its header. time_s: the newest time that it shows with the nominal delay, s from the first step.
+            position: (3,) m, base axes.
+            tips: stamps (k,) s and positions (k, 3) m of the open-loop run.
+            foretold: what the filter foretold; see :class:`~ctr_dynamics.estimation.filter.filter_records.Update`.
+            expected, delay: the tracker and its delay beyond the nominal one (s), with which the filter has met it.
+        """
+        self.response.add(stamp_ns, time_s, position, *tips, foretold, expected.response)
+        seen = through(expected.model, *tips)
+        for search in (self.late, self.behind):
+            search.add(stamp_ns, time_s, position, *seen, foretold, delay)
+
+    def other(self, expected: ExpectedTracker, delay: float) -> float:
+        """Probability of something else than the filter counts on."""
+        response = self.response.belief(expected.response)
+        return max(self.late.belief(delay).late, self.behind.belief(delay).late, response.late)
+
+    def found(self, expected: ExpectedTracker, delay: float) -> Found | None:
+        """What is believed instead of the ``expected`` tracker with the estimated ``delay`` (s); None where nothing is."""
+        present = expected.response
+        responds = self.response.belief(present).odds
+        for search in (self.late, self.behind):
+            if search.belief(delay).odds >= responds:
+                late = search.found(delay)
+                if late is not None:
+                    return Found(late[0], None, late[1])
+        if responds > max(self.late.belief(delay).odds, self.behind.belief(delay).odds):
+            slow = self.response.found(present)
+            if slow is not None:
+                return (
+                    Found(None, *slow)
+                    if abs(slow[0]) > self.response.options.least_s
+                    else Found(None, 0.0, 0.0)
+                )
+        return None
+
+    def undecided(self, expected: ExpectedTracker, delay: float) -> bool:
+        """Whether the tracker has been late since the start, nobody knows yet in which way; to be asked where nothing is :meth:`found`."""
+        return self.late.undecided(delay) or self.response.undecided(expected.response)
+
+    def followed(self, found: Found) -> None:
+        """The filter goes on from the open-loop run with what was ``found``."""
+        if found.delay is not None:
+            gains = [search.begin_again(found.delay) for search in (self.late, self.behind)]
+            self.response.foretells_better(max(gains))
+        else:
+            assert found.response is not None
+            self.response.begin_again(found.response)
+            self.late.clear()
+            self.behind.clear()
+
+    def begin_again(self, expected: ExpectedTracker, delay: float) -> None:
+        """The filter goes on from the open-loop run with the delay and response that it has."""
+        for search in (self.late, self.behind):
+            search.begin_again(delay)
+        self.response.begin_again(expected.response)
