@@ -79,6 +79,9 @@ def test_a_response_that_is_followed_is_known_better_with_every_pose():
     short, long = (timing(0.06, seconds=s, expected=known).response.refined(0.058) for s in (0.2, 1.5))
     assert long[0] == pytest.approx(0.06, abs=1e-3)
     assert long[1] < short[1] < 2e-3
+    forgotten = timing(0.06, expected=known)
+    forgotten.clear()
+    assert forgotten.response.refined(0.058) == (0.058, forgotten.response.options.least_s)
 
 
 def test_a_release_shows_the_response_soon_and_what_it_is_0_2_s_later():
@@ -202,3 +205,17 @@ def test_the_estimate_follows_a_tracker_that_smooths():
     broken = np.linalg.norm(errors, axis=-1) > np.maximum(3.0 * deviation, 3e-3)
     assert broken.mean() < 0.02
     assert np.linalg.norm(truth_error(run, "clean_protocol", "p_trk", since=3.5)[0], axis=-1).max() < 2e-3
+
+
+def test_a_response_that_was_found_stays_over_a_reset():
+    messages = smoothed(bag_messages("clean_protocol", 3.0), 0.06, "clean_protocol")
+    run = play([m for m in messages if m.stamp < 2.5e9])
+    made = run.estimator
+    assert made.runs.fused.ekf.expected.response_sigma > 0.0
+    made.reset()
+    for message in messages:
+        if message.stamp >= 2.5e9:
+            message.give(made)
+    outputs = made.finish()
+    assert any(out.valid for out in outputs)
+    assert made.runs.fused.ekf.expected.response == pytest.approx(0.06, abs=8e-3)

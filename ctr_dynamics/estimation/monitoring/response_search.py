@@ -88,11 +88,10 @@ class ResponseSearch(DelaySearch):
 
     def refined(self, present_s: float) -> tuple[float, float]:
         """The response around ``present_s`` and its deviation (s), by all measurements."""
-        evidence = self._evidence[-1].delays
-        near = np.abs(self._dense - present_s) <= self.options.least_s
-        dense = np.empty(self._dense.shape)
-        fill_between(evidence, FINER, -np.inf, dense)
-        near &= self._inside & np.isfinite(dense)
+        dense = np.full(self._dense.shape, -np.inf)
+        if self._evidence:
+            fill_between(self._evidence[-1].delays, FINER, -np.inf, dense)
+        near = self._inside & np.isfinite(dense) & (np.abs(self._dense - present_s) <= self.options.least_s)
         if not near.any():
             return present_s, self.options.least_s
         values, weights = self._dense[near], np.exp(dense[near] - dense[near].max())

@@ -85,11 +85,8 @@ class TrackerTiming:
         if responds > max(self.late.belief(delay).odds, self.behind.belief(delay).odds):
             slow = self.response.found(present)
             if slow is not None:
-                return (
-                    Found(None, *slow)
-                    if abs(slow[0]) > self.response.options.least_s
-                    else Found(None, 0.0, 0.0)
-                )
+                responds_at_once = abs(slow[0]) <= self.response.options.least_s
+                return Found(None, 0.0, 0.0) if responds_at_once else Found(None, *slow)
         return None
 
     def undecided(self, expected: ExpectedTracker, delay: float) -> bool:
