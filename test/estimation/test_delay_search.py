@@ -78,10 +78,10 @@ def test_a_delay_that_changes_is_found_after_a_long_time_without():
 def test_delays_between_two_points_rise_above_them_only_at_a_smooth_peak():
     found = DelaySearch(NOISE, 20.0, LENGTH, REGISTERED)
     smooth = -0.5 * ((found.delays - 0.06125) / 0.003) ** 2  # its peak lies halfway
-    delays, dense = found._between(smooth, -np.inf)
-    np.testing.assert_allclose(dense, -0.5 * ((delays - 0.06125) / 0.003) ** 2, atol=1e-9)
+    dense = found._between([smooth], -np.inf)[0]
+    np.testing.assert_allclose(dense, -0.5 * ((found._dense - 0.06125) / 0.003) ** 2, atol=1e-9)
     bent = np.where(np.abs(found.delays - 0.06) < 0.011, -3.0, -500.0)
-    assert found._between(bent, -np.inf)[1].max() < -2.9
+    assert found._between([bent], -np.inf).max() < -2.9
 
 
 def test_the_kernel_takes_the_lower_of_two_parabolas():

@@ -17,9 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctr_dynamics.estimation.filter.adapted_variances import AdaptationOptions
-from ctr_dynamics.estimation.monitoring.densities import density_of_filter, log_density
+from ctr_dynamics.estimation.monitoring.densities import density_of_filter
 from ctr_dynamics.estimation.monitoring.moved_tracker import Moved, MovedTracker
 from ctr_dynamics.estimation.monitoring.taken_again import drop_from
+from ctr_dynamics.kernels.delay_evidence import compare_delays, weigh_changes, weigh_delays
 from ctr_dynamics.kernels.parabolas import fill_between
 
 Floats = NDArray[np.float64]
@@ -200,41 +201,38 @@ class DelaySearch:
                 Evidence(stamp_ns, residual, noise, none, 0.0, none, began, residual, moved)
             )
             return
-        # 1. The registration and the drift of the open-loop run: a random walk.
+        # 1. The registration and the drift of the open-loop run: a random walk. What is known of the past counts less and less.
         last, options = self._evidence[-1], self.options
         elapsed = (stamp_ns - last.stamp_ns) * 1e-9
         before = last.variance + noise * elapsed / options.drift_s
-        change = residual - last.level
-        total = before + noise
-        # 2. Density of the position.
-        density = log_density((change**2).sum(axis=1), total, noise)
-        own = density_of_filter(foretold, elapsed / self._change_s)
-        # 3. What is known of the past counts less and less.
-        decay = math.exp(-elapsed / options.memory_s)
+        total, decay = before + noise, math.exp(-elapsed / options.memory_s)
         gain = before / total
-        # 4. The latency may have changed just now. That leaves the registration as it is; a model that is wrong all of a sudden does not.
+        # 2. Density of the position.
+        told = noise, total, gain, decay
+        level, delays = np.empty_like(residual), np.empty(len(residual))
+        weigh_delays(residual, (last.level, last.delays), told, level, delays)
+        # 3. The latency may have changed just now. That leaves the registration as it is; a model that is wrong all of a sudden does not.
         present = int(np.argmin(np.abs(self.delays - present_s)))
         right_before = decay * max(last.filter, float(last.delays[present]))
-        goes_on, begins = residual - last.changed_level, residual - last.level[present]
-        on = decay * last.changed + log_density((goes_on**2).sum(axis=1), total, noise)
-        now = math.log(-math.expm1(-elapsed / options.sound_s))
-        begun = right_before + now + log_density((begins**2).sum(axis=1), total, noise)
-        new = begun > on
-        # 5. Or the tracker has been moved just now.
+        changed, began_ns, changed_level = last.changed, last.began_ns, last.changed_level
+        if options.changes:
+            now = right_before + math.log(-math.expm1(-elapsed / options.sound_s))
+            changed, began_ns, changed_level = (
+                np.empty_like(delays),
+                np.empty_like(began_ns),
+                np.empty_like(level),
+            )
+            weigh_changes(
+                residual, (last.changed_level, last.changed, last.began_ns), told, (last.level[present], now, last.stamp_ns),
+                changed_level, changed, began_ns,
+            )  # fmt: skip
+        # 4. Or the tracker has been moved just now.
+        own = density_of_filter(foretold, elapsed / self._change_s)
         of_filter = own + self._moved.filter_goes_on(last.filter, last.moved.evidence, elapsed, decay)
         moved = self._moved.add(last.moved, residual[present], elapsed, decay, right_before, of_filter)
+        variance = before * (1.0 - gain)
         self._evidence.append(
-            Evidence(
-                stamp_ns,
-                last.level + gain * change,
-                before * (1.0 - gain),
-                decay * last.delays + density,
-                of_filter,
-                np.where(new, begun, on),
-                np.where(new, last.stamp_ns, last.began_ns),
-                residual - (1.0 - gain) * np.where(new[:, None], begins, goes_on),
-                moved,
-            )
+            Evidence(stamp_ns, level, variance, delays, of_filter, changed, began_ns, changed_level, moved)
         )
 
     def belief(self, present_s: float) -> Belief:
@@ -253,26 +251,14 @@ class DelaySearch:
         ways = [last.delays, self._after_change(present_s, known)] if changes else [last.delays]
         prior = math.log(options.prior / (len(FINER) * len(self.delays)))
         least = max(last.filter, float(last.delays.max())) - IMPOSSIBLE
-        dense = [self._between(one, least) for one in ways]
-        delays, evidence = (np.concatenate(parts) for parts in zip(*dense, strict=True))
-        other = np.abs(delays - present_s) > options.least_s
-        if not other.any():
-            return Belief(0.0, present_s, 0.0, 0.0)
-        as_now = max(last.filter, last.moved.evidence, float(evidence[~other].max(initial=-math.inf)))
-        likely = evidence[other] + prior
-        most = max(as_now, float(likely.max()))
-        weights = np.exp(likely - most)
-        top = float(likely.max())
-        odds = top + math.log(np.exp(likely - top).sum()) - as_now
-        weights /= weights.sum() + math.exp(as_now - most)
-        delays = delays[other]
-        near = np.abs(delays - delays[weights.argmax()]) <= 2.0 * options.least_s
-        around = float(weights[near].sum())
-        if not around:
-            return Belief(float(weights.sum()), present_s, 0.0, 0.0, odds)
-        delay = float(weights[near] @ delays[near]) / around
-        spread = math.sqrt(float(weights[near] @ (delays[near] - delay) ** 2) / around)
-        return Belief(float(weights.sum()), delay, spread, around, odds)
+        as_now = max(last.filter, last.moved.evidence)
+        odds, delay, spread, part = compare_delays(
+            self._dense, self._inside, self._between(ways, least), present_s, options.least_s, prior, as_now
+        )
+        late = 1.0 / (1.0 + math.exp(-odds)) if odds > 0.0 else math.exp(odds) / (1.0 + math.exp(odds))
+        if not late:
+            return Belief(0.0, present_s, 0.0, 0.0, odds)
+        return Belief(late, delay, spread, late * part, odds)
 
     def _after_change(self, present_s: float, known: Sequence[Evidence]) -> Floats:
         """(d,) logarithm of the evidence of every delay, if the latency has changed from ``present_s``.
@@ -289,17 +275,17 @@ class DelaySearch:
         alike = last.changed[likeliest] + np.minimum(since - since[likeliest], 0.0)
         return np.where(near, alike, last.changed)
 
-    def _between(self, evidence: Floats, least: float) -> tuple[Floats, Floats]:
-        """Delays and evidence ten times as dense: parabolas through neighbours. A fast robot moves by more than the noise between two delays.
+    def _between(self, ways: Sequence[Floats], least: float) -> Floats:
+        """(w, d, 10) evidence ten times as dense: parabolas through neighbours. A fast robot moves by more than the noise between two delays.
 
         Between two points there are two parabolas, through the next point on either side. The lower one counts: where both are right they agree, and
         where the evidence bends sharply, as between two times of a change, one of them rises far above all points. Those that cannot reach ``least``
-        are left out.
+        do not count.
         """
-        dense = np.empty((len(evidence), len(FINER)))
-        fill_between(evidence, FINER, least, dense)
-        reached = self._inside & np.isfinite(dense)
-        return self._dense[reached], dense[reached]
+        dense = np.empty((len(ways), *self._dense.shape))
+        for evidence, into in zip(ways, dense, strict=True):
+            fill_between(evidence, FINER, least, into)
+        return dense
 
     @property
     def apart(self) -> float:
@@ -361,7 +347,8 @@ class DelaySearch:
             same = np.abs(self.delays - present_s) <= self.options.least_s
             if not same.any():
                 same[:] = True
-            best = max([last.filter, *last.delays[same], *last.changed[same]])
+            known = [last.delays[same], last.changed[same]] if self.options.changes else [last.delays[same]]
+            best = max(last.filter, *(float(evidence.max()) for evidence in known))
             self._evidence.append(last._replace(filter=best, moved=last.moved._replace(evidence=-math.inf)))
             gain = best - last.filter
         return gain

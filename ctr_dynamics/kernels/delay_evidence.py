@@ -1,0 +1,88 @@
+"""What a measured position says of every delay of the tracker. See :mod:`ctr_dynamics.estimation.monitoring.delay_search`."""
+
+import math
+
+from ctr_dynamics.kernels.compiler import njit
+
+compiled = njit(cache=True, nogil=True, error_model="numpy")
+NEGLIGIBLE = -40.0  # logarithm of a weight beside the largest: below the last digit
+
+
+@compiled
+def weigh_delays(residual, before, told, level, evidence):
+    """Evidence for delays that have been there since the start, with another measurement.
+
+    ``residual`` (d, 3): m, how far it lies from the open-loop run with every delay. ``before``: level (d, 3) and evidence (d,) up to the last one.
+    ``told``: variance of the noise and of a residual (m^2 per axis), gain of the level, and the part of the evidence that counts on. Fills ``level``
+    and ``evidence``.
+    """
+    old_level, old_evidence = before
+    noise, total, gain, decay = told
+    spread = 3.0 * math.log(total / noise)
+    for i in range(len(residual)):
+        square = 0.0
+        for axis in range(3):
+            change = residual[i, axis] - old_level[i, axis]
+            square += change * change
+            level[i, axis] = old_level[i, axis] + gain * change
+        evidence[i] = decay * old_evidence[i] - 0.5 * (square / total + spread)
+
+
+@compiled
+def weigh_changes(residual, before, told, begun, level, evidence, began_ns):
+    """Evidence for delays that came about by a change, at the time that speaks most for it; arguments as of :func:`weigh_delays`.
+
+    ``before``: level, evidence and stamps (d,) before the change, up to the last measurement. ``begun``: level (3,), evidence and stamp of a tracker
+    that changes after the last measurement. Fills ``level``, ``evidence`` and ``began_ns``.
+    """
+    old_level, old_evidence, old_began_ns = before
+    now_level, now_evidence, now_ns = begun
+    noise, total, gain, decay = told
+    spread = 3.0 * math.log(total / noise)
+    for i in range(len(residual)):
+        goes_on = begins = 0.0
+        for axis in range(3):
+            goes_on += (residual[i, axis] - old_level[i, axis]) ** 2
+            begins += (residual[i, axis] - now_level[axis]) ** 2
+        on = decay * old_evidence[i] - 0.5 * (goes_on / total + spread)
+        new = now_evidence - 0.5 * (begins / total + spread)
+        evidence[i], began_ns[i] = (new, now_ns) if new > on else (on, old_began_ns[i])
+        for axis in range(3):
+            was = now_level[axis] if new > on else old_level[i, axis]
+            level[i, axis] = was + gain * (residual[i, axis] - was)
+
+
+@compiled
+def compare_delays(delays, inside, ways, present, least, prior, now):
+    """Delays that are farther than ``least`` from the ``present`` one, against it and whatever else has the evidence ``now``.
+
+    ``delays``, ``inside`` (d, f): dense delays, and which are tried. ``ways`` (w, d, f): logarithm of their evidence in every way; minus infinity
+    where it does not count. ``prior``: logarithm, of each. Returns the logarithm of the odds of all, the mean and the deviation of those near the
+    likeliest, and the part of the probability that these have.
+    """
+    top, likeliest = -math.inf, present
+    for way in range(len(ways)):
+        for i in range(delays.shape[0]):
+            for k in range(delays.shape[1]):
+                if inside[i, k] and abs(delays[i, k] - present) <= least:
+                    now = max(now, ways[way, i, k])
+                elif inside[i, k] and ways[way, i, k] > top:
+                    top, likeliest = ways[way, i, k], delays[i, k]
+    if top == -math.inf:
+        return -math.inf, present, 0.0, 0.0
+    total = near = mean = square = 0.0
+    for way in range(len(ways)):
+        for i in range(delays.shape[0]):
+            for k in range(delays.shape[1]):
+                below = ways[way, i, k] - top
+                if not inside[i, k] or abs(delays[i, k] - present) <= least or below < NEGLIGIBLE:
+                    continue
+                weight, away = math.exp(below), delays[i, k] - likeliest
+                total += weight
+                if abs(away) <= 2.0 * least:
+                    near += weight
+                    mean += weight * away
+                    square += weight * away * away
+    mean /= near
+    spread = math.sqrt(max(square / near - mean * mean, 0.0))
+    return top + prior + math.log(total) - now, likeliest + mean, spread, near / total
