@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import shutil
 import subprocess
@@ -26,6 +27,13 @@ one_blas_thread()
 
 WITHOUT_ROS = find_spec("rclpy") is None
 collect_ignore = ["ros"] if WITHOUT_ROS else []
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _what_is_loaded_is_no_garbage():
+    """A run of all tests holds millions of objects. A collection that searches them takes seconds, and a step loop makes one every second."""
+    gc.collect()
+    gc.freeze()
 
 
 def pytest_report_header() -> list[str]:

@@ -1,5 +1,6 @@
 """The stepping thread and its account, against scripted estimators and clocks."""
 
+import gc
 import math
 import threading
 import time
@@ -24,6 +25,12 @@ from ctr_dynamics.runtime.step_loop import (
 from ctr_dynamics.runtime.timing import Histogram, StepTiming
 
 MS = 1_000_000
+
+
+@pytest.fixture(autouse=True)
+def _frozen():
+    """As :meth:`StepLoop.run` does before its first round."""
+    gc.freeze()
 
 
 class Scripted:
