@@ -423,13 +423,16 @@ class Estimator:
             return self._invalid(k, too_old, innovations)
         fused.inflate_covariance(tip, self.runs.open_loop, self._largest_deviation)
         self._unexpected.inflate(tip.covariance, stamp)
-        modes = self._modes.measure(fused.state, k)
-        self._twist_error.inflate(tip, stamp, open_loop, fused.ekf, self.inputs.periods_s, modes)
+        since = fused.measured_ns if fused.measured_ns is not None else self.t0_ns
+        health.tracker_age_s = max(0.0, (stamp - (since or stamp)) * 1e-9)
+        modes, periods_s = (
+            self._modes.measure(fused.state, k),
+            (self.inputs.joint_period_s, fused.pose_period_s),
+        )
+        self._twist_error.inflate(tip, stamp, open_loop, fused.ekf, periods_s, modes)
         self._driven_m = self.inputs.actuator_error.inflate(
             tip.covariance, tip.position, self._length, stamp, late.lag * STEP_NS
         )
-        since = fused.measured_ns if fused.measured_ns is not None else self.t0_ns
-        health.tracker_age_s = max(0.0, (stamp - (since or stamp)) * 1e-9)
         problem = health.problem = self._problem(stamp, tip.position_deviation, unsettled)
         return StepOutput(
             stamp, k, not problem, problem, tip.position, tip.quaternion, tip.covariance[:6, :6], tip.twist, tip.covariance[6:, 6:],
@@ -455,7 +458,7 @@ class Estimator:
             return unsettled
         deviations = Deviations(deviation, self._driven_m, self._largest_deviation)
         fused = self.runs.fused
-        return deviations.problem(self.health, fused.timing.late.apart if fused.late else None)
+        return deviations.problem(self.health, fused.timing.apart if fused.late else None)
 
     def _look_for_motion(self) -> None:
         """Have outputs wait after a gap of the joints, or after a start, in which the robot moved."""

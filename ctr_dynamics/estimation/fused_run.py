@@ -121,6 +121,13 @@ class FusedRun:
         return UNKNOWN_DELAY if self.late else MOVING_FRAME if self.moving else ""
 
     @property
+    def pose_period_s(self) -> float:
+        """s between two measurements that are fused, at least the time since the last one; infinite while none are."""
+        if not self._health.fusing or self.not_fused:
+            return math.inf
+        return max(self._inputs.measurements.period_s, self._health.tracker_age_s)
+
+    @property
     def inputs_at(self) -> RunInputs:
         """Actuators and load with the estimated offsets and force."""
         return RunInputs(self._interpolated, self._load, self._by_theta, self.ekf.theta)
@@ -150,6 +157,8 @@ class FusedRun:
                 self.timing.add(
                     measurement.stamp_ns, newest_s, seen, tips, update.foretold, expected, self.ekf.delay
                 )
+                if expected.slower:
+                    expected.refine(*self.timing.response.refined(expected.response))
                 self.model_error_search.add(
                     measurement.stamp_ns,
                     seen,
@@ -232,22 +241,21 @@ class FusedRun:
         expected, delay, was_late = self.ekf.expected, self.ekf.delay, self.late
         found = self.timing.found(expected, delay)
         self.late = found is None and self.timing.undecided(expected, delay)
-        if found is None and expected.response_sigma:
-            expected.responds(*self.timing.response.refined(expected.response))
         if found is None and (was_late or not self.late):
             return False
         kind, note = "latency", "poses are older than their stamps, by a time that is not known yet"
         if found is not None:
             if found.response is not None:
                 expected.responds(found.response, found.deviation)
-                expected.late_by(0.0, 0.0)  # a response tells by itself how late a tracker is
+                expected.late_by(0.0, 0.0)  # a response tells by itself how late a tracker is,
+                expected.jitter = 0.0  # and looks like jitter before it is known
+                self.end_of_jitter.clear()
                 kind, note = "response", in_words(found.response)
             elif found.delay is not None:
                 expected.late_by(found.delay, found.deviation)
-                whole_ms = 1e3 * expected.newest_s
+                whole_ms = 1e3 * (expected.model.delay + expected.delay)
                 note = f"poses are {abs(whole_ms):.0f} ms {'older' if whole_ms > 0.0 else 'newer'} than their stamps"
-            queue = self._inputs.measurements
-            queue.early_s = max(queue.tracker.delay - expected.newest_s, 0.0)
+            self._inputs.measurements.early_s = max(-expected.delay, 0.0)
             self.timing.followed(found)
             self._health.distances.clear()
         advice = "; check the tracker's clock, or set tracker.delay_s" if kind == "latency" else ""

@@ -57,7 +57,7 @@ DELAY, DRIFT, SHIFT = 15, slice(16, 19), slice(19, 22)
 # Gauss and Legendre's rule of five points on [0, 1]
 AVERAGE_POINTS = np.array([0.04691008, 0.23076534, 0.5, 0.76923466, 0.95308992])
 AVERAGE_WEIGHTS = np.array([0.11846344, 0.23931434, 0.28444444, 0.23931434, 0.11846344])
-SMOOTHED = 4.0  # time constants of a low-pass filter that are looked back: 2 % of its response is older
+SMOOTHED = 4.0  # time constants of a low-pass filter that are looked back; the older 2 % of its response count at their mean age, one more
 PART_S = 0.015  # s, over which the rule is good for vibrations that a model follows in steps of 3 ms
 
 
@@ -218,8 +218,11 @@ class TrackerModel:
         if self.smoothing > 0.0:
             older, less = _points(SMOOTHED * self.smoothing)
             less = less * np.exp(-older / self.smoothing)
+            tail = math.exp(-SMOOTHED)
+            older = np.append(older, (SMOOTHED + 1.0) * self.smoothing)
+            less = np.append(less * ((1.0 - tail) / less.sum()), tail)
             ages = np.add.outer(older, ages).ravel()
-            weights = np.multiply.outer(less / less.sum(), weights).ravel()
+            weights = np.multiply.outer(less, weights).ravel()
         return tuple(zip(ages.tolist(), weights.tolist(), strict=True))
 
     @property

@@ -34,7 +34,7 @@ def seen_through(path, response, t):
 def timing(response=0.0, delay=0.0, foretold=(-20.0, -2.0), seconds=1.0, expected=None):
     """Positions at 40 Hz of a tracker of that response and delay, beside a filter that has `foretold` every one like that."""
     rng, found = np.random.default_rng(3), TrackerTiming(NOISE, 20.0, LENGTH, REGISTERED)
-    times = np.arange(0.0, 1.5 + seconds, 0.003)
+    times = np.arange(-1.0, 1.5 + seconds, 0.003)
     for k in range(round(40 * (seconds + 0.5))):
         t = 0.5 + 0.025 * k
         z = seen_through(swinging, response, t) if response else swinging(np.array([t - delay]))[0]
@@ -137,13 +137,20 @@ def test_weights_are_those_of_the_response(response):
         assert gain == pytest.approx(1.0 / (1.0 + 2j * np.pi * 4.0 * response), abs=0.01)
 
 
+@pytest.mark.parametrize(("averaging", "smoothing"), [(0.0, 0.0), (0.06, 0.0), (0.0, 0.04), (0.03, 0.02)])
+def test_the_mean_age_is_that_of_what_is_shown(averaging, smoothing):
+    tracker = replace(TRACKER, averaging=averaging, smoothing=smoothing)
+    assert sum(weight for _, weight in tracker.window) == pytest.approx(1.0)
+    assert tracker.delay + sum(age * weight for age, weight in tracker.window) == pytest.approx(tracker.age)
+
+
 @pytest.mark.parametrize(("averaging", "smoothing"), [(0.06, 0.0), (0.0, 0.04), (0.03, 0.02)])
 @pytest.mark.parametrize("hertz", [2.0, 16.0, 40.0])
 def test_the_tracker_model_shows_vibrations_as_a_mean_or_filter_does(averaging, smoothing, hertz):
     w = 2j * np.pi * hertz
     mean = -np.expm1(-w * averaging) / (w * averaging) if averaging else 1.0
-    kept = np.exp(-4.0 * (1.0 + w * smoothing))  # the oldest 2 % are left out
-    slow = (1.0 - kept) / (1.0 + w * smoothing) / (1.0 - np.exp(-4.0)) if smoothing else 1.0
+    tail = np.exp(-4.0 * (1.0 + w * smoothing))  # the oldest 2 % are at their mean age
+    slow = (1.0 - tail) / (1.0 + w * smoothing) + np.exp(-4.0 - 5.0 * w * smoothing) if smoothing else 1.0
     tracker = replace(TRACKER, averaging=averaging, smoothing=smoothing)
     assert gain_at(tracker, np.array([hertz]))[0] == pytest.approx(mean * slow, abs=2e-3)
     seen = tracker.observed_tip(
@@ -172,6 +179,40 @@ def test_of_a_vibration_that_the_tracker_may_not_show_nothing_is_certain():
     unsure = expected.seen_of(np.array([12.0]))[0]
     expected.responds(-0.03, 0.0)
     assert 0.0 < unsure < expected.seen_of(np.array([12.0]))[0]
+
+
+def test_a_response_that_is_refined_keeps_its_kind_and_needs_no_other_window():
+    expected = ExpectedTracker(TRACKER)
+    file = expected.reach_s
+    expected.responds(0.006, 1e-3)
+    found = expected.reach_s
+    assert found > file
+    for response, kept in ((0.2, 0.0105), (-0.2, 0.0015), (0.007, 0.007)):
+        expected.refine(response, 0.01)
+        assert expected.response == pytest.approx(kept)
+        assert expected.reach_s == found
+        assert expected.slower.window[-1][0] <= found
+    expected.responds(0.0, 0.0)
+    assert expected.slower is None
+    assert expected.reach_s == file
+
+
+def test_responses_that_are_shorter_than_a_step_or_slower_than_all_are_left_alone():
+    assert weights_of(1e-5, 10)[0] == weights_of(-1e-5, 10)[0] == 1.0
+    times = np.arange(0.0, 1.0, 0.003)
+    same = through(replace(TRACKER, averaging=1e-5), times, swinging(times))
+    np.testing.assert_array_equal(same[1], swinging(times))
+    slow = ExpectedTracker(replace(TRACKER, averaging=0.3))
+    assert timing(-0.15, expected=slow).response.belief(slow.response).late == 0.0
+
+
+def test_steps_that_failed_do_not_shift_what_the_tracker_shows():
+    tracker = replace(TRACKER, averaging=0.0, smoothing=0.03)
+    times = np.arange(0.0, 2.0, 0.003)
+    some = np.delete(times, [300, 301, 302, 500])
+    stamps, tips = through(tracker, some, swinging(some))
+    expected = np.array([seen_through(swinging, 0.03, t) for t in stamps[-50:]])
+    np.testing.assert_allclose(tips[-50:], expected, atol=3e-4)
 
 
 def smoothed(messages, time_s, name):
@@ -211,7 +252,7 @@ def test_a_response_that_was_found_stays_over_a_reset():
     messages = smoothed(bag_messages("clean_protocol", 3.0), 0.06, "clean_protocol")
     run = play([m for m in messages if m.stamp < 2.5e9])
     made = run.estimator
-    assert made.runs.fused.ekf.expected.response_sigma > 0.0
+    assert made.runs.fused.ekf.expected.slower is not None
     made.reset()
     for message in messages:
         if message.stamp >= 2.5e9:

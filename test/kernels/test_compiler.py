@@ -85,6 +85,7 @@ class Checkout:
             **os.environ,
             "PYTHONPATH": str(self.package.parent),
             "NUMBA_CACHE_DIR": str(self.cache),
+            "PYTHONDONTWRITEBYTECODE": "1",  # two changes within a second and of one size are the same to Python's own cache
         }
         command = [sys.executable, "-m", "ctr_dynamics.health"]
         done = subprocess.run(

@@ -65,7 +65,7 @@ class RodEkf:
         theta: (p,) estimated changes of the uncertain parameters. bias: (22,) tracker states b. pi: (r + 22, r + 22) Pi.
         factor: V. tips: those of the last steps. adapted: of the unknown tip force. gate: counts rejections. stride: of the columns in the last step.
         refuted: whether the estimate refutes the tolerances of the robot file. The delay is not estimated then.
-        expected: the tracker as the filter counts on it; whoever changes its timing has :meth:`start` called next.
+        expected: the tracker as the filter counts on it; whoever changes its delay or reach has :meth:`start` called next. tracker: its model.
         insertion_fraction: of beta's rate, what the model's velocities hold already.
     """
 

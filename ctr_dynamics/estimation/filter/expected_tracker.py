@@ -12,6 +12,7 @@ from ctr_dynamics.sensing import TrackerModel
 from ctr_dynamics.sensing.tracker import DELAY
 
 Floats = NDArray[np.float64]
+REFINED_S = 0.0045  # by which a response that was found may be refined: it stays of its kind, as less than 5 ms is none
 
 
 def response_of(tracker: TrackerModel) -> float:
@@ -31,25 +32,20 @@ class ExpectedTracker:
         model: by the robot file.
 
     Attributes:
-        model: with the response that is known now. delay: s, expected beyond the nominal one; delay_sigma: s, its deviation.
-        jitter: s, by which stamps are known to scatter. response_sigma: s, deviation of the response.
+        model: with the response that is known now. slower: the tracker whose response is slower by its deviation; None where nothing was found.
+        delay: s, expected beyond the nominal one; delay_sigma: s, its deviation. jitter: s, by which stamps are known to scatter.
     """
 
     def __init__(self, model: TrackerModel) -> None:
         self.model = model
-        self.delay, self.delay_sigma = 0.0, float(model.state_sigma[DELAY])
-        self.jitter = self.response_sigma = 0.0
+        self.slower: TrackerModel | None = None
+        self.delay, self.delay_sigma, self.jitter = 0.0, float(model.state_sigma[DELAY]), 0.0
+        self._found, self._oldest = response_of(model), model.window[-1][0]
 
     @property
     def reach_s(self) -> float:
-        """How much older than its stamp the oldest tip is that a measurement shows, s."""
-        oldest, _ = self.model.window[-1]
-        return max(0.0, self.model.delay) + max(0.0, self.delay) + oldest
-
-    @property
-    def newest_s(self) -> float:
-        """How much older than its stamp the newest one is, s; negative where stamps are early."""
-        return self.model.delay + self.delay
+        """How much older than its stamp the oldest tip is that a measurement may show, s. A response that is refined does not change it."""
+        return max(0.0, self.model.delay) + max(0.0, self.delay) + self._oldest
 
     def late_by(self, delay: float, sigma: float) -> None:
         """Another ``delay`` beyond the nominal one and its deviation ``sigma``, both s."""
@@ -61,22 +57,28 @@ class ExpectedTracker:
         return response_of(self.model)
 
     def responds(self, response: float, sigma: float) -> None:
-        """Another ``response`` and its deviation ``sigma``, both s."""
-        averaging, smoothing = averaging_and_smoothing(response)
-        self.model = replace(self.model, averaging=averaging, smoothing=smoothing)
-        self.response_sigma = sigma
+        """Another ``response`` and its deviation ``sigma``, both s; sigma is 0 where the tracker does not respond late any more."""
+        self._found = response
+        self._set(response, sigma)
+        slowest = response + math.copysign(REFINED_S + max(sigma, REFINED_S), response) if sigma else response
+        self._oldest = self._with(slowest).window[-1][0]
 
-    @property
-    def slower(self) -> TrackerModel:
-        """The tracker whose response is slower by its deviation."""
-        longer = self.response + math.copysign(self.response_sigma, self.response)
-        averaging, smoothing = averaging_and_smoothing(longer)
+    def refine(self, response: float, sigma: float) -> None:
+        """The same kind of response, better known, close to what was found."""
+        self._set(min(max(response, self._found - REFINED_S), self._found + REFINED_S), min(sigma, REFINED_S))
+
+    def _set(self, response: float, sigma: float) -> None:
+        self.model = self._with(response)
+        self.slower = self._with(response + math.copysign(sigma, response)) if sigma else None
+
+    def _with(self, response: float) -> TrackerModel:
+        averaging, smoothing = averaging_and_smoothing(response)
         return replace(self.model, averaging=averaging, smoothing=smoothing)
 
     def seen_of(self, frequency_hz: Floats) -> Floats:
         """(m,) parts of the amplitudes that vibrations of these frequencies (m,) certainly have in what the tracker shows."""
         gain = gain_at(self.model, frequency_hz)
-        unsure = np.abs(gain_at(self.slower, frequency_hz) - gain) if self.response_sigma else 0.0
+        unsure = np.abs(gain_at(self.slower, frequency_hz) - gain) if self.slower else 0.0
         found: Floats = np.maximum(np.abs(gain) - unsure, 0.0)
         return found
 

@@ -84,8 +84,8 @@ class Update(NamedTuple):
 
 
 class Comparison(NamedTuple):
-    """A measurement against the tip of its time: innovation ``nu`` (k,), ``H`` (k, r + 22), ``S`` (k, k), what of it is ``more`` by jitter, and the
-    record of it."""
+    """A measurement against the tip of its time: innovation ``nu`` (k,), ``H`` (k, r + 22), ``S`` (k, k), what of it is ``more`` by jitter and an
+    uncertain response, and the record of it."""
 
     nu: Floats
     H: Floats

@@ -46,15 +46,15 @@ def compare_with_tip(
     if not math.isfinite(nu.sum() + S.sum() + whitened.sum()):
         return Update.impossible("the innovation is not finite")
     more, steadier, noise = np.zeros_like(S), 0.0, tracker.noise
-    if adapted.noisy or expected.jitter or expected.response_sigma:
+    if adapted.noisy or expected.jitter or expected.slower:
         S += (adapted.noise - 1.0 if adapted.noisy else 0.0) * noise
-        slower = expected.slower.observed_tip(tip_at, time) if expected.response_sigma else None
+        slower = expected.slower.observed_tip(tip_at, time) if expected.slower else None
         if slower is not None:
             change = tracker.innovation(bias, slower, pi, position, quaternion)[0] - nu
             more += np.multiply.outer(change, change)
             S += more
         if expected.jitter:
-            before, at = tip_at(time - dt) or tip, len(pi) - STATES + DELAY
+            before, at = tracker.observed_tip(tip_at, time - dt) or tip, len(pi) - STATES + DELAY
             earlier = tracker.innovation(bias, before, pi, position, quaternion)[1]
             scattered = with_jitter(nu, S, noise, expected.jitter, -H[:, at], -earlier[:, at], dt)
             nu, S, steadier = scattered.nu, scattered.S, scattered.steadier

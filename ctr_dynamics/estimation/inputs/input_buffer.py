@@ -110,11 +110,6 @@ class InputBuffer:
         stamps = self.joints.stamps
         return (stamps[-1] - stamps[-2]) * 1e-9 if len(stamps) > 1 else 0.0
 
-    @property
-    def periods_s(self) -> tuple[float, float]:
-        """s between the last two joint states, and between the last two tracker poses; 0 and infinite before there are two."""
-        return self.joint_period_s, self.measurements.period_s
-
     def carry_load(self, load: Signal) -> None:
         """Have of loads only the last one of ``load``: what hangs on the robot does so whatever the estimator is told.
 

@@ -288,6 +288,11 @@ class DelaySearch:
         return dense
 
     @property
+    def knows(self) -> bool:
+        """Whether any measurement has counted."""
+        return bool(self._evidence)
+
+    @property
     def apart(self) -> float:
         """m between the measurements and the open-loop run with the delay that brings them together most."""
         return float(np.linalg.norm(self._evidence[-1].level, axis=1).min()) if self._evidence else 0.0

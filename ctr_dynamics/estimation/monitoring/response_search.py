@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctr_dynamics.estimation.filter.expected_tracker import averaging_and_smoothing, response_of
-from ctr_dynamics.estimation.monitoring.delay_search import FINER, DelaySearch, DelaySearchOptions
+from ctr_dynamics.estimation.monitoring.delay_search import FINER, Belief, DelaySearch, DelaySearchOptions
 from ctr_dynamics.estimation.timeline import DT
 from ctr_dynamics.kernels.parabolas import fill_between
 from ctr_dynamics.sensing.tracker import SMOOTHED, TrackerModel
@@ -25,6 +25,7 @@ Floats = NDArray[np.float64]
 RESPONSES = DelaySearchOptions(
     earliest_s=0.075, longest_s=0.12, near=0.5, settles_s=0.2, prior=0.01 * DelaySearchOptions.prior, changes=False,
 )  # fmt: skip
+LOOKED_BACK = SMOOTHED + 1.0  # time constants
 PARTS = 20  # of a step, to which the integral of a response is taken
 
 
@@ -42,12 +43,13 @@ def weights_of(response: float, steps: int) -> Floats:
     """(steps,) what tips 0, 1, 2 .. steps of 3 ms ago, with straight lines between them, count in a pose of that ``response`` (s)."""
     weights = np.zeros(steps)
     window, tau = averaging_and_smoothing(response)
-    if not response:
+    if abs(response) < 0.5 * DT:
         weights[0] = 1.0
         return weights
     ages = (np.arange(PARTS * (steps - 1)) + 0.5) * DT / PARTS
     density = (ages < window).astype(float) if window else np.exp(-ages / tau)
-    density /= density.sum()
+    weights[-1] = 0.0 if window else math.exp(-(steps - 1) * DT / tau)  # and what is older
+    density *= (1.0 - weights[-1]) / density.sum()
     before = ages / DT
     i = before.astype(int)
     np.add.at(weights, i, density * (1.0 - (before - i)))
@@ -58,16 +60,19 @@ def weights_of(response: float, steps: int) -> Floats:
 class ResponseSearch(DelaySearch):
     """Evidence for every response of the tracker against that of the filter; the arguments are those of :class:`DelaySearch`.
 
+    What that calls a delay is a response here.
+
     Attributes:
         reach_s: s, how far into the past the slowest looks.
     """
 
     def __init__(self, noise: float, change_s: float, length: float, registered: float) -> None:
         super().__init__(noise, change_s, length, registered, RESPONSES)
-        steps = math.ceil(SMOOTHED * RESPONSES.longest_s / DT)
+        steps = 1 + math.ceil(LOOKED_BACK * RESPONSES.longest_s / DT)
         self._weights = np.stack([weights_of(u, steps) for u in np.round(self.delays, 6)])
         self._ages = DT * np.arange(steps)
         self.reach_s = float(self._ages[-1])
+        self._finest_s = float(np.ptp(self._dense[1, :2])) / math.sqrt(12.0)  # what the grid leaves open
 
     def newest(self, time_s: float) -> float:
         """The newest time (s) of the open-loop run that a measurement of ``time_s`` may show."""
@@ -75,12 +80,23 @@ class ResponseSearch(DelaySearch):
 
     def shown(self, time_s: float, stamps: Floats, tips: Floats) -> Floats | None:
         """(d, 3) m of the open-loop run, that measurements of ``time_s`` (s) show with every response; None where that is not known."""
-        if len(stamps) < 2 or time_s < stamps[0]:
-            return None
         times = time_s - self._ages
+        if len(stamps) < 2 or times[-1] < stamps[0]:
+            return None
         past = np.stack([np.interp(times, stamps, tips[:, axis]) for axis in range(3)], axis=1)
         found: Floats = self._weights @ past
         return found
+
+    def belief(self, present_s: float) -> Belief:
+        """How likely another response than ``present_s`` (s) is; one that is slower than all that are tried is left as it is."""
+        if not self.delays[0] <= present_s <= self.delays[-1]:
+            return Belief(0.0, present_s, 0.0, 0.0)
+        return super().belief(present_s)
+
+    def found(self, present_s: float) -> tuple[float, float] | None:
+        """The response that is believed instead of ``present_s``, and its deviation, s; None where there is none."""
+        found = super().found(present_s)
+        return found and (found[0], max(found[1], self._finest_s))
 
     def undecided(self, present_s: float) -> bool:
         """Whether another response is believed, which has yet to settle; to be asked where none is :meth:`found`."""
@@ -97,18 +113,20 @@ class ResponseSearch(DelaySearch):
         values, weights = self._dense[near], np.exp(dense[near] - dense[near].max())
         weights /= weights.sum()
         mean = float(weights @ values)
-        return mean, math.sqrt(float(weights @ (values - mean) ** 2))
+        return mean, max(math.sqrt(float(weights @ (values - mean) ** 2)), self._finest_s)
 
 
 def through(tracker: TrackerModel, stamps: Floats, tips: Floats) -> tuple[Floats, Floats]:
-    """Stamps (k,) s and positions (k, 3) m of the tips as ``tracker`` shows them: those of which enough of the past is known."""
+    """Stamps (k,) s, evenly, and positions (k, 3) m of the tips as ``tracker`` shows them: those of which enough of the past is known."""
     response = response_of(tracker)
-    if not response:
+    if abs(response) < 0.5 * DT or len(stamps) < 2:
         return stamps, tips
     window, tau = averaging_and_smoothing(response)
-    steps = 2 + math.ceil((window or SMOOTHED * tau) / DT)
-    if len(tips) < steps:
+    steps = 2 + math.ceil((window or LOOKED_BACK * tau) / DT)
+    count = 1 + math.floor((stamps[-1] - stamps[0]) / DT + 1e-6)
+    if count < steps:
         return stamps[:0], tips[:0]
+    even = stamps[-1] - DT * np.arange(count)[::-1]  # steps that failed are missing
     weights = weights_of(response, steps)
-    seen = [np.convolve(tips[:, axis], weights, "valid") for axis in range(3)]
-    return stamps[steps - 1 :], np.stack(seen, axis=1)
+    seen = [np.convolve(np.interp(even, stamps, tips[:, axis]), weights, "valid") for axis in range(3)]
+    return even[steps - 1 :], np.stack(seen, axis=1)

@@ -89,6 +89,11 @@ class TrackerTiming:
                 return Found(None, 0.0, 0.0) if responds_at_once else Found(None, *slow)
         return None
 
+    @property
+    def apart(self) -> float:
+        """m between the measurements and the open-loop run with the delay or response that brings them together most."""
+        return min((search.apart for search in (self.late, self.response) if search.knows), default=0.0)
+
     def undecided(self, expected: ExpectedTracker, delay: float) -> bool:
         """Whether the tracker has been late since the start, nobody knows yet in which way; to be asked where nothing is :meth:`found`."""
         return self.late.undecided(delay) or self.response.undecided(expected.response)

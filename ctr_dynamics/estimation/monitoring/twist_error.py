@@ -34,6 +34,7 @@ MEMORY_S = (
 )
 MOST = 2.0  # mean square of the difference of two vibrations of unknown phase, by that of one
 KEPT = 0.5  # part of a column's vibration that it may lose in the time for which columns count, and still corrects the mode
+SMALLEST = 1e-30  # m^2 s: a tracker without noise tells all
 OVER = 1e-3  # of its amplitude: a vibration that has decayed so far is over
 
 
@@ -196,8 +197,8 @@ class HiddenVibration:
         if not len(modes.frequency_hz):
             covariance += self._known
             return
-        of_poses = self._noise**2 * period_s
-        told = expected.seen_of(modes.frequency_hz) ** 2 * (0.5 / of_poses if of_poses > 0.0 else math.inf)
+        of_poses = max(self._noise**2 * period_s, SMALLEST)
+        told = expected.seen_of(modes.frequency_hz) ** 2 * (0.5 / of_poses)
         self._known = np.zeros((12, 12))
         add_hidden_vibrations(
             self._tolerance, told, MOST, RESOLVED_HZ, modes.frequency_hz, modes.amplitude, modes.rate, modes.direction, self._known,
@@ -277,6 +278,6 @@ class TwistError:
         self._frame.inflate(covariance, tip.twist, tip.quaternion)
         if periods_s[0] > 0.0:
             self._encoders.add(stamp_ns, periods_s[0])
-        if ekf.expected.response and math.isfinite(periods_s[1]):
+        if ekf.expected.response:
             self._hidden.inflate(covariance, vibrating, periods_s[1], ekf.expected)
         self._encoders.inflate(covariance)
