@@ -425,10 +425,8 @@ class Estimator:
         self._unexpected.inflate(tip.covariance, stamp)
         since = fused.measured_ns if fused.measured_ns is not None else self.t0_ns
         health.tracker_age_s = max(0.0, (stamp - (since or stamp)) * 1e-9)
-        modes, periods_s = (
-            self._modes.measure(fused.state, k),
-            (self.inputs.joint_period_s, fused.pose_period_s),
-        )
+        modes = self._modes.measure(fused.state, k)
+        periods_s = self.inputs.joint_period_s, fused.pose_period_s
         self._twist_error.inflate(tip, stamp, open_loop, fused.ekf, periods_s, modes)
         self._driven_m = self.inputs.actuator_error.inflate(
             tip.covariance, tip.position, self._length, stamp, late.lag * STEP_NS

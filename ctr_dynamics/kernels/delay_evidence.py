@@ -9,6 +9,16 @@ NEGLIGIBLE = -40.0  # logarithm of a weight beside the largest: below the last d
 
 
 @compiled
+def density_about(level, residual, total, spread):
+    """Logarithm of the density of a ``residual`` (3,) about a ``level`` (3,), by that of the noise at zero; ``total``: m^2, its variance per axis,
+    and ``spread`` 3 log of that by the noise's. As :func:`~ctr_dynamics.estimation.monitoring.densities.log_density`."""
+    square = 0.0
+    for axis in range(3):
+        square += (residual[axis] - level[axis]) ** 2
+    return -0.5 * (square / total + spread)
+
+
+@compiled
 def weigh_delays(residual, before, told, level, evidence):
     """Evidence for delays that have been there since the start, with another measurement.
 
@@ -20,12 +30,9 @@ def weigh_delays(residual, before, told, level, evidence):
     noise, total, gain, decay = told
     spread = 3.0 * math.log(total / noise)
     for i in range(len(residual)):
-        square = 0.0
+        evidence[i] = decay * old_evidence[i] + density_about(old_level[i], residual[i], total, spread)
         for axis in range(3):
-            change = residual[i, axis] - old_level[i, axis]
-            square += change * change
-            level[i, axis] = old_level[i, axis] + gain * change
-        evidence[i] = decay * old_evidence[i] - 0.5 * (square / total + spread)
+            level[i, axis] = old_level[i, axis] + gain * (residual[i, axis] - old_level[i, axis])
 
 
 @compiled
@@ -40,12 +47,8 @@ def weigh_changes(residual, before, told, begun, level, evidence, began_ns):
     noise, total, gain, decay = told
     spread = 3.0 * math.log(total / noise)
     for i in range(len(residual)):
-        goes_on = begins = 0.0
-        for axis in range(3):
-            goes_on += (residual[i, axis] - old_level[i, axis]) ** 2
-            begins += (residual[i, axis] - now_level[axis]) ** 2
-        on = decay * old_evidence[i] - 0.5 * (goes_on / total + spread)
-        new = now_evidence - 0.5 * (begins / total + spread)
+        on = decay * old_evidence[i] + density_about(old_level[i], residual[i], total, spread)
+        new = now_evidence + density_about(now_level, residual[i], total, spread)
         evidence[i], began_ns[i] = (new, now_ns) if new > on else (on, old_began_ns[i])
         for axis in range(3):
             was = now_level[axis] if new > on else old_level[i, axis]

@@ -68,6 +68,22 @@ def _points(length: float) -> tuple[Floats, Floats]:
     return points, np.tile(AVERAGE_WEIGHTS, parts) / parts
 
 
+def window_of(averaging: float, smoothing: float) -> tuple[Floats, Floats]:
+    """Ages (k,) s, newest first, and weights (k,) of the poses that a measurement shows the mean of: of a window, a low-pass filter, or both (s)."""
+    ages, weights = np.zeros(1), np.ones(1)
+    if averaging > 0.0:
+        ages, weights = _points(averaging)
+    if smoothing > 0.0:
+        older, less = _points(SMOOTHED * smoothing)
+        less = less * np.exp(-older / smoothing)
+        tail = math.exp(-SMOOTHED)
+        older = np.append(older, (SMOOTHED + 1.0) * smoothing)
+        less = np.append(less * ((1.0 - tail) / less.sum()), tail)
+        ages = np.add.outer(older, ages).ravel()
+        weights = np.multiply.outer(less, weights).ravel()
+    return ages, weights
+
+
 def free_axis(mask: NDArray[np.bool_]) -> int:
     """1 to 3: the one rotation axis that the ``mask`` (6,) of measured axes leaves out; 0 where it leaves out none or several."""
     return 1 + int(np.argmin(mask[3:])) if np.sum(mask[3:]) == 2 else 0
@@ -212,17 +228,7 @@ class TrackerModel:
     @cached_property
     def window(self) -> tuple[tuple[float, float], ...]:
         """(age in s, weight) of the poses that a measurement shows the mean of."""
-        ages, weights = np.zeros(1), np.ones(1)
-        if self.averaging > 0.0:
-            ages, weights = _points(self.averaging)
-        if self.smoothing > 0.0:
-            older, less = _points(SMOOTHED * self.smoothing)
-            less = less * np.exp(-older / self.smoothing)
-            tail = math.exp(-SMOOTHED)
-            older = np.append(older, (SMOOTHED + 1.0) * self.smoothing)
-            less = np.append(less * ((1.0 - tail) / less.sum()), tail)
-            ages = np.add.outer(older, ages).ravel()
-            weights = np.multiply.outer(less, weights).ravel()
+        ages, weights = window_of(self.averaging, self.smoothing)
         return tuple(zip(ages.tolist(), weights.tolist(), strict=True))
 
     @property

@@ -11,7 +11,7 @@ import math
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -111,6 +111,12 @@ class Belief(NamedTuple):
     odds: float = -math.inf
 
 
+def tips_at(times: NDArray[np.floating[Any]], stamps: Floats, tips: Floats) -> Floats:
+    """(t, 3) m at ``times`` (t,) s, on straight lines between ``tips`` (k, 3) m of ``stamps`` (k,) s."""
+    found: Floats = np.stack([np.interp(times, stamps, path) for path in tips.T], axis=1)
+    return found
+
+
 class DelaySearch:
     """Evidence for every delay of the tracker against that of the filter.
 
@@ -183,7 +189,7 @@ class DelaySearch:
         times = time_s - self.delays
         if len(stamps) < 2 or times[-1] < stamps[0]:
             return None
-        return np.stack([np.interp(times, stamps, tips[:, axis]) for axis in range(3)], axis=1)
+        return tips_at(times, stamps, tips)
 
     def _take(self, measured: Waiting, stamps: Floats, tips: Floats) -> None:
         """Have a measurement count that all tips (k, 3) m of the open-loop run are known for; ``stamps`` (k,) s."""
@@ -217,11 +223,8 @@ class DelaySearch:
         changed, began_ns, changed_level = last.changed, last.began_ns, last.changed_level
         if options.changes:
             now = right_before + math.log(-math.expm1(-elapsed / options.sound_s))
-            changed, began_ns, changed_level = (
-                np.empty_like(delays),
-                np.empty_like(began_ns),
-                np.empty_like(level),
-            )
+            changed, began_ns = np.empty_like(delays), np.empty_like(began_ns)
+            changed_level = np.empty_like(level)
             weigh_changes(
                 residual, (last.changed_level, last.changed, last.began_ns), told, (last.level[present], now, last.stamp_ns),
                 changed_level, changed, began_ns,
@@ -241,8 +244,12 @@ class DelaySearch:
         The filter may be right; so may the open-loop run with the delay that the filter has, the tracker moved or not, and so may it with any other.
         """
         if self._belief is None or self._belief[0] != present_s:
-            self._belief = present_s, self._compare(present_s, self._evidence, self.options.changes)
+            self._belief = present_s, self._judge(present_s)
         return self._belief[1]
+
+    def _judge(self, present_s: float) -> Belief:
+        """What :meth:`belief` keeps until another measurement counts."""
+        return self._compare(present_s, self._evidence, self.options.changes)
 
     def _compare(self, present_s: float, known: Sequence[Evidence], changes: bool = True) -> Belief:
         if not known:
@@ -307,14 +314,12 @@ class DelaySearch:
         if not self._sure(belief):
             return None
         always = self._compare(present_s, self._evidence, changes=False)
-        settles_s = self.options.settles_s
-        if self._sure(always) and (
-            not settles_s or self._compare(present_s, self._until(settles_s), changes=False).late > 0.5
-        ):
+        settled = self._until(self.options.settles_s)
+        if self._sure(always) and self._compare(present_s, settled, changes=False).late > 0.5:
             return always.delay, always.spread
         if not self.options.changes:
             return None
-        before = self._compare(present_s, self._until(max(abs(belief.delay), self.options.lasts_s)))
+        before = self._compare(present_s, self._until(max(belief.delay, self.options.lasts_s)))
         same = abs(before.delay - belief.delay) <= 2.0 * self.options.least_s
         return (belief.delay, belief.spread) if same and before.near > 0.5 else None
 

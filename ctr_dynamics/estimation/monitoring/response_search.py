@@ -14,7 +14,13 @@ from numpy.typing import NDArray
 
 from ctr_dynamics import chi_square
 from ctr_dynamics.estimation.filter.expected_tracker import averaging_and_smoothing, response_of
-from ctr_dynamics.estimation.monitoring.delay_search import FINER, Belief, DelaySearch, DelaySearchOptions
+from ctr_dynamics.estimation.monitoring.delay_search import (
+    FINER,
+    Belief,
+    DelaySearch,
+    DelaySearchOptions,
+    tips_at,
+)
 from ctr_dynamics.estimation.timeline import DT
 from ctr_dynamics.kernels.parabolas import fill_between
 from ctr_dynamics.sensing.tracker import SMOOTHED, TrackerModel
@@ -85,18 +91,16 @@ class ResponseSearch(DelaySearch):
         times = time_s - self._ages
         if len(stamps) < 2 or times[-1] < stamps[0]:
             return None
-        past = np.stack([np.interp(times, stamps, tips[:, axis]) for axis in range(3)], axis=1)
-        found: Floats = self._weights @ past
+        found: Floats = self._weights @ tips_at(times, stamps, tips)
         return found
 
-    def belief(self, present_s: float) -> Belief:
-        """How likely another response than ``present_s`` (s) is; one that is slower than all that are tried is left as it is."""
-        if not self.delays[0] <= present_s <= self.delays[-1]:
-            return Belief(0.0, present_s, 0.0, 0.0)
-        found = super().belief(present_s)
-        if found.late > 0.5 and not self._explains():
-            return Belief(0.0, present_s, 0.0, 0.0)
-        return found
+    def _judge(self, present_s: float) -> Belief:
+        """As of delays, but a response is left as it is that is slower than all that are tried, or where none leaves noise."""
+        if self.delays[0] <= present_s <= self.delays[-1]:
+            found = super()._judge(present_s)
+            if found.late <= 0.5 or self._explains():
+                return found
+        return Belief(0.0, present_s, 0.0, 0.0)
 
     def _explains(self) -> bool:
         """Whether the likeliest response leaves noise, of late and in all. Where the model errs by more, any that smooths fits better."""
@@ -145,5 +149,5 @@ def through(tracker: TrackerModel, stamps: Floats, tips: Floats) -> tuple[Floats
         return stamps[:0], tips[:0]
     even = stamps[-1] - DT * np.arange(count)[::-1]  # steps that failed are missing
     weights = weights_of(response, steps)
-    seen = [np.convolve(np.interp(even, stamps, tips[:, axis]), weights, "valid") for axis in range(3)]
+    seen = [np.convolve(path, weights, "valid") for path in tips_at(even, stamps, tips).T]
     return even[steps - 1 :], np.stack(seen, axis=1)
