@@ -12,7 +12,6 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from ctr_dynamics import chi_square
 from ctr_dynamics.estimation.filter.expected_tracker import averaging_and_smoothing, response_of
 from ctr_dynamics.estimation.monitoring.delay_search import (
     FINER,
@@ -32,7 +31,6 @@ Floats = NDArray[np.float64]
 RESPONSES = DelaySearchOptions(
     earliest_s=0.075, longest_s=0.12, near=0.5, settles_s=0.2, prior=0.01 * DelaySearchOptions.prior, changes=False,
 )  # fmt: skip
-NOISE_LIMIT = 0.999  # probability of the noise's squares that a response may leave
 LOOKED_BACK = SMOOTHED + 1.0  # time constants
 PARTS = 20  # of a step, to which the integral of a response is taken
 
@@ -95,24 +93,10 @@ class ResponseSearch(DelaySearch):
         return found
 
     def _judge(self, present_s: float) -> Belief:
-        """As of delays, but a response is left as it is that is slower than all that are tried, or where none leaves noise."""
+        """As of delays, but a response that is slower than all that are tried is left as it is."""
         if self.delays[0] <= present_s <= self.delays[-1]:
-            found = super()._judge(present_s)
-            if found.late <= 0.5 or self._explains():
-                return found
+            return super()._judge(present_s)
         return Belief(0.0, present_s, 0.0, 0.0)
-
-    def _explains(self) -> bool:
-        """Whether the likeliest response leaves noise, of late and in all. Where the model errs by more, any that smooths fits better."""
-        last, memory_ns = self._evidence[-1], 1e9 * self.options.memory_s
-        likeliest = int(last.delays.argmax())
-        counts = [math.exp((e.stamp_ns - last.stamp_ns) / memory_ns) for e in self._evidence]
-        for begin in {0, max(len(self._until(self.options.settles_s)) - 1, 0)}:
-            before = counts[begin] * float(self._evidence[begin].delays[likeliest])
-            left = -2.0 * (float(last.delays[likeliest]) - before)
-            if left > chi_square.quantile(NOISE_LIMIT, 3.0 * sum(counts[begin:])):
-                return False
-        return True
 
     def found(self, present_s: float) -> tuple[float, float] | None:
         """The response that is believed instead of ``present_s``, and its deviation, s; None where there is none."""
