@@ -265,7 +265,7 @@ class TwistError:
         """Add to the covariance of ``tip`` at ``stamp_ns``, in place.
 
         ``open_loop``: the tip that measurements do not move. ``periods_s``: between two joint states, and between two poses. ``vibrating``: the
-        modes now.
+        modes now. Where no poses are fused, their period is infinite, and there is no more unknown than the tolerances say.
         """
         covariance = tip.covariance
         self._motion.add(stamp_ns, open_loop.mean[:3], open_loop.mean[7:10])
@@ -278,6 +278,6 @@ class TwistError:
         self._frame.inflate(covariance, tip.twist, tip.quaternion)
         if periods_s[0] > 0.0:
             self._encoders.add(stamp_ns, periods_s[0])
-        if ekf.expected.response:
+        if ekf.expected.response and math.isfinite(periods_s[1]):
             self._hidden.inflate(covariance, vibrating, periods_s[1], ekf.expected)
         self._encoders.inflate(covariance)
