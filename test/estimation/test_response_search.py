@@ -53,7 +53,7 @@ def test_a_mean_and_a_low_pass_filter_are_found_beside_a_wrong_registration(resp
     assert found.delay is None
     assert found.response == pytest.approx(response, abs=max(4.0 * found.deviation, 2e-3))
     assert in_words(found.response).startswith(
-        "poses are means" if response < 0.0 else "poses pass a low-pass"
+        "poses are means" if response < 0.0 else "poses lag as through a low-pass filter"
     )
 
 

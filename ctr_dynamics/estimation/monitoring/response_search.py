@@ -41,7 +41,10 @@ def in_words(response: float) -> str:
     if averaging:
         return f"poses are means over {1e3 * averaging:.0f} ms; switch the averaging off, or tell it by the effect tracker_averaging"
     if smoothing:
-        return f"poses pass a low-pass filter of {1e3 * smoothing:.0f} ms; switch it off: it hides vibrations"
+        return (
+            f"poses lag as through a low-pass filter of {1e3 * smoothing:.0f} ms; switch it off: it hides vibrations. Where the tracker has none, "
+            "the joint states may be commands that the motors follow late, or the latency is not known: measure it with ctr-dynamics align"
+        )
     return "poses are neither averaged nor smoothed any more"
 
 
