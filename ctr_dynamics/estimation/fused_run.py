@@ -80,7 +80,7 @@ class FusedRun:
         file = ekf.tracker.state_sigma
         registered = math.hypot(file[TRANSLATION].max(), length * file[ROTATION].max())
         moves = noise.position.value, ekf.options.force_change, length, registered
-        self.timing = TrackerTiming(*moves)
+        self.timing = TrackerTiming(*moves, ekf.tracker)
         self.disagreement = Disagreement(noise.position.value)
         self.end_of_jitter = EndOfJitter()
         self.model_error_search = ModelErrorSearch(
@@ -246,12 +246,13 @@ class FusedRun:
         kind, note = "latency", "poses are older than their stamps, by a time that is not known yet"
         if found is not None:
             if found.response is not None:
-                expected.responds(found.response, found.deviation)
+                expected.responds(found.response, found.deviation if found.delay is None else 0.0)
                 expected.late_by(0.0, 0.0)  # a response tells by itself how late a tracker is,
                 expected.jitter = 0.0  # and looks like jitter before it is known
                 self.end_of_jitter.clear()
                 kind, note = "response", in_words(found.response)
-            elif found.delay is not None:
+            if found.delay is not None:
+                kind = "latency"
                 expected.late_by(found.delay, found.deviation)
                 whole_ms = 1e3 * (expected.model.delay + expected.delay)
                 note = f"poses are {abs(whole_ms):.0f} ms {'older' if whole_ms > 0.0 else 'newer'} than their stamps"

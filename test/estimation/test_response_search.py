@@ -7,8 +7,8 @@ import pytest
 from estimation_cases import BAGS, bag_messages, play, truth_error
 
 from ctr_dynamics.estimation.filter.expected_tracker import ExpectedTracker, gain_at, response_of
-from ctr_dynamics.estimation.monitoring.response_search import in_words, through, weights_of
-from ctr_dynamics.estimation.monitoring.tracker_timing import TrackerTiming
+from ctr_dynamics.estimation.monitoring.response_search import ResponseSearch, in_words, through, weights_of
+from ctr_dynamics.estimation.monitoring.tracker_timing import Found, TrackerTiming
 from ctr_dynamics.robot_files import load_robot
 from ctr_dynamics.sensing import Tip, TrackerModel
 
@@ -33,7 +33,7 @@ def seen_through(path, response, t):
 
 def timing(response=0.0, delay=0.0, foretold=(-20.0, -2.0), seconds=1.0, expected=None):
     """Positions at 40 Hz of a tracker of that response and delay, beside a filter that has `foretold` every one like that."""
-    rng, found = np.random.default_rng(3), TrackerTiming(NOISE, 20.0, LENGTH, REGISTERED)
+    rng, found = np.random.default_rng(3), TrackerTiming(NOISE, 20.0, LENGTH, REGISTERED, TRACKER)
     times = np.arange(-1.0, 1.5 + seconds, 0.003)
     for k in range(round(40 * (seconds + 0.5))):
         t = 0.5 + 0.025 * k
@@ -62,6 +62,52 @@ def test_a_delay_is_not_taken_for_a_slow_response():
     assert found is not None
     assert found.response is None
     assert found.delay == pytest.approx(0.06, abs=2e-3)
+
+
+def slowly(t):
+    """A slow turn, as a delay and a mean of the same age show it alike."""
+    return np.stack([0.02 * np.sin(2.0 * t), 0.03 * np.cos(3.1 * t), 0.1 + 0.0 * t], axis=1)
+
+
+def test_a_delay_in_place_of_a_response_that_is_followed_comes_back():
+    """A mean over 0.12 s is followed, and the robot begins to vibrate: poses 60 ms late show all of that."""
+    rng, found = np.random.default_rng(5), TrackerTiming(NOISE, 20.0, LENGTH, REGISTERED, TRACKER)
+    known, delay, times = ExpectedTracker(TRACKER), 0.06, np.arange(-1.0, 4.0, 0.003)
+
+    def path(t):
+        return slowly(t) + 2e-3 * np.sin(2 * np.pi * 7.0 * np.maximum(t - 2.0, 0.0))[:, None]
+
+    for k in range(130):
+        t = 0.5 + 0.025 * k
+        seen = path(np.array([t - delay]))[0] + NOISE * rng.standard_normal(3)
+        tips = times[times <= t], path(times[times <= t])
+        found.add(round(t * 1e9), t, seen, tips, (-1.5, -1.5) if t < 2.0 else (-9.0, -4.0), known, 0.0)
+        if k == 40:  # whatever has made it believe so
+            known.responds(-0.06, 1e-3)
+            found.followed(Found(None, -0.06, 1e-3))
+            assert found.instead is not None
+    again = found.found(known, 0.0)
+    assert again is not None
+    assert again.delay == pytest.approx(delay, abs=3e-3)
+    assert again.response == response_of(TRACKER)
+    found.followed(again)
+    assert found.instead is None
+    known.responds(again.response, 0.0)
+    assert found.found(known, again.delay) is None
+
+
+def test_delays_and_responses_are_compared_by_what_both_have_counted():
+    """A response counts later, as it looks farther back. What delays have counted before speaks for neither."""
+    found = timing(delay=0.06)
+    assert not found.response.explains_better(found.late)
+    shorter = timing(response=0.06)
+    assert shorter.response.explains_better(shorter.late)
+    first = shorter.late._evidence[0]
+    shorter.late._evidence.appendleft(
+        first._replace(stamp_ns=first.stamp_ns - 10**9, delays=first.delays + 1e3)
+    )
+    assert shorter.response.explains_better(shorter.late)
+    assert not ResponseSearch(NOISE, 20.0, LENGTH, REGISTERED).explains_better(found.late)
 
 
 def test_nothing_is_found_where_the_filter_foretells_well_or_the_response_is_known():

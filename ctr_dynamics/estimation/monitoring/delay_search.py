@@ -313,15 +313,39 @@ class DelaySearch:
         belief = self.belief(present_s)
         if not self._sure(belief):
             return None
-        always = self._compare(present_s, self._evidence, changes=False)
-        settled = self._until(self.options.settles_s)
-        if self._sure(always) and self._compare(present_s, settled, changes=False).late > 0.5:
-            return always.delay, always.spread
-        if not self.options.changes:
-            return None
+        always = self.always(present_s)
+        if always is not None or not self.options.changes:
+            return always
         before = self._compare(present_s, self._until(max(belief.delay, self.options.lasts_s)))
         same = abs(before.delay - belief.delay) <= 2.0 * self.options.least_s
         return (belief.delay, belief.spread) if same and before.near > 0.5 else None
+
+    def always(self, present_s: float) -> tuple[float, float] | None:
+        """As :meth:`found`, of delays that have been there since the start."""
+        belief = self._compare(present_s, self._evidence, changes=False)
+        if self._sure(belief):
+            settled = self._compare(present_s, self._until(self.options.settles_s), changes=False)
+            if settled.late > 0.5:
+                return belief.delay, belief.spread
+        return None
+
+    def explains_better(self, other: DelaySearch) -> bool:
+        """Whether delays since the start explain what both have counted better, with their prior, than those of ``other``."""
+        if not (self._evidence and other._evidence):
+            return bool(self._evidence)
+        since = max(search._evidence[0].stamp_ns for search in (self, other))
+        until = min(search._evidence[-1].stamp_ns for search in (self, other))
+        return until > since and self._explained(since, until) > other._explained(since, until)
+
+    def _explained(self, since_ns: int, until_ns: int) -> float:
+        """Logarithm of the evidence of all delays since the start together, with their prior, from measurements after ``since_ns``."""
+        before, now = (
+            next((e for e in reversed(self._evidence) if e.stamp_ns <= stamp_ns), self._evidence[0])
+            for stamp_ns in (since_ns, until_ns)
+        )
+        decay = math.exp((before.stamp_ns - now.stamp_ns) * 1e-9 / self.options.memory_s)
+        each = math.log(self.options.prior / len(self.delays))
+        return each + float(np.logaddexp.reduce(now.delays - decay * before.delays))
 
     def _until(self, seconds: float) -> list[Evidence]:
         """What was known ``seconds`` before the last measurement."""

@@ -6,20 +6,26 @@ response that fits better. While none is sure, the tracker is not fused.
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ctr_dynamics.estimation.filter.expected_tracker import ExpectedTracker
+from ctr_dynamics.estimation.filter.expected_tracker import ExpectedTracker, response_of
 from ctr_dynamics.estimation.monitoring.delay_search import CLOCK_BEHIND, DelaySearch
 from ctr_dynamics.estimation.monitoring.response_search import ResponseSearch, through
+from ctr_dynamics.sensing import TrackerModel
 
 Floats = NDArray[np.float64]
+NONE_OF_THEM = math.inf  # a delay that is not tried: what the filter counts on is a response instead
 
 
 class Found(NamedTuple):
-    """Another ``delay`` beyond the nominal one, or another ``response``, and its ``deviation``, s; the other one is None."""
+    """Another ``delay`` beyond the nominal one or another ``response``, s, and its ``deviation``; None where that stays as it is.
+
+    A delay in place of a response that was followed comes with the response of the robot file.
+    """
 
     delay: float | None
     response: float | None
@@ -33,21 +39,33 @@ class TrackerTiming:
         noise: m per axis, deviation of a measured position.
         change_s: mean time between two changes of the unknown force. The filter may have met one with every measurement.
         length: m, of the robot outside the base plate at most. registered: m per axis, tolerance of the registration at the tip.
+        file: tracker by the robot file.
+
+    Attributes:
+        late, behind: delays beside the response that the filter counts on. response: responses without a delay.
+        instead: delays in place of a response that was found; None where none is.
     """
 
-    def __init__(self, noise: float, change_s: float, length: float, registered: float) -> None:
-        moves = noise, change_s, length, registered
-        self.late, self.behind = DelaySearch(*moves), DelaySearch(*moves, CLOCK_BEHIND)
-        self.response = ResponseSearch(*moves)
+    def __init__(
+        self, noise: float, change_s: float, length: float, registered: float, file: TrackerModel
+    ) -> None:
+        self._moves, self._file = (noise, change_s, length, registered), file
+        self.instead: DelaySearch | None = None
+        self.late, self.behind = DelaySearch(*self._moves), DelaySearch(*self._moves, CLOCK_BEHIND)
+        self.response = ResponseSearch(*self._moves)
 
     @property
     def reach_s(self) -> float:
         """How far into the past of the open-loop run the searches look at most, s."""
         return float(self.late.delays[-1] - self.behind.delays[0]) + self.response.reach_s
 
+    @property
+    def _all(self) -> list[DelaySearch]:
+        return [self.late, self.behind, self.response, *([self.instead] if self.instead else [])]
+
     def clear(self) -> None:
         """Forget all measurements."""
-        for search in (self.late, self.behind, self.response):
+        for search in self._all:
             search.clear()
 
     def add(
@@ -64,26 +82,31 @@ class TrackerTiming:
             expected, delay: the tracker and its delay beyond the nominal one (s), with which the filter has met it.
         """
         self.response.add(stamp_ns, time_s, position, *tips, foretold, expected.response)
+        if self.instead:
+            self.instead.add(stamp_ns, time_s, position, *through(self._file, *tips), foretold, NONE_OF_THEM)
         seen = through(expected.model, *tips)
         for search in (self.late, self.behind):
             search.add(stamp_ns, time_s, position, *seen, foretold, delay)
 
     def other(self, expected: ExpectedTracker, delay: float) -> float:
         """Probability of something else than the filter counts on."""
+        instead = self.instead.belief(NONE_OF_THEM).late if self.instead else 0.0
         response = self.response.belief(expected.response)
-        return max(self.late.belief(delay).late, self.behind.belief(delay).late, response.late)
+        return max(self.late.belief(delay).late, self.behind.belief(delay).late, response.late, instead)
 
     def found(self, expected: ExpectedTracker, delay: float) -> Found | None:
         """What is believed instead of the ``expected`` tracker with the estimated ``delay`` (s); None where nothing is."""
-        present = expected.response
-        responds = self.response.belief(present).odds
-        for search in (self.late, self.behind):
-            if search.belief(delay).odds >= responds:
-                late = search.found(delay)
-                if late is not None:
-                    return Found(late[0], None, late[1])
-        if responds > max(self.late.belief(delay).odds, self.behind.belief(delay).odds):
-            slow = self.response.found(present)
+        if self.instead and not self.response.explains_better(self.instead):
+            late = self.instead.always(NONE_OF_THEM)
+            if late is not None:
+                return Found(late[0], response_of(self._file), late[1])
+        delays = [search for search in (self.late, self.behind) if not self.response.explains_better(search)]
+        for search in delays:
+            late = search.found(delay)
+            if late is not None:
+                return Found(late[0], None, late[1])
+        if not delays:
+            slow = self.response.found(expected.response)
             if slow is not None:
                 responds_at_once = abs(slow[0]) <= self.response.options.least_s
                 return Found(None, 0.0, 0.0) if responds_at_once else Found(None, *slow)
@@ -100,17 +123,28 @@ class TrackerTiming:
 
     def followed(self, found: Found) -> None:
         """The filter goes on from the open-loop run with what was ``found``."""
-        if found.delay is not None:
-            gains = [search.begin_again(found.delay) for search in (self.late, self.behind)]
-            self.response.foretells_better(max(gains))
-        else:
+        if found.delay is None:
             assert found.response is not None
-            self.response.begin_again(found.response)
-            self.late.clear()
+            gain = self.response.begin_again(found.response)
+            beside = self.instead or self.late
+            beside.foretells_better(gain)
+            if found.response == response_of(self._file):
+                self.late, self.instead = beside, None
+            else:
+                self.late, self.instead = DelaySearch(*self._moves), beside
             self.behind.clear()
+            return
+        if found.response is not None:
+            assert self.instead is not None
+            self.late, self.instead = self.instead, None
+            self.behind.clear()
+        gains = [search.begin_again(found.delay) for search in (self.late, self.behind)]
+        self.response.foretells_better(max(gains))
 
     def begin_again(self, expected: ExpectedTracker, delay: float) -> None:
         """The filter goes on from the open-loop run with the delay and response that it has."""
         for search in (self.late, self.behind):
             search.begin_again(delay)
-        self.response.begin_again(expected.response)
+        gain = self.response.begin_again(expected.response)
+        if self.instead:
+            self.instead.foretells_better(gain)
