@@ -53,7 +53,7 @@ class VibrationErrors(NamedTuple):
             (:class:`~ctr_dynamics.estimation.vibration_modes.ModalBasis`).
         by_load: (m, 6) complex, modal coordinate of the equilibrium by force and torque; by_rotation: (m, N) complex, by the tubes' rotations.
         phase_rate: (m,) rad/s, errors of nodes and steps. tolerance: relative deviation of a frequency by the robot file's tolerances.
-        resolved: (m,) whether the steps resolve it.
+        resolved: (m,) whether the steps resolve it. reach: (m,) of the tip's displacements, where all have the same energy.
     """
 
     exponent: NDArray[np.complex128]
@@ -63,6 +63,7 @@ class VibrationErrors(NamedTuple):
     phase_rate: Floats
     tolerance: float
     resolved: NDArray[np.bool_]
+    reach: Floats
 
     def deflection(self, difference: Floats) -> float:
         """m, by which a load's ``difference`` (6,) N, N m moves the resting tip."""
@@ -73,7 +74,9 @@ class VibrationErrors(NamedTuple):
     def none(cls) -> VibrationErrors:
         """Of a robot whose modes are not known."""
         no_rows = np.zeros((0, 6), complex)
-        return cls(np.zeros(0, complex), no_rows, no_rows, no_rows, np.zeros(0), 0.0, np.zeros(0, bool))
+        return cls(
+            np.zeros(0, complex), no_rows, no_rows, no_rows, np.zeros(0), 0.0, np.zeros(0, bool), np.zeros(0)
+        )
 
 
 @dataclass(frozen=True)
@@ -183,6 +186,7 @@ def discretise(robot: Robot, least: int, accuracy_m: float) -> Discretisation:
         np.hypot(2 * np.pi * frequency * shift * (COARSE / nodes) ** 4, by_steps),
         frequency_tolerance(robot),
         kept,
+        fine.reach[:count],
     )
     return Discretisation(nodes, at_coarse * (COARSE / nodes) ** 4, time_error, modes, vibration)
 

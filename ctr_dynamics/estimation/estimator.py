@@ -10,7 +10,6 @@ import math
 import time
 from array import array
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -18,6 +17,7 @@ from numpy.typing import NDArray
 
 from ctr_dynamics.estimation.backbone import Backbone
 from ctr_dynamics.estimation.discretisation import discretise
+from ctr_dynamics.estimation.estimator_options import EstimatorOptions
 from ctr_dynamics.estimation.inputs.input_buffer import InputBuffer
 from ctr_dynamics.estimation.inputs.measurement_queue import tracker_of
 from ctr_dynamics.estimation.inputs.unseen_load import UnseenLoad
@@ -28,7 +28,7 @@ from ctr_dynamics.estimation.monitoring.health import Health
 from ctr_dynamics.estimation.monitoring.innovation_log import InnovationLog
 from ctr_dynamics.estimation.monitoring.settling import Settling
 from ctr_dynamics.estimation.monitoring.statuses import all_statuses
-from ctr_dynamics.estimation.monitoring.twist_error import TwistError
+from ctr_dynamics.estimation.monitoring.twist_error import TwistError, UnseenVibration
 from ctr_dynamics.estimation.monitoring.unexpected_innovation import UnexpectedInnovation
 from ctr_dynamics.estimation.out_of_sequence import OutOfSequence
 from ctr_dynamics.estimation.runs import Runs
@@ -44,33 +44,6 @@ from ctr_dynamics.robot import Robot
 from ctr_dynamics.sensing.tracker_parameters import with_robot_file
 
 Floats = NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class EstimatorOptions:
-    """Figures of the estimator's time line; no user needs to tune them.
-
-    Attributes:
-        stability_every: steps between looks at the elastic stability, 0.1 s: a tenth of the warning time of a snap.
-        modes_every: steps between refreshes of the vibration modes, 0.4 s.
-        jacobian_every: steps between two of the tip's Jacobian, 0.1 s.
-        longest_without_idle: steps after which idle work is done without idle time, 0.2 s.
-        retry_every: steps between starts while there is no equilibrium. Looking for one in vain takes longer than a step.
-        deviation_fraction: of tube 1's length: outputs with a larger deviation of the tip are invalid, where no parameter says otherwise.
-        largest_gap: steps to catch up with at once, 3 s. Beyond, the model is reinitialised at the newest joints.
-        lead_ns: what a live step takes, from waking to its messages.
-        backwards: joint states in a row whose time ran backwards, after which the clock was set back or another bag begins.
-    """
-
-    stability_every: int = 33
-    modes_every: int = 132
-    jacobian_every: int = 33
-    longest_without_idle: int = 66
-    retry_every: int = 33
-    deviation_fraction: float = 0.05
-    largest_gap: int = 1000
-    lead_ns: int = 1_000_000
-    backwards: int = 3
 
 
 class Estimator:
@@ -128,7 +101,7 @@ class Estimator:
 
     def _clear(self) -> None:
         noise = self.robot.tracker.noise.position.value
-        self._settling = Settling(noise)
+        self._settling = Settling(noise, self.robot.encoders.noise.value)
         self._no_start: tuple[int, str] | None = None  # step and reason of a start that found no equilibrium
         self._stability = StabilityWatch(self.model)
         self._stability_due = False
@@ -137,6 +110,9 @@ class Estimator:
         self._without_idle = 0  # steps since the last idle work
         self._unexpected = UnexpectedInnovation(self._largest_deviation, noise)
         self._twist_error = TwistError(self.discretisation.vibration, self.robot)
+        self._unseen_vibration = UnseenVibration(
+            self.discretisation.vibration, self.options.unseen_fraction * self._largest_deviation
+        )
         self._unseen_load = UnseenLoad(self.discretisation.vibration, noise)
         self._driven_m = 0.0  # by which actuators may have moved the tip unknown to the last step
 
@@ -339,6 +315,12 @@ class Estimator:
         if self.late.correct(spare_s):
             self._modes.clear()
             self._jacobian.clear()
+            self._watch_start(self.timeline.stamp(0))
+
+    def _watch_start(self, stamp: int) -> None:
+        """The model has started at rest at ``stamp`` (ns): joints and measurements tell whether the robot did."""
+        self._settling.start(stamp, self.inputs.joints.at(stamp)[0])
+        self._look_for_motion()
 
     def _step(self, k: int, too_old: Callable[[int], str]) -> StepOutput:
         """Take step ``k`` and describe it."""
@@ -379,8 +361,7 @@ class Estimator:
         self.late.history.restart(k)
         self._modes.clear()
         self._jacobian.clear()
-        stamp = self.timeline.stamp(k)
-        self._settling.start(stamp, self.inputs.joints.at(stamp)[0])
+        self._watch_start(self.timeline.stamp(k))
         return self._output(k, StepResult(True, "at rest", 0, 0, 0))
 
     # -- outputs --
@@ -409,9 +390,11 @@ class Estimator:
                 f"{self._length:g} m; the filter is reinitialised from the open-loop run",
             )
         innovations = self.innovations.take()
-        self._settling.take(innovations)
+        self._settling.take(innovations, fused.ekf.tracker_fault()[0] > 0.0)
         health.refutation = fused.ekf.refutation()
         unsettled = self._settling.problem(stamp)
+        if self._settling.begun:
+            return self._begin_vibrating(k, unsettled, innovations)
         self._unexpected.take(
             innovations, fused.ekf.refuted, fused.agreed or bool(unsettled) or not health.fusing
         )
@@ -428,6 +411,9 @@ class Estimator:
         modes = self._modes.measure(fused.state, k)
         periods_s = self.inputs.joint_period_s, fused.pose_period_s
         self._twist_error.inflate(tip, stamp, open_loop, fused.ekf, periods_s, modes)
+        apart = self._settling.unseen(stamp)
+        if apart is not None:
+            self._unseen_vibration.inflate(tip.covariance, apart)
         self._driven_m = self.inputs.actuator_error.inflate(
             tip.covariance, tip.position, self._length, stamp, late.lag * STEP_NS
         )
@@ -438,6 +424,21 @@ class Estimator:
             tip.force_sigma, innovations, SolverStats(result.iterations, result.sweeps, result.reason),
             fused.state.inputs.beta.tolist(), self._jacobian.measure(fused.state),
         )  # fmt: skip
+
+    def _begin_vibrating(self, k: int, reason: str, innovations: Sequence[Innovation]) -> StepOutput:
+        """Begin again at step ``k`` from the open-loop run, about which the robot vibrates in a way that is not known."""
+        open_loop, fused = self.runs.open_loop, self.runs.fused
+        self._settling.begun = False
+        assert open_loop.state is not None
+        deviation = min(
+            max(self._largest_deviation, self._settling.apart), self.options.vibrating_fraction * self._length
+        )
+        vibrating = self._modes.vibrating(open_loop.state, self.model.parameters, deviation)
+        fused.reinitialise(open_loop, k, vibrating)
+        fused.timing.clear()
+        self.late.repeated = k, lambda: fused.reinitialise(open_loop, k, vibrating)
+        self.late.history.record(k, always=True)
+        return self._invalid(k, reason, innovations)
 
     def _invalid(self, k: int, reason: str, taken: Sequence[Innovation] = ()) -> StepOutput:
         self.health.problem = reason
@@ -466,7 +467,7 @@ class Estimator:
             if self.runs.running:
                 self._unseen_load.look(settling, gap=gap)
                 if settling.moved(gap.change.tolist()):
-                    settling.begin(gap.until_ns, f"{gap.words} while the robot moved")
+                    settling.begin(gap.until_ns, f"{gap.words} while the robot moved", vibrating=False)
         if self.inputs.joints.stamps:
             settling.watch(self.inputs.joints.stamps[-1], self.inputs.joints.values[-1])
 

@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ctr_dynamics.estimation.filter.covariance_factor import Vibrating
 from ctr_dynamics.estimation.filter.ekf import RodEkf
 from ctr_dynamics.estimation.filter.filter_records import FilterState, TipEstimate, Update
 from ctr_dynamics.estimation.inputs.input_buffer import InputBuffer
@@ -105,10 +106,10 @@ class FusedRun:
         self.end_of_jitter.clear()
         self.state, self.measured_ns, self.confirmed, self.late, self.moving = None, None, 0, False, False
 
-    def start(self, state: State, t: float) -> None:
-        """Begin at the static equilibrium ``state`` at the time ``t`` (s)."""
+    def start(self, state: State, t: float, vibrating: Vibrating | None = None) -> None:
+        """Begin at the static equilibrium ``state`` at the time ``t`` (s); ``vibrating``: what the robot may do about it."""
         self.state = state
-        self.ekf.start(state, t)
+        self.ekf.start(state, t, vibrating)
 
     @property
     def agreed(self) -> bool:
@@ -215,10 +216,10 @@ class FusedRun:
         expected = rotations.multiply(tracker.rotation, open_loop)
         return pose_difference(none, quaternion, none, expected, tracker.free)[3:][tracker.mask[3:]]
 
-    def reinitialise(self, open_loop: OpenLoopRun, k: int) -> None:
-        """Go on from the open-loop run at step ``k``: a correction has led this run astray."""
+    def reinitialise(self, open_loop: OpenLoopRun, k: int, vibrating: Vibrating | None = None) -> None:
+        """Go on from the open-loop run at step ``k``: a correction has led this run astray. ``vibrating``: how the robot may move beside it."""
         assert open_loop.state is not None
-        self.start(open_loop.state.copy(), seconds(k))
+        self.start(open_loop.state.copy(), seconds(k), vibrating)
         self._health.restarts += 1
 
     def begin_again(self, open_loop: OpenLoopRun, k: int) -> bool:

@@ -8,11 +8,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from ctr_dynamics.estimation.filter.covariance_factor import Vibrating
 from ctr_dynamics.estimation.step_output import Modes
 from ctr_dynamics.estimation.timeline import seconds
 from ctr_dynamics.estimation.vibration_modes import ModalBasis, lanes_of, modal_parts
 from ctr_dynamics.kernels.structures import SweepBuffers
-from ctr_dynamics.model.mesh import Key
+from ctr_dynamics.model.mesh import Key, Mesh
 from ctr_dynamics.model.mesh_interpolation import MeshInterpolation, mesh_interpolation
 from ctr_dynamics.model.model import Model
 from ctr_dynamics.model.state import State, at_inputs
@@ -58,6 +59,7 @@ class ModeTracker:
         self._interpolations: dict[tuple[Key, Key], MeshInterpolation] = {}
         self._buffers: dict[Key, SweepBuffers] = {}
         self._former: ModalBasis | None = None  # the last modes found, on the coarse mesh
+        self._mesh: Mesh | None = None  # that
         self.clear()
 
     def clear(self) -> None:
@@ -115,6 +117,18 @@ class ModeTracker:
             self._age = 0
             self._begin(state, parameters)
 
+    def vibrating(self, state: State, parameters: Floats, deviation: float) -> Vibrating | None:
+        """Vibrations that the robot in ``state`` may have, of the ``deviation`` (m) at the tip; None where no modes are found."""
+        self.clear()
+        self._begin(state, parameters)
+        while self._pending is not None:
+            self.refresh(state, parameters)
+        if self._basis is None or self._former is None or self._own is None:
+            return None
+        mesh = self._mesh
+        assert mesh is not None
+        return Vibrating(self._former.vibrating(deviation), mesh)
+
     def _begin(self, state: State, parameters: Floats) -> None:
         now = state.inputs
         equilibrium = Statics(self.model, self.options.tolerance).solve_at(
@@ -140,6 +154,7 @@ class ModeTracker:
             if pair not in self._interpolations:
                 self._interpolations[pair] = mesh_interpolation(self.model.n, equilibrium.mesh, on.mesh)
             self._interpolation = self._interpolations[pair]
+        self._mesh = on.mesh
         self._own, self._alpha, self._reused = equilibrium, now.alpha, self.options.most_reused
         if on.key not in self._buffers:
             self._buffers[on.key] = self.coarse.sweep_buffers(on.mesh, lanes_of(self.coarse).count)

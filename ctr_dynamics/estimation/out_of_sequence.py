@@ -138,6 +138,7 @@ class OutOfSequence:
 
     Attributes:
         history: checkpoints.
+        repeated: a step, and what is done after it whenever it is taken again; None for nothing.
     """
 
     def __init__(self, runs: Runs, inputs: InputBuffer, health: Health, innovations: InnovationLog) -> None:
@@ -150,6 +151,7 @@ class OutOfSequence:
     def clear(self) -> None:
         """Forget everything."""
         self.history.checkpoints.clear()
+        self.repeated: tuple[int, Callable[[], None]] | None = None
         self._from_ns: int | None = None  # inputs from here on have changed
         self._joints_only = True  # and nothing but joints
         self._urgent = False  # the load among them, by a jump
@@ -158,7 +160,7 @@ class OutOfSequence:
     def forget(self) -> None:
         """Have nothing to correct and nothing to return to: the steps go on elsewhere."""
         self.history.checkpoints.clear()
-        self._from_ns = None
+        self._from_ns = self.repeated = None
         self._inputs.actuator_error.corrected()
 
     # -- 1. what has changed --
@@ -234,6 +236,7 @@ class OutOfSequence:
             if self._runs.start(0):
                 return False
             history.restart(0)
+            self.repeated = None
         else:
             later = {checkpoint.k: checkpoint for checkpoint in history.take_after(from_ns)}
             # 2. Small lag: the stored covariance can be reused until the first measurement after the checkpoint.
@@ -254,6 +257,8 @@ class OutOfSequence:
             stored = later.get(k) if k < reuse_before else None
             reuse: FilterState | None = stored.fused.filter if stored is not None else None
             result = self._runs.step(k, reuse=reuse)
+            if result.ok and self.repeated is not None and self.repeated[0] == k:
+                self.repeated[1]()
             if k >= covered or k % options.checkpoint_every == 0 or not result.ok:
                 history.record(k)
             self._runs.judge(result)

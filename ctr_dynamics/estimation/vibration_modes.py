@@ -51,6 +51,7 @@ class ModalBasis:
         by_input_rates: (m, 2N + 6) speed of the equilibrium along the direction, by the rates of alpha, beta, force and torque.
         twist: (m, 6) complex twist of the tip about the base axes, per unit of the modal coordinate: the tip's is 2 Re (twist z).
         shapes: (fields, m) complex, the fields in each mode where its own coordinate is 1 and all others are 0, but for a factor.
+        reach: (m,) m, of the tip's displacement in each of the shapes. Of these, all have the same energy.
     """
 
     frequency_hz: Floats
@@ -64,6 +65,7 @@ class ModalBasis:
     by_input_rates: Floats
     twist: NDArray[np.complex128]
     shapes: NDArray[np.complex128]
+    reach: Floats
 
     def measure(self, fields: Floats, now: Inputs, load_rate: Floats | None = None) -> Modes:
         """Amplitude and rate of each mode in ``fields`` (fields,) at the actuators and load ``now``.
@@ -122,7 +124,16 @@ class ModalBasis:
             (sign[:, None] * self.by_input_rates)[order],
             (sign[:, None] * self.twist)[order],
             self.shapes[:, order],
+            self.reach[order],
         )
+
+    def vibrating(self, deviation: float) -> Floats:
+        """(fields, 2m) fields of vibrations of any phase, in columns of one deviation: the tip's displacement has the ``deviation`` (m) in all.
+
+        All modes have the same energy.
+        """
+        columns = self.shapes * (deviation / np.linalg.norm(self.reach))
+        return np.concatenate([columns.real, columns.imag], axis=1)
 
     @cached_property
     def _rows(self) -> tuple[Floats, Floats, Floats, Floats]:
@@ -350,6 +361,7 @@ def modal_parts(
         2.0 * (pairs.exponent[:, None] * (readout @ moving)).real,
         twist / np.where(scale == 0.0, 1.0, scale) / np.sum(coordinates * shapes.T, axis=1)[:, None],
         shapes,
+        np.linalg.norm(shapes[main:][:3], axis=0) / np.abs(pairs.exponent),
     )
 
 

@@ -9,6 +9,7 @@ import ctr_dynamics.estimation.filter.covariance_factor as factor_module
 from ctr_dynamics.estimation.energy_norm import energy_rows, field_weights
 from ctr_dynamics.estimation.filter.covariance_factor import CovarianceFactor
 from ctr_dynamics.estimation.filter.parameter_priors import force_range, model_uncertainty, tip_compliance
+from ctr_dynamics.estimation.mode_tracker import ModeTracker
 from ctr_dynamics.kernels.layout import base_field_count
 from ctr_dynamics.model.mesh import build_mesh
 from ctr_dynamics.model.mesh_interpolation import coarse_key, mesh_interpolation
@@ -251,6 +252,38 @@ def test_the_factor_follows_finite_differences_of_the_simulation(robot, nodes, e
         tip = factor.dnodes[-model_rows(model) :, i][:3]
         shift = ends[0].nodes[-1, :3] - ends[1].nodes[-1, :3]
         assert np.linalg.norm(tip - shift) < 0.015 * every * np.linalg.norm(shift) + 1e-7, name
+
+
+@pytest.mark.parametrize("column", range(4))
+def test_columns_of_a_start_in_motion_follow_the_vibration(robot, column):
+    """The fields moved along such a column, then simulated: the tip moves as its rows say, and for one deviation of all by what was asked."""
+    model = Model(robot, nodes=24)
+    inputs = Inputs(ALPHA, ZERO, BETA, ZERO, np.zeros(3), np.zeros(3))
+    simulator = Simulator(model, tolerance=1e-10)
+    state = simulator.rest(inputs)
+    vibrating = ModeTracker(model, 100).vibrating(state, model.parameters, 2e-3)
+    assert vibrating is not None
+    factor, uncertainty = CovarianceFactor(model, model_uncertainty(model), rank=24), model_uncertainty(model)
+    pi = factor.start(state.key, state.mesh, BETA, ALPHA, model.parameters, state.unknowns_at_base, vibrating)
+    first = len(uncertainty.names)
+    assert pi[first + column, first + column] == 1.0
+    assert not factor.theta[:, first:].any()
+    a = np.zeros(len(pi))
+    a[first + column] = 0.1
+    moved = state.copy()
+    moved.bank[:2] += factor.fields_change(a)
+    moved.forget_history()
+    largest, error = 0.0, 0.0
+    for k in range(30):
+        results = [simulator.step(run, k * DT, lambda t: inputs, record=True) for run in (moved, state)]
+        assert all(result.ok for result in results)
+        assert factor.propagate(results[1].records[-1], model.parameters, DT)
+        rows = factor.dnodes[-model_rows(model) :][:3]
+        shift = moved.nodes[-1, :3] - state.nodes[-1, :3]
+        largest, error = max(largest, np.linalg.norm(shift)), max(error, np.linalg.norm(rows @ a - shift))
+    assert error < 0.05 * largest
+    square = sum(np.linalg.norm(rows[:, first + i]) ** 2 for i in range(vibrating.fields.shape[1]))
+    assert np.sqrt(square) == pytest.approx(2e-3, rel=0.3)
 
 
 def test_energy_is_that_of_all_points(model):

@@ -18,7 +18,7 @@ def innovation(at_ms, residual=(0.0, 0.0, 0.0), reason=""):
 
 
 def test_outputs_count_again_after_measurements_in_a_row():
-    settling, options = Settling(NOISE), SettlingOptions()
+    settling, options = Settling(NOISE, 2e-4), SettlingOptions()
     assert not settling.problem(0)
     settling.begin(1000 * MS, "joints were missing")
     assert "joints were missing" in settling.problem(1001 * MS)
@@ -37,7 +37,7 @@ def test_outputs_count_again_after_measurements_in_a_row():
 
 @pytest.mark.parametrize(("change", "waits"), [(0.0003, False), (0.003, True)])
 def test_a_residual_that_changes_after_a_start_shows_motion(change, waits):
-    settling = Settling(NOISE)
+    settling = Settling(NOISE, 2e-4)
     settling.start(0, np.zeros(4))
     settling.take([innovation(10, (0.005, 0.0, 0.0)), innovation(35, (0.005 + change, 0.0, 0.0))])
     assert bool(settling.problem(36 * MS)) == waits
@@ -105,11 +105,85 @@ def test_outputs_are_invalid_where_the_tip_is_not_known_well_enough():
     ids=["at once", "later", "at the first look after a long start", "at the second"],
 )
 def test_joints_that_move_at_the_start_have_outputs_wait(seen, waits):
-    settling = Settling(NOISE)
+    settling = Settling(NOISE, 2e-4)
     settling.start(0, np.zeros(4))
     for ms, angle in seen:
         settling.watch(ms * MS, np.array([angle, 0.0, 0.0, 0.0]))
     assert bool(settling.problem(1 * MS)) == waits
+
+
+@pytest.mark.parametrize(("ms", "rad", "waits"), [(10, 0.0025, True), (10, 0.0015, False), (3, 9e-4, False)])
+def test_a_rate_tells_before_the_watched_time_is_over_if_it_is_more_than_noise(ms, rad, waits):
+    """0.2 rad/s and more; within 3 ms that is 0.6 mrad, less than four deviations of a difference of two readings."""
+    settling = Settling(NOISE, 2e-4)
+    settling.start(0, np.zeros(4))
+    settling.watch(ms * MS, np.array([rad, 0.0, 0.0, 0.0]))
+    assert bool(settling.problem((ms + 1) * MS)) == waits
+
+
+def test_measurements_of_a_tracker_that_is_not_trusted_do_not_agree():
+    """They are within any gate. Where none agree, the filter begins again, and outputs wait once more."""
+    settling, longest = Settling(NOISE, 2e-4), round(SettlingOptions().longest_s * 1e9)
+    settling.begin(0, "it moved")
+    assert settling.begun
+    settling.begun = False
+    for ms in range(0, 1200, 25):
+        settling.take([innovation(ms)], shifted=True)
+    assert "it moved" in settling.problem(longest - 1)
+    settling.problem(longest + 1)
+    assert settling.begun
+    settling.begun = False
+    assert not settling.problem(longest + 2), "the model alone counts, while nothing is measured"
+    settling.take([innovation(1300)], shifted=True)
+    assert "have not agreed" in settling.problem(longest + 3)
+    assert not settling.problem(2 * longest + 2)
+    assert not settling.begun, "it is not done a third time"
+
+
+@pytest.mark.parametrize(("noises", "agree"), [(5.0, True), (8.0, False)])
+def test_measurements_agree_by_the_noise_that_is_stated(noises, agree):
+    """Whatever the filter takes the noise for, and however little it knows of the tip: within the gate is any that lies so near."""
+    settling, options = Settling(NOISE, 2e-4), SettlingOptions()
+    settling.begin(0, "it moved")
+    beside = innovation(10)
+    beside.residual[0] = noises * NOISE
+    settling.take([beside._replace(stamp_ns=10 * MS + i) for i in range(options.agreeing)])
+    assert (not settling.problem(20 * MS)) == agree
+
+
+def test_nothing_is_seen_of_the_motion_until_joints_and_measurements_have_told():
+    settling = Settling(NOISE, 2e-4)
+    assert settling.unseen(0) is None
+    settling.start(0, np.zeros(4))
+    settling.watch(0, np.zeros(4))
+    assert settling.unseen(1 * MS) == 0.0, "the joint state of the start tells nothing"
+    settling.watch(10 * MS, np.zeros(4))
+    settling.take([innovation(10, (3e-4, 0.0, 4e-4))])
+    assert settling.unseen(30 * MS) == pytest.approx(5e-4), "nor does one measurement"
+    settling.take([innovation(35, (3e-4, 0.0, 4e-4))])
+    assert settling.unseen(36 * MS) is None
+    settling.start(0, np.zeros(4))
+    settling.watch(10 * MS, np.zeros(4))
+    assert settling.unseen(200 * MS) == 0.0
+    assert settling.unseen(201 * MS) is None, "without measurements it is not waited for"
+
+
+@pytest.mark.parametrize("since_s", [1.02, 1.1, 1.33])
+def test_a_start_in_a_vibration_follows_it_soon(since_s):
+    """The weight has just been cut, the joints rest: measurements alone tell how the robot vibrates. The model alone is centimetres off."""
+    run = play([m for m in bag_messages("clean_release", since_s + 1.5) if m.stamp >= since_s * 1e9])
+    first = next(out for out in run.outputs if not out.valid)
+    assert first.stamp_ns - START_NS < (since_s + 0.08) * 1e9
+    error, steps = truth_error(run, "clean_release", "p_trk", since_s + 0.9)
+    assert all(run.outputs[k].valid for k in steps)
+    alone = run.column("predicted_position")[steps] - (run.column("tip_position")[steps] - error)
+    assert rms(alone) > 4e-3
+    assert rms(error) < 0.15 * rms(alone)
+    # before the first pose nothing tells
+    error, steps = truth_error(run, "clean_release", "p_trk", since_s + 0.03)
+    deviation = np.sqrt(run.column("tip_covariance")[steps][:, range(3), range(3)].sum(axis=1))
+    broken = np.linalg.norm(error, axis=1) > np.maximum(3.0 * deviation, 3e-3)
+    assert not broken[[run.outputs[k].valid for k in steps]].any()
 
 
 def test_outputs_wait_where_the_known_load_has_changed_in_a_gap_of_everything():

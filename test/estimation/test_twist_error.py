@@ -12,6 +12,7 @@ from ctr_dynamics.estimation.monitoring.twist_error import (
     HiddenVibration,
     LoadVibration,
     MotionFrequency,
+    UnseenVibration,
 )
 from ctr_dynamics.estimation.step_output import Modes
 from ctr_dynamics.estimation.vibration_modes import lanes_of, modal_basis, tip_response
@@ -34,7 +35,14 @@ def vibration_errors(phase_rate=(0.0, 0.0), tolerance=0.0, resolved=(True, True)
     by_load[:, 1] = 0.01, 0.001
     by_rotation = np.array([[0.02j, 0.0], [0.001, 0.0]])
     return VibrationErrors(
-        MU, along * MU[:, None], by_load, by_rotation, np.array(phase_rate), tolerance, np.array(resolved)
+        MU,
+        along * MU[:, None],
+        by_load,
+        by_rotation,
+        np.array(phase_rate),
+        tolerance,
+        np.array(resolved),
+        np.array([0.2, 0.05]),
     )
 
 
@@ -271,6 +279,22 @@ def test_a_linear_filter_errs_by_as_much_as_is_added_for_a_phase_that_it_does_no
     np.testing.assert_allclose(covariance[6:9, 6:9], omega**2 * covariance[:3, :3])
     if deviation == 4.0 and amplitude == 2e-4:
         assert square > 2.0 * variance
+
+
+def test_a_robot_that_may_move_when_the_model_starts_is_off_by_as_much_as_is_asked():
+    covariance = np.zeros((12, 12))
+    found = UnseenVibration(vibration_errors(), 3e-3)
+    found.inflate(covariance, 0.0)
+    assert covariance[:3, :3].trace() == pytest.approx(9e-6)
+    # of the same energy, modes move the tip by their reach: 0.2 along y and 0.05 along z
+    assert covariance[1, 1] == pytest.approx(16.0 * covariance[2, 2])
+    assert covariance[7, 7] == pytest.approx(np.abs(MU[0]) ** 2 * covariance[1, 1])
+    unknown = np.zeros((12, 12))
+    UnseenVibration(VibrationErrors.none(), 3e-3).inflate(unknown, 1e-3)
+    np.testing.assert_allclose(unknown[:3, :3], 3e-6 * np.eye(3))
+    farther = np.zeros((12, 12))
+    found.inflate(farther, 6e-3)
+    np.testing.assert_allclose(farther, 4.0 * covariance)
 
 
 def test_a_phase_that_is_certain_or_measured_exactly_adds_nothing_nor_does_a_mode_too_fast_for_the_steps():

@@ -98,7 +98,7 @@ def test_a_step_that_is_too_old_moves_the_model_and_has_no_estimate():
     ):
         estimator = Estimator(load_robot("till2020_tissue"), Settings({"output.policy": "wait"}))
         for k in range(steps + 1):
-            estimator.add_joint_state(start_ns + k * STEP_NS, names, [0.02 * k, -0.2521, 0.02 * k, -0.1977])
+            estimator.add_joint_state(start_ns + k * STEP_NS, names, [2e-4 * k, -0.2521, 2e-4 * k, -0.1977])
         outputs.append(estimator.advance(too_old=too_old))
     for a, b in zip(*outputs, strict=True):
         if a.k in held_up:

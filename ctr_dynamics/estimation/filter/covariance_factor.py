@@ -66,6 +66,13 @@ class SolvedStage(NamedTuple):
         return SolvedStage(self.key, *(0.5 * (a + b) for a, b in pairs))
 
 
+class Vibrating(NamedTuple):
+    """Vibrations of unknown size and phase: their ``fields`` (fields, v) for one deviation each, on the sections of ``mesh``."""
+
+    fields: Floats
+    mesh: Mesh
+
+
 class FactorState(NamedTuple):
     """What a checkpoint stores of a :class:`CovarianceFactor`, attribute by attribute. Arrays are references: later steps go on with others."""
 
@@ -118,7 +125,9 @@ class CovarianceFactor:
         self._lent = False  # whether a checkpoint holds `fields`
         self._spare = self._nothing = np.empty((0, 0))  # room for the next `fields`
 
-    def start(self, key: tuple, mesh: Mesh, beta: Floats, alpha: Floats, par: Floats, x: Floats) -> Floats:
+    def start(
+        self, key: tuple, mesh: Mesh, beta: Floats, alpha: Floats, par: Floats, x: Floats, vibrating: Vibrating | None = None
+    ) -> Floats:  # fmt: skip
         """The static equilibrium's derivative by every uncertain parameter times its deviation; returns Pi_aa (r, r).
 
         At an equilibrium that cannot be linearised (a fold) the fields' rows begin at zero and fill while the robot moves.
@@ -128,6 +137,7 @@ class CovarianceFactor:
             beta, alpha: (N,) m and rad, actuators.
             par: (NP,) parameter block with the load.
             x: (5 + N,) unknowns of the equilibrium.
+            vibrating: what the robot may do about it; None where it rests. The tip's rows know it from the first step on.
         """
         model, unc = self.model, self.uncertainty
         own, mesh, interpolation = self._coarse_sections(key, mesh, beta)
@@ -153,16 +163,20 @@ class CovarianceFactor:
             dx[:], fields[:], dnodes[:] = 0.0, 0.0, 0.0  # some may have been written
         self.key, self.mesh, self.interpolation = own, mesh, interpolation
         self.beta, self._linearised = beta.copy(), None
-        r = self.rank
-        wide = max(count, r)
+        more = 0 if vibrating is None else vibrating.fields.shape[1]
+        wide = max(count + more, self.rank)
         self.theta = np.zeros((count, wide))
         self.theta[:, :count] = np.diag(scale)
         self.fields = np.zeros((main + base, wide))
         self.fields[:, :count] = fields
+        if vibrating is not None:
+            columns = remap_columns(model.n, vibrating.fields[None], vibrating.mesh, beta, mesh, beta)[0]
+            self.fields[:, count : count + more] = columns
         self.dnodes, self.dx = np.zeros((len(dnodes), wide)), np.zeros((m, wide))
         self.dnodes[:, :count], self.dx[:, :count] = dnodes, dx
         variance = np.zeros(wide)
         variance[:count] = np.where(unc.sigma > 0, 1.0, 0.0)
+        variance[count : count + more] = 1.0
         return np.diag(variance)
 
     def _coarse_sections(

@@ -13,7 +13,7 @@ from filterpy.kalman import ExtendedKalmanFilter
 from numpy.typing import NDArray
 
 from ctr_dynamics.estimation.filter.adapted_variances import AdaptedVariances, Constants, ForceRange
-from ctr_dynamics.estimation.filter.covariance_factor import CovarianceFactor
+from ctr_dynamics.estimation.filter.covariance_factor import CovarianceFactor, Vibrating
 from ctr_dynamics.estimation.filter.expected_tracker import ExpectedTracker
 from ctr_dynamics.estimation.filter.factor_reduction import reduced
 from ctr_dynamics.estimation.filter.factor_schedule import FactorSchedule
@@ -102,13 +102,16 @@ class RodEkf:
 
     # -- start --
 
-    def start(self, state: State, stamp: float) -> None:
-        """Begin at the static equilibrium in ``state``, of the time ``stamp`` (s), with the robot file's tolerances as the prior."""
+    def start(self, state: State, stamp: float, vibrating: Vibrating | None = None) -> None:
+        """Begin at the static equilibrium in ``state``, of the time ``stamp`` (s), with the robot file's tolerances as the prior.
+
+        ``vibrating``: what the robot may do about it; None where it rests.
+        """
         inputs = state.inputs
         self.forget_parameters()
         block = at_inputs(self.model, self.simulator.parameters, inputs)
         pi_aa = self.factor.start(
-            state.key, state.mesh, inputs.beta, inputs.alpha, block, state.unknowns_at_base
+            state.key, state.mesh, inputs.beta, inputs.alpha, block, state.unknowns_at_base, vibrating
         )
         if self._strides is None:  # of the first start; the exposed length tells how they change
             self._strides = ColumnStrides.of(self.model, state, block, self.simulator.scheme.dt)

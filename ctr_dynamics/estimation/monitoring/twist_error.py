@@ -136,6 +136,30 @@ class LoadVibration:
         add_by_modes(size**2 * square, self._of_one, covariance)
 
 
+class UnseenVibration:
+    """A vibration that the robot may have when the model starts at rest, before anything has shown how it moves. All modes have the same energy.
+
+    Args:
+        modes: how the robot vibrates at rest.
+        deviation: m, of the tip.
+    """
+
+    def __init__(self, modes: VibrationErrors, deviation: float) -> None:
+        self._deviation, self._covariance = deviation, np.zeros((12, 12))
+        of_one = of_modes(modes)
+        at_tip = of_one.reshape(-1, 12, 12)[:, range(3), range(3)].sum(axis=1)
+        moves = at_tip > 0.0
+        if not moves.any():
+            self._covariance[range(3), range(3)] = deviation**2 / 3.0
+            return
+        part = modes.reach[moves] ** 2 / (modes.reach[moves] ** 2).sum()
+        add_by_modes(deviation**2 * part / at_tip[moves], of_one[moves], self._covariance)
+
+    def inflate(self, covariance: Floats, apart: float) -> None:
+        """Add it to the ``covariance`` (12, 12) of the tip, in place; ``apart``: m, that a measurement has shown."""
+        covariance += max(apart / self._deviation, 1.0) ** 2 * self._covariance
+
+
 class EncoderVibration:
     """Vibrations that the model has and the robot has not: the noise of the encoders turns its tubes alone.
 
