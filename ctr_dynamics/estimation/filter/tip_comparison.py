@@ -20,17 +20,17 @@ NEGLIGIBLE = 1e-4  # of a variance: half a ten thousandth of the deviation
 
 
 def second_order(variance: Floats, axes: NDArray[np.int64], length: float) -> Floats:
-    """(a,) variances of what the tangent of the tip's motion misses, m^2 and rad^2.
+    """(a,) mean squares of what the tangent of the tip's motion misses, m^2 and rad^2.
 
-    A robot of ``length`` (m) that turns its tip by an angle, small but uncertain, moves it on an arc. The next term of the series is half the square
-    of the angle, or of the way by the length: of a normal error, its variance is half the square of that of the error.
+    A robot of ``length`` (m) that turns its tip by an angle moves it on an arc. The next term of the series is half the square of the angle, or of
+    the way by the length. Where these are normal, its mean square is three quarters of the square of their variance.
 
     Args:
         variance: (a,) m^2 and rad^2, of the tip, on the measured ``axes`` (a,) out of 0 to 5.
     """
     turns = axes >= 3
     way, angle = float(variance[~turns].sum()), float(variance[turns].sum())
-    found: Floats = 0.5 * np.where(turns, angle, way / length) ** 2
+    found: Floats = 0.75 * np.where(turns, angle, way / length) ** 2
     return found
 
 
