@@ -86,6 +86,25 @@ class ActuatorMotion:
                 worst, worst_ratio = Jump(i, b - a, allowed, elapsed_s), ratio
         return worst
 
+    def beside(self, last: Values, ahead: Values, new: Values, elapsed_s: float) -> Jump | None:
+        """The joint that lies farthest beside its way from the ``last`` values to those ``ahead``; None where none does by more than a step."""
+        off = [
+            (y - min(max(y, min(a, b)), max(a, b))) / s
+            for a, b, y, s in zip(last, ahead, new, self.scale, strict=True)
+        ]
+        i = max(range(len(off)), key=lambda joint: abs(off[joint]))
+        if abs(off[i]) <= 1.0:
+            return None
+        return Jump(i, off[i] * self.scale[i], self.scale[i], elapsed_s)
+
+    def stray_text(self, stray: Jump) -> str:
+        """A message off the rhythm and beside the motion in words; :data:`STAYS` in it is to be replaced once its fate is known."""
+        unit = self.unit(stray.joint)
+        return (
+            f"{self.names[stray.joint]} lies {stray.change:.4g} {unit} beside its motion, limit {stray.allowed:.3g} {unit}, "
+            f"in a message {1e3 * stray.elapsed_s:.1f} ms after the last; {STAYS}; look for a second driver"
+        )
+
     def jump_text(self, jump: Jump) -> str:
         """A jump in words; :data:`STAYS` in it is to be replaced once its fate is known."""
         unit, speed = self.unit(jump.joint), self.speeds[jump.joint]

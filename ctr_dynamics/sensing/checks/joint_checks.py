@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, NamedTuple
 from ctr_dynamics.sensing.checks.actuator_motion import STAYS, ActuatorMotion, Jump, Unwrapping
 from ctr_dynamics.sensing.checks.check_limits import CheckOptions
 from ctr_dynamics.sensing.checks.stamp_checks import StampChecks
-from ctr_dynamics.sensing.checks.value_trains import ReturnWatch, Train, TwoTrains, Values, distance
+from ctr_dynamics.sensing.checks.value_trains import TOO_SOON, ReturnWatch, Train, TwoTrains, Values, distance
 from ctr_dynamics.sensing.checks.verdicts import ACCEPT, Findings, Kind, Verdict
 
 if TYPE_CHECKING:
@@ -67,6 +67,8 @@ class JointChecks:
         self._train: Train | None = None  # the accepted joint states
         self._other: Train | None = None  # those that may replace it
         self._two: TwoTrains | None = None  # of two drivers
+        # messages that were left out as strays, and the time of the last; those of them that were of a second driver and are not counted yet
+        self._strays, self._of_other = (0, 0), 0
         self._pending = 0  # joint states left out since the last accepted one
         self._held = 0  # joint states that are zero throughout, at the start
         self._held_ns = 0  # stamp of the first of them
@@ -154,8 +156,24 @@ class JointChecks:
                 train = self._one_again(place)
         jump = self._jump(train, state)
         if jump is not None:
-            return self._jumped(train, state, jump)
+            return self._jumped(train, state, jump, self.motion.jump_text(jump))
+        if self._two is None:
+            stray = self._stray(train, state)
+            if stray is not None:
+                recent = state.at - self._strays[1] <= self.limits.return_s * 1e9
+                self._strays = (self._strays[0] if recent else 0) + 1, state.at
+                return self._jumped(train, state, stray, self.motion.stray_text(stray))
         return self._accept(train, state, stamped)
+
+    def _stray(self, train: Train, state: _JointState) -> Jump | None:
+        """What a second driver sends first: between two messages of a driver that keeps a rhythm, and beside its motion."""
+        since_ns, rhythm_ns = state.stamp_ns - train.stamp_ns, 1e9 * self.stamps.rhythm_s
+        if not self._watch.off_beat or not 0 < since_ns < TOO_SOON * rhythm_ns:
+            return None
+        ahead = train.at(
+            train.stamp_ns + round(2.0 * rhythm_ns)
+        )  # of a message that is stamped late or early
+        return self.motion.beside(train.values, ahead, state.values, since_ns * 1e-9)
 
     def _accept(self, train: Train, state: _JointState, stamped: Verdict) -> Verdict:
         if self._pending and self._two is None:
@@ -257,9 +275,9 @@ class JointChecks:
     def _jump(self, train: Train, state: _JointState) -> Jump | None:
         return self.motion.jump(train.values, state.values, self._elapsed_s(train, state.stamp_ns))
 
-    def _jumped(self, train: Train, state: _JointState, jump: Jump) -> Verdict:
-        """Leave out what cannot be, until enough joint states in a row confirm it."""
-        text, size = self.motion.jump_text(jump), abs(jump.change)
+    def _jumped(self, train: Train, state: _JointState, jump: Jump, text: str) -> Verdict:
+        """Leave out what cannot be, until enough joint states in a row confirm it; ``text`` says what that is."""
+        size = abs(jump.change)
         if self._two is not None:
             return self._drop(Kind.JUMP, state.at, size, "", text)
         other = self._other
@@ -329,19 +347,24 @@ class JointChecks:
         self._watch.add(state.stamp_ns, state.values, stamps.rhythm_s, stamps.least_period_s, sure)
 
     def _separate(self) -> None:
-        """Two trains are told apart: go on with the accepted one; where both are, with the one that keeps the rhythm."""
+        """Two trains are told apart: go on with the one that keeps the rhythm; where none was known, with the accepted one.
+
+        Which was accepted last tells little: while both lie within what actuators can do, each is in turn.
+        """
         assert self._watch.two is not None
         assert self._train is not None
         mine, other = self._watch.two
         scale, accepted = self.motion.scale, self._train.values
         apart = self.motion.jump(mine.values, other.values, self.stamps.least_period_s) is not None
         nearer = distance(accepted, other.values, scale) < distance(accepted, mine.values, scale)
-        if (apart and nearer) or not any(mine.values):
+        if (apart and nearer and not self._watch.by_rhythm) or not any(mine.values):
             mine, other = other, mine
         mine.count = self.limits.confirm_count
         self._two = TwoTrains(mine, other, scale, self.stamps.rhythm_s, self.limits.return_s)
+        strays, self._strays = self._strays[0], (0, 0)
         for kind in (Kind.GLITCH, Kind.JUMP):
-            self.findings.uncount(kind, min(self.findings.count(kind), self.limits.returns))
+            self.findings.uncount(kind, min(self.findings.count(kind), max(self.limits.returns, strays)))
+        self._of_other = strays
         self._train, self._other, self._pending = mine, None, 0
 
     def _one_again(self, place: str) -> Train:
@@ -354,7 +377,8 @@ class JointChecks:
 
     def _drop_other(self, train: Train, state: _JointState) -> Verdict:
         size, unit, text = self.motion.apart_text(train.values, state.values)
-        return self._drop(Kind.TWO_PUBLISHERS, state.at, size, unit, text)
+        before, self._of_other = self._of_other, 0
+        return self._drop(Kind.TWO_PUBLISHERS, state.at, size, unit, text, 1 + before)
 
     # -- all zero --
 
@@ -384,6 +408,6 @@ class JointChecks:
         started = self._start(state)
         return Verdict(started.use, Kind.ALL_ZERO, text, started.stamp_ns)
 
-    def _drop(self, kind: Kind, at: int, worst: float, unit: str, text: str) -> Verdict:
-        self.findings.add(kind, at, worst, unit, text)
+    def _drop(self, kind: Kind, at: int, worst: float, unit: str, text: str, count: int = 1) -> Verdict:
+        self.findings.add(kind, at, worst, unit, text, count)
         return Verdict("drop", kind, text)

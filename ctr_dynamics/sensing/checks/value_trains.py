@@ -176,21 +176,27 @@ class ReturnWatch:
         self._count, self._score = 0, 0.0
         self._since = 0  # messages since the last return
         self._beat = Beat()
-        self.two: tuple[Train, Train] | None = (
-            None  # the stream and the foreign train, once both are told apart
-        )
+        # the stream and the foreign train, once both are told apart, and whether a rhythm has told which is which
+        self.two: tuple[Train, Train] | None = None
+        self.by_rhythm = False
         self.glitch: tuple[int, float] | None = (
             None  # stamp of the message before, where it alone was off, and by how many scales
         )
 
+    @property
+    def off_beat(self) -> bool:
+        """Whether the newest message misses the rhythm that the stream has kept."""
+        return bool(self._last) and self._last[-1].off_beat > UNEVEN
+
     def add(self, stamp_ns: int, values: Values, rhythm_s: float, least_s: float, sure: bool = False) -> None:
-        """Take in a message of the stream in arrival order. Sets ``two`` and ``glitch`` again.
+        """Take in a message of the stream in arrival order. Sets ``two``, ``by_rhythm`` and ``glitch`` again.
 
         Args:
             rhythm_s: shortest usual time between its messages, s. least_s: time that at least passes between two measurements, s.
             sure: whether it cannot be motion that it returns.
         """
         self.two = self.glitch = None
+        self.by_rhythm = False
         last, scale, before = self._last, self.scale, self._step
         here = _Message(stamp_ns, values, self._beat.error(stamp_ns))
         self._since += 1
@@ -256,6 +262,7 @@ class ReturnWatch:
                 if self._count >= self.returns:
                     trains = _train(a, here), _train(known.message, b)
                     self.two = trains if self._score >= 0.0 else (trains[1], trains[0])
+                    self.by_rhythm = abs(self._score) > UNEVEN * self._count
                 self._foreign = foreign
                 return
         self._count, self._score, self._foreign = 1, b.off_beat - here.off_beat, foreign
