@@ -218,6 +218,26 @@ def test_a_second_driver_that_the_first_one_passes_by_is_left_out(checks):
     assert max(near, default=0.0) < 0.02
 
 
+def test_a_second_driver_that_agreed_while_the_robot_rested_is_left_out_when_it_moves(checks):
+    """Twice as many messages are no new rhythm of the first driver."""
+    begins = 250 * PERIOD * 1e-9
+
+    def motion(t):
+        return sweep(max(t - begins, 0.0))
+
+    mixed, strange = [], []
+    for i, row in enumerate(joint_rows(350, motion)):
+        mixed.append(row)
+        if i >= 100:
+            strange.append(len(mixed))
+            mixed.append(delayed(row, 4 * PERIOD // 10, sweep(0.0)))
+    verdicts = feed_joints(checks, mixed)
+    left_out = [i for i, v in enumerate(verdicts) if v.use == "drop"]
+    assert not set(left_out) - set(strange)
+    assert left_out[-97:] == strange[-97:], "from the third message of the motion on"
+    assert list(kinds(checks)) == [Kind.TWO_PUBLISHERS]
+
+
 def test_one_message_off_the_rhythm_and_beside_the_motion_is_left_out(checks):
     rows = joint_rows(200)
     mixed = [

@@ -167,7 +167,7 @@ class JointChecks:
 
     def _stray(self, train: Train, state: _JointState) -> Jump | None:
         """What a second driver sends first: between two messages of a driver that keeps a rhythm, and beside its motion."""
-        since_ns, rhythm_ns = state.stamp_ns - train.stamp_ns, 1e9 * self.stamps.rhythm_s
+        since_ns, rhythm_ns = state.stamp_ns - train.stamp_ns, 1e9 * self._watch.rhythm_s
         if not self._watch.off_beat or not 0 < since_ns < TOO_SOON * rhythm_ns:
             return None
         ahead = train.at(
@@ -360,7 +360,8 @@ class JointChecks:
         if (apart and nearer and not self._watch.by_rhythm) or not any(mine.values):
             mine, other = other, mine
         mine.count = self.limits.confirm_count
-        self._two = TwoTrains(mine, other, scale, self.stamps.rhythm_s, self.limits.return_s)
+        rhythm_s = max(self.stamps.rhythm_s, self._watch.rhythm_s)
+        self._two = TwoTrains(mine, other, scale, rhythm_s, self.limits.return_s)
         strays, self._strays = self._strays[0], (0, 0)
         for kind in (Kind.GLITCH, Kind.JUMP):
             self.findings.uncount(kind, min(self.findings.count(kind), max(self.limits.returns, strays)))

@@ -118,6 +118,11 @@ class Beat:
         self._period_ns = 0.0
         self._kept = 0
 
+    @property
+    def period_s(self) -> float:
+        """Of the rhythm, s; 0 while none is known."""
+        return 1e-9 * self._period_ns if self._kept >= BEATS_KNOWN else 0.0
+
     def error(self, stamp_ns: int) -> float:
         """Periods by which a stamp misses the rhythm, 0 to 0.5; 0 while none is known. A stamp that keeps it leads it on."""
         last, period = self._last_ns, self._period_ns
@@ -184,6 +189,11 @@ class ReturnWatch:
         )
 
     @property
+    def rhythm_s(self) -> float:
+        """s between two messages of the stream by the rhythm that it has kept; 0 while none is known. A second one does not change it."""
+        return self._beat.period_s
+
+    @property
     def off_beat(self) -> bool:
         """Whether the newest message misses the rhythm that the stream has kept."""
         return bool(self._last) and self._last[-1].off_beat > UNEVEN
@@ -199,6 +209,7 @@ class ReturnWatch:
         self.by_rhythm = False
         last, scale, before = self._last, self.scale, self._step
         here = _Message(stamp_ns, values, self._beat.error(stamp_ns))
+        rhythm_s = max(rhythm_s, self.rhythm_s)
         self._since += 1
         if last:
             self._step = tuple((y - x) / s for x, y, s in zip(last[-1].values, values, scale, strict=True))
