@@ -22,6 +22,11 @@ if TYPE_CHECKING:
 BASELINE_S = 0.05  # rates are taken over this long, so that noise does not look like motion
 POLLED_LIMIT_S = 0.05  # a driver that repeats its reading for longer is at rest, not polled too fast
 ABSURD = 1e6  # rad or m; beyond it nothing is compared
+LITTLE = 0.3  # part of the readings that equal the one before: of two drivers in step, one of which repeats itself, a quarter do at most
+RECENT, REPEATING = (
+    16,
+    4,
+)  # messages, and how many of them are equal bit by bit where a second driver repeats itself
 RUNS = 8  # runs of equal readings that tell how often a driver repeats them
 
 
@@ -75,6 +80,8 @@ class JointChecks:
         self._last: tuple[int, Values] | None = None  # stamp and values as they came
         self._given = (-1, -1)  # stamp of the last accepted as it came, and as it was given out
         self._base: tuple[int, Values] = (0, ())  # what rates are taken from
+        self._readings, self._equal = 0, 0  # since the start, and of these equal to the one before
+        self._recent = deque[Values](maxlen=RECENT)
         self._run = 1  # equal readings in a row
         self._runs = deque[int](maxlen=RUNS)  # the last such lengths in motion
 
@@ -103,6 +110,8 @@ class JointChecks:
             kind, size, text = bad
             return self._drop(kind, at, size, "", text)
         last, self._last = self._last, (stamp_ns, raw)
+        if last is not None:
+            self._readings, self._equal = self._readings + 1, self._equal + (last[1] == raw)
         if last == self._last:
             text = "a joint state came twice; the first counts; look at the driver"
             return self._drop(Kind.REPEATED, at, 0.0, "", text)
@@ -344,12 +353,14 @@ class JointChecks:
 
     def _see(self, state: _JointState, sure: bool) -> None:
         stamps = self.stamps
+        self._recent.append(state.values)
         self._watch.add(state.stamp_ns, state.values, stamps.rhythm_s, stamps.least_period_s, sure)
 
     def _separate(self) -> None:
-        """Two trains are told apart: go on with the one that keeps the rhythm; where none was known, with the accepted one.
+        """Two trains are told apart: go on with the one that keeps the rhythm; where it does not tell, with the accepted one.
 
-        Which was accepted last tells little: while both lie within what actuators can do, each is in turn.
+        Which was accepted last tells little: while both lie within what actuators can do, each is in turn. One that repeats its values bit by bit is
+        not that of encoders whose readings have not.
         """
         assert self._watch.two is not None
         assert self._train is not None
@@ -357,7 +368,14 @@ class JointChecks:
         scale, accepted = self.motion.scale, self._train.values
         apart = self.motion.jump(mine.values, other.values, self.stamps.least_period_s) is not None
         nearer = distance(accepted, other.values, scale) < distance(accepted, mine.values, scale)
-        if (apart and nearer and not self._watch.by_rhythm) or not any(mine.values):
+        repeats = [self._recent.count(train.values) >= REPEATING for train in (mine, other)]
+        if self._watch.by_rhythm:
+            swapped = False
+        elif repeats[0] != repeats[1] and self._equal < LITTLE * self._readings:
+            swapped = repeats[0]
+        else:
+            swapped = apart and nearer
+        if swapped or not any(mine.values):
             mine, other = other, mine
         mine.count = self.limits.confirm_count
         rhythm_s = max(self.stamps.rhythm_s, self._watch.rhythm_s)
