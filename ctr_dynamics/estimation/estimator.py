@@ -426,14 +426,13 @@ class Estimator:
         )  # fmt: skip
 
     def _begin_vibrating(self, k: int, reason: str, innovations: Sequence[Innovation]) -> StepOutput:
-        """Begin again at step ``k`` from the open-loop run, about which the robot vibrates in a way that is not known."""
-        open_loop, fused = self.runs.open_loop, self.runs.fused
-        self._settling.begun = False
-        assert open_loop.state is not None
-        deviation = min(
-            max(self._largest_deviation, self._settling.apart), self.options.vibrating_fraction * self._length
-        )
-        vibrating = self._modes.vibrating(open_loop.state, self.model.parameters, deviation)
+        """Begin again at step ``k`` from the open-loop run, about which the robot may vibrate in a way that is not known."""
+        open_loop, fused, settling, vibrating = self.runs.open_loop, self.runs.fused, self._settling, None
+        settling.begun = False
+        if settling.vibrates and open_loop.state is not None:
+            farthest = self.options.vibrating_fraction * self._length
+            deviation = min(max(self._largest_deviation, settling.apart), farthest)
+            vibrating = self._modes.vibrating(open_loop.state, self.model.parameters, deviation)
         fused.reinitialise(open_loop, k, vibrating)
         fused.timing.clear()
         self.late.repeated = k, lambda: fused.reinitialise(open_loop, k, vibrating)

@@ -56,6 +56,7 @@ class Settling:
     Attributes:
         apart: m, how far a measurement lay from the open-loop run at most since the start.
         begun: whether the robot has been found to vibrate as the model does not, or measurements have not agreed; who acts on it sets it back.
+        vibrates: whether the robot may still vibrate then.
     """
 
     def __init__(self, noise: float, encoder_noise: float, options: SettlingOptions | None = None) -> None:
@@ -70,7 +71,8 @@ class Settling:
         self._why = ""
         self._agreed = 0
         self._measured = False  # since then
-        self.begun = False
+        self._newest_ns = 0  # stamp of the newest measurement
+        self.begun = self.vibrates = False
         self.apart = 0.0
         self._start_ns: int | None = None
         self._residual: Floats | None = None
@@ -104,7 +106,7 @@ class Settling:
     def begin(self, stamp_ns: int, why: str, vibrating: bool = True) -> None:
         """The model does not know how the robot moves at ``stamp_ns``, and ``why``, in words; ``vibrating``: it may vibrate as the model does not."""
         self._since_ns, self._why, self._agreed, self._measured = stamp_ns, why, 0, False
-        self.begun = vibrating
+        self.begun = self.vibrates = vibrating
 
     def _rotated(self, elapsed_ns: int) -> float:
         """rad, by which a joint has turned in that time after a start where the robot moves: the same rate, and more than noise."""
@@ -129,7 +131,7 @@ class Settling:
             if self._since_ns is None:
                 continue
             if innovation.stamp_ns >= self._since_ns and innovation.dof:
-                self._measured = True
+                self._measured, self._newest_ns = True, innovation.stamp_ns
                 agrees = (
                     innovation.accepted and not innovation.reason and not shifted and self._near(innovation)
                 )
@@ -183,4 +185,7 @@ class Settling:
             if not astray:
                 return ""
             self.begin(stamp_ns, DISAGREED)
+            self.vibrates = (
+                stamp_ns - self._newest_ns <= options.compared_s * 1e9
+            )  # else nothing would tell how, and it has died down
         return f"{self._why}: how it moves is not known until {options.agreeing} measurements in a row agree, or for {options.longest_s:g} s"

@@ -80,7 +80,7 @@ class JointChecks:
         self._last: tuple[int, Values] | None = None  # stamp and values as they came
         self._given = (-1, -1)  # stamp of the last accepted as it came, and as it was given out
         self._base: tuple[int, Values] = (0, ())  # what rates are taken from
-        self._readings, self._equal = 0, 0  # since the start, and of these equal to the one before
+        self._received, self._equal = 0, 0  # since the start, and of these equal to the one before
         self._recent = deque[Values](maxlen=RECENT)
         self._run = 1  # equal readings in a row
         self._runs = deque[int](maxlen=RUNS)  # the last such lengths in motion
@@ -111,7 +111,7 @@ class JointChecks:
             return self._drop(kind, at, size, "", text)
         last, self._last = self._last, (stamp_ns, raw)
         if last is not None:
-            self._readings, self._equal = self._readings + 1, self._equal + (last[1] == raw)
+            self._received, self._equal = self._received + 1, self._equal + (last[1] == raw)
         if last == self._last:
             text = "a joint state came twice; the first counts; look at the driver"
             return self._drop(Kind.REPEATED, at, 0.0, "", text)
@@ -371,7 +371,7 @@ class JointChecks:
         repeats = [self._recent.count(train.values) >= REPEATING for train in (mine, other)]
         if self._watch.by_rhythm:
             swapped = False
-        elif repeats[0] != repeats[1] and self._equal < LITTLE * self._readings:
+        elif repeats[0] != repeats[1] and self._equal < LITTLE * self._received:
             swapped = repeats[0]
         else:
             swapped = apart and nearer
