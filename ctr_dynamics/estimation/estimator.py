@@ -341,6 +341,8 @@ class Estimator:
         runs.judge(result)
         if mark is not None:
             self.innovations.discard(mark)
+        elif self._settling.lacks_vibration(self.timeline.stamp(k)):
+            runs.fused.timing.clear()
         elif result.ok and runs.fused.begin_again(runs.open_loop, k):
             late.history.restart(k)
         health.sweeps += result.sweeps

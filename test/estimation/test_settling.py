@@ -151,6 +151,19 @@ def test_measurements_agree_by_the_noise_that_is_stated(noises, agree):
     assert (not settling.problem(20 * MS)) == agree
 
 
+def test_after_a_start_in_motion_the_open_loop_run_tells_nothing_of_the_tracker_for_a_while():
+    settling, longest = Settling(NOISE, 2e-4), round(SettlingOptions().longest_s * 1e9)
+    settling.start(0, np.zeros(4))
+    assert not settling.lacks_vibration(5 * MS)
+    settling.watch(10 * MS, np.array([0.1, 0.0, 0.0, 0.0]))
+    settling.take([innovation(20 + i) for i in range(SettlingOptions().agreeing)])
+    assert not settling.problem(30 * MS), "measurements agree with the filter"
+    assert settling.lacks_vibration(30 * MS), "but the open-loop run is as it was"
+    assert not settling.lacks_vibration(longest + 1)
+    settling.begin(0, "a gap of the joints", vibrating=False)
+    assert not settling.lacks_vibration(5 * MS)
+
+
 def test_nothing_is_seen_of_the_motion_until_joints_and_measurements_have_told():
     settling = Settling(NOISE, 2e-4)
     assert settling.unseen(0) is None

@@ -72,6 +72,7 @@ class Settling:
         self._agreed = 0
         self._measured = False  # since then
         self._newest_ns = 0  # stamp of the newest measurement
+        self._moving_ns: int | None = None  # when the estimate started in motion
         self.begun = self.vibrates = False
         self.apart = 0.0
         self._start_ns: int | None = None
@@ -107,6 +108,7 @@ class Settling:
         """The model does not know how the robot moves at ``stamp_ns``, and ``why``, in words; ``vibrating``: it may vibrate as the model does not."""
         self._since_ns, self._why, self._agreed, self._measured = stamp_ns, why, 0, False
         self.begun = self.vibrates = vibrating
+        self._moving_ns = stamp_ns if why == STARTED_IN_MOTION else None
 
     def _rotated(self, elapsed_ns: int) -> float:
         """rad, by which a joint has turned in that time after a start where the robot moves: the same rate, and more than noise."""
@@ -162,6 +164,10 @@ class Settling:
         change = motion.residual - before
         if float(change @ change) > self._limit and self._since_ns is None:
             self.begin(innovation.stamp_ns, STARTED_IN_MOTION)
+
+    def lacks_vibration(self, stamp_ns: int) -> bool:
+        """Whether the open-loop run lacks a vibration at ``stamp_ns`` that the robot has: how measurements follow it tells nothing of the tracker."""
+        return self._moving_ns is not None and stamp_ns <= self._moving_ns + self.options.longest_s * 1e9
 
     def unseen(self, stamp_ns: int) -> float | None:
         """None where something has told how the robot moved when the model started: two joint states, and two measurements, of which the
