@@ -342,7 +342,7 @@ class Estimator:
         if mark is not None:
             self.innovations.discard(mark)
         elif self._settling.lacks_vibration(self.timeline.stamp(k)):
-            runs.fused.timing.clear()
+            runs.fused.timing.clear()  # nor is anything else concluded from how measurements follow it
         elif result.ok and runs.fused.begin_again(runs.open_loop, k):
             late.history.restart(k)
         health.sweeps += result.sweeps

@@ -123,11 +123,11 @@ class ModeTracker:
         self._begin(state, parameters)
         while self._pending is not None:
             self.refresh(state, parameters)
-        if self._basis is None or self._former is None or self._own is None:
+        if self._basis is None:
             return None
-        mesh = self._mesh
-        assert mesh is not None
-        return Vibrating(self._former.vibrating(deviation), mesh)
+        assert self._former is not None
+        assert self._mesh is not None
+        return Vibrating(self._former.vibrating(deviation), self._mesh)
 
     def _begin(self, state: State, parameters: Floats) -> None:
         now = state.inputs

@@ -1,8 +1,8 @@
 """After a start or a gap of the joints in motion the model does not know how the robot moves; outputs wait until measurements agree with it.
 
 A model that starts at rest lacks the vibration that the robot has. The filter then begins again from the open-loop run, with vibrations of any phase
-in its covariance, and measurements tell. Nothing is published until some in a row have been within the gate. Without measurements the vibration has
-to die down. Where measurements come and do not agree until then, they have led the estimate astray: the filter begins once more.
+in its covariance, and measurements tell. Nothing is published until some in a row have agreed. Without measurements the vibration has to die
+down. Where measurements come and do not agree until then, they have led the estimate astray: the filter begins once more.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ class SettlingOptions:
     """When the outputs count again.
 
     Attributes:
-        agreeing: measurements in a row within the gate, 0.2 s at 40 Hz: about a period of a slow vibration.
+        agreeing: measurements in a row that agree, 0.2 s at 40 Hz: about a period of a slow vibration.
         longest_s: s. Without measurements the outputs count again after that time.
         watched_s: s after a start in which the joints tell whether the robot moves.
         vibrating: probability with which the change of the open-loop residual between the first measurements is more than noise. As near as that,
@@ -191,7 +191,6 @@ class Settling:
             if not astray:
                 return ""
             self.begin(stamp_ns, DISAGREED)
-            self.vibrates = (
-                stamp_ns - self._newest_ns <= options.compared_s * 1e9
-            )  # else nothing would tell how, and it has died down
+            # where nothing measures any more, nothing would tell how; and it has died down
+            self.vibrates = stamp_ns - self._newest_ns <= options.compared_s * 1e9
         return f"{self._why}: how it moves is not known until {options.agreeing} measurements in a row agree, or for {options.longest_s:g} s"

@@ -23,10 +23,8 @@ BASELINE_S = 0.05  # rates are taken over this long, so that noise does not look
 POLLED_LIMIT_S = 0.05  # a driver that repeats its reading for longer is at rest, not polled too fast
 ABSURD = 1e6  # rad or m; beyond it nothing is compared
 LITTLE = 0.3  # part of the readings that equal the one before: of two drivers in step, one of which repeats itself, a quarter do at most
-RECENT, REPEATING = (
-    16,
-    4,
-)  # messages, and how many of them are equal bit by bit where a second driver repeats itself
+RECENT = 16  # messages among which values are looked for that come back bit by bit
+REPEATING = 4  # times that they come where a driver repeats itself
 RUNS = 8  # runs of equal readings that tell how often a driver repeats them
 
 
@@ -179,9 +177,8 @@ class JointChecks:
         since_ns, rhythm_ns = state.stamp_ns - train.stamp_ns, 1e9 * self._watch.rhythm_s
         if not self._watch.off_beat or not 0 < since_ns < TOO_SOON * rhythm_ns:
             return None
-        ahead = train.at(
-            train.stamp_ns + round(2.0 * rhythm_ns)
-        )  # of a message that is stamped late or early
+        # a message that is stamped late or early lies on the way there, too
+        ahead = train.at(train.stamp_ns + round(2.0 * rhythm_ns))
         return self.motion.beside(train.values, ahead, state.values, since_ns * 1e-9)
 
     def _accept(self, train: Train, state: _JointState, stamped: Verdict) -> Verdict:
