@@ -10,6 +10,7 @@ import math
 import time
 from array import array
 from collections.abc import Callable, Sequence
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -252,6 +253,7 @@ class Estimator:
         runs, history = self.runs, self.late.history
         if runs.fused.state is None:
             return
+        self._conclude()
         runs.fused.ekf.adapted.settle()
         if runs.fused.ekf.add_noise_and_reduce() and history.last is not None and history.last.k == self.k:
             history.record(self.k)  # who returns to that step need not do it again
@@ -300,9 +302,8 @@ class Estimator:
             return
         if newest - stamps[-2] <= largest * STEP_NS:
             return  # a long call without a gap: take every step
-        self.health.note(
-            "joints", "gap", f"{seconds(behind):.1f} s without joints; the model is reinitialised at rest"
-        )
+        text = f"{seconds(behind):.1f} s without joints; the model is reinitialised at rest"
+        self.health.note("joints", "gap", text)
         self.health.restarts += 1
         self.timeline.k = (newest - self.t0_ns) // STEP_NS - 1
         self.runs.stop()
@@ -328,6 +329,7 @@ class Estimator:
         health.steps += 1
         if not runs.running:
             return self._start(k)
+        self._conclude()
         # Uncorrected steps say nothing of the robot, nor do those that will be corrected at once: measurements wait for the correction. Where that
         # is not soon, they are fused for the time being, and counted when they are fused again; but not where they would be taken for what the
         # actuators have done.
@@ -341,14 +343,17 @@ class Estimator:
         runs.judge(result)
         if mark is not None:
             self.innovations.discard(mark)
-        elif self._settling.lacks_vibration(self.timeline.stamp(k)):
-            runs.fused.timing.clear()  # nor is anything else concluded from how measurements follow it
-        elif result.ok and runs.fused.begin_again(runs.open_loop, k):
-            late.history.restart(k)
         health.sweeps += result.sweeps
         if not result.ok:
             return self._invalid(k, f"step failed: {result.reason}")
         return self._output(k, result, too_old(self.timeline.stamp(k)))
+
+    def _conclude(self) -> None:
+        """Have the filter count on something else, if the measurements up to the last step show that it is right."""
+        runs, late = self.runs, self.late
+        moves_as_modelled = not self._settling.lacks_vibration(self.timeline.stamp(runs.k))
+        if late.lag <= late.options.reuse_lag and runs.conclude(moves_as_modelled):
+            late.history.restart(runs.k)
 
     def _start(self, k: int) -> StepOutput:
         """Both runs at rest at step ``k``, unless there is no equilibrium."""
@@ -401,7 +406,7 @@ class Estimator:
             innovations, fused.ekf.refuted, fused.agreed or bool(unsettled) or not health.fusing
         )
         if unsettled:  # measurements tell nothing of the model's error either
-            fused.model_error_search.clear()
+            fused.alternatives.clear_model_error()
             self.innovations.pass_over()
         self._stability_due |= k % options.stability_every == 0
         if too_old:
@@ -413,8 +418,7 @@ class Estimator:
         modes = self._modes.measure(fused.state, k)
         periods_s = self.inputs.joint_period_s, fused.pose_period_s
         self._twist_error.inflate(tip, stamp, open_loop, fused.ekf, periods_s, modes)
-        apart = self._settling.unseen(stamp)
-        if apart is not None:
+        if (apart := self._settling.unseen(stamp)) is not None:
             self._unseen_vibration.inflate(tip.covariance, apart)
         self._driven_m = self.inputs.actuator_error.inflate(
             tip.covariance, tip.position, self._length, stamp, late.lag * STEP_NS
@@ -436,7 +440,7 @@ class Estimator:
             deviation = min(max(self._largest_deviation, settling.apart), farthest)
             vibrating = self._modes.vibrating(open_loop.state, self.model.parameters, deviation)
         fused.reinitialise(open_loop, k, vibrating)
-        fused.timing.clear()
+        fused.alternatives.clear_timing()
         self.late.repeated = k, lambda: fused.reinitialise(open_loop, k, vibrating)
         self.late.history.record(k, always=True)
         return self._invalid(k, reason, innovations)
@@ -457,8 +461,7 @@ class Estimator:
         if unsettled:
             return unsettled
         deviations = Deviations(deviation, self._driven_m, self._largest_deviation)
-        fused = self.runs.fused
-        return deviations.problem(self.health, fused.timing.apart if fused.late else None)
+        return deviations.problem(self.health, self.runs.fused.alternatives.late_by_m)
 
     def _look_for_motion(self) -> None:
         """Have outputs wait after a gap of the joints, or after a start, in which the robot moved."""
@@ -484,10 +487,7 @@ class Estimator:
             "parameters": ekf.parameters(known=self.runs.running),
             "tracker_bias": [float(x) for x in ekf.bias],
             "tip_force_drive_N": ekf.adapted.sigma,
-            "statuses": [
-                {"name": s.name, "level": s.level, "message": s.message, "values": s.values}
-                for s in all_statuses(self.health)
-            ],
+            "statuses": [asdict(status) for status in all_statuses(self.health)],
         }
 
     def summary(self) -> dict[str, Any]:

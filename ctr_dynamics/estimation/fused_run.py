@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ctr_dynamics.estimation.alternatives import Alternatives, Compared
 from ctr_dynamics.estimation.filter.covariance_factor import Vibrating
 from ctr_dynamics.estimation.filter.ekf import RodEkf
 from ctr_dynamics.estimation.filter.filter_records import FilterState, TipEstimate, Update
@@ -17,26 +18,18 @@ from ctr_dynamics.estimation.inputs.measurement_queue import DueMeasurement
 from ctr_dynamics.estimation.inputs.run_inputs import InterpolatedInputs, RunInputs
 from ctr_dynamics.estimation.monitoring.densities import allowance
 from ctr_dynamics.estimation.monitoring.disagreement import Disagreement
-from ctr_dynamics.estimation.monitoring.end_of_jitter import EndOfJitter
 from ctr_dynamics.estimation.monitoring.health import Health
 from ctr_dynamics.estimation.monitoring.innovation_log import InnovationLog
-from ctr_dynamics.estimation.monitoring.model_error_search import ModelErrorSearch
-from ctr_dynamics.estimation.monitoring.response_search import in_words
-from ctr_dynamics.estimation.monitoring.tracker_timing import TrackerTiming
 from ctr_dynamics.estimation.open_loop import OpenLoopRun
 from ctr_dynamics.estimation.step_output import (
     FUSION_OFF,
-    MOVING_FRAME,
-    UNKNOWN_DELAY,
     Innovation,
     MotionPoint,
 )
 from ctr_dynamics.estimation.timeline import DT, seconds
 from ctr_dynamics.kernels import rotations
 from ctr_dynamics.kernels.layout import parameters_of_inputs
-from ctr_dynamics.kernels.tracker_measurement import pose_difference
 from ctr_dynamics.model.simulator import State
-from ctr_dynamics.sensing.tracker import ROTATION, TRANSLATION
 
 Floats = NDArray[np.float64]
 NEGLIGIBLE = 1e-4  # probability of another delay or model error; less is no matter of the covariance
@@ -64,8 +57,7 @@ class FusedRun:
         state: after the last step; None before the start and after what cannot be gone on from.
         measured_ns: stamp of the newest measurement that reached the gate.
         confirmed: measurements since the start that were fused and show no shift of the tracker.
-        late: whether the tracker is late by a time that is not known yet. moving: whether its frame moves. Measurements are then compared and not
-            fused.
+        alternatives: what else than the filter counts on may be right.
     """
 
     def __init__(
@@ -77,34 +69,19 @@ class FusedRun:
         model = ekf.model
         rows = parameters_of_inputs(model.n)[: model.input_count]
         self._by_theta = ekf.uncertainty.effect[rows]  # encoder offsets and tip force
-        noise, length = model.robot.tracker.noise, float(model.robot.lengths[0])
-        file = ekf.tracker.state_sigma
-        registered = math.hypot(file[TRANSLATION].max(), length * file[ROTATION].max())
-        moves = noise.position.value, ekf.options.force_change, length, registered
-        self.timing = TrackerTiming(*moves, ekf.tracker)
-        self.disagreement = Disagreement(noise.position.value)
-        self.end_of_jitter = EndOfJitter()
-        self.model_error_search = ModelErrorSearch(
-            noise.position.value,
-            noise.rotation.value,
-            length,
-            registered,
-            ekf.options.force_change,
-        )
+        self.disagreement = Disagreement(model.robot.tracker.noise.position.value)
+        self.alternatives = Alternatives(ekf, inputs, health)
         self.state: State | None = None
         self.measured_ns: int | None = None
-        self.confirmed, self.late, self.moving = 0, False, False
-        self._scatters_since = 0  # step, since when stamps probably scatter
+        self.confirmed = 0
         self._apart = np.zeros(3)  # m, the last measurement from the open-loop run
 
     def clear(self) -> None:
         """Have no state, and the parameters of the robot file."""
         self.ekf.forget_parameters()
-        self.timing.clear()
-        self.model_error_search.clear()
+        self.alternatives.clear()
         self.disagreement.clear()
-        self.end_of_jitter.clear()
-        self.state, self.measured_ns, self.confirmed, self.late, self.moving = None, None, 0, False, False
+        self.state, self.measured_ns, self.confirmed = None, None, 0
 
     def start(self, state: State, t: float, vibrating: Vibrating | None = None) -> None:
         """Begin at the static equilibrium ``state`` at the time ``t`` (s); ``vibrating``: what the robot may do about it."""
@@ -117,14 +94,9 @@ class FusedRun:
         return self.confirmed >= CONFIRMED
 
     @property
-    def not_fused(self) -> str:
-        """Why measurements are compared and not fused; empty where they are."""
-        return UNKNOWN_DELAY if self.late else MOVING_FRAME if self.moving else ""
-
-    @property
     def pose_period_s(self) -> float:
         """s between two measurements that are fused, at least the time since the last one; infinite while none are."""
-        if not self._health.fusing or self.not_fused:
+        if not self._health.fusing or self.alternatives.not_fused:
             return math.inf
         return max(self._inputs.measurements.period_s, self._health.tracker_age_s)
 
@@ -136,39 +108,28 @@ class FusedRun:
     def update(self, k: int, due: Sequence[DueMeasurement], open_loop: OpenLoopRun) -> None:
         """Compare the measurements that have come ``due`` after step ``k`` with the tips of their times, and fuse them."""
         assert self.state is not None
+        not_fused = self.alternatives.not_fused
         for measurement, time_s, position, quaternion in due:
             measurement.fused_k = k
             motion, residual = self.residuals(time_s, position, quaternion, open_loop)
             if self._inputs.missing_at(time_s - self.ekf.tracker.age):
                 update = Update.impossible("no joint states at its time")
-            elif self._health.fusing and not self.not_fused:
+            elif self._health.fusing and not not_fused:
                 update = self.ekf.update(self.state, time_s, position, quaternion)
             else:
                 update = self.ekf.compare(time_s, position, quaternion)
-                if self.not_fused:
-                    update = update._replace(reason=update.reason.replace(FUSION_OFF, self.not_fused))
+                if not_fused:
+                    update = update._replace(reason=update.reason.replace(FUSION_OFF, not_fused))
             if motion is not None and residual is not None:
                 seen = motion.position + motion.residual
                 self.disagreement.add(measurement.stamp_ns, seen, motion.position, residual)
             if motion is not None and update.foretold is not None:
                 self._apart = motion.residual
-                self.end_of_jitter.add(measurement.stamp_ns, update.steadier)
-                expected, tips = self.ekf.expected, open_loop.tips.positions()
-                newest_s = time_s - expected.model.delay
-                self.timing.add(
-                    measurement.stamp_ns, newest_s, seen, tips, update.foretold, expected, self.ekf.delay
+                tips = open_loop.tips.positions()
+                compared = Compared(
+                    measurement.stamp_ns, time_s, quaternion, motion, tips, update, self.ekf.delay
                 )
-                if expected.slower:
-                    expected.refine(*self.timing.response.refined(expected.response))
-                self.model_error_search.add(
-                    measurement.stamp_ns,
-                    seen,
-                    motion.residual,
-                    motion.velocity,
-                    motion.acceleration,
-                    self._turn(quaternion, motion.quaternion),
-                    update.foretold,
-                )
+                self.alternatives.add(compared)
             newer = self.measured_ns is None or measurement.stamp_ns > self.measured_ns
             if not self.agreed and update.accepted and newer and not self.ekf.tracker_fault()[0]:
                 self.confirmed += 1
@@ -210,12 +171,6 @@ class FusedRun:
         )  # fmt: skip
         return motion, position - estimate
 
-    def _turn(self, quaternion: Floats, open_loop: Floats) -> Floats:
-        """Rotation vector (a,) rad from that of the ``open_loop`` tip to a measured ``quaternion``, (4,) wxyz each, on the measured axes."""
-        tracker, none = self.ekf.tracker, np.zeros(3)
-        expected = rotations.multiply(tracker.rotation, open_loop)
-        return pose_difference(none, quaternion, none, expected, tracker.free)[3:][tracker.mask[3:]]
-
     def reinitialise(self, open_loop: OpenLoopRun, k: int, vibrating: Vibrating | None = None) -> None:
         """Go on from the open-loop run at step ``k``: a correction has led this run astray. ``vibrating``: how the robot may move beside it."""
         assert open_loop.state is not None
@@ -224,123 +179,10 @@ class FusedRun:
 
     def begin_again(self, open_loop: OpenLoopRun, k: int) -> bool:
         """Go on from the open-loop run at step ``k`` if measurements show that something else is right than the filter counts on."""
-        return (
-            self.follow_timing(open_loop, k)
-            or self.follow_jitter(open_loop, k)
-            or self.leave_moving_frame(open_loop, k)
-            or self.follow_model_error(open_loop, k)
-            or self.leave_refuted(open_loop, k)
-        )
-
-    def follow_timing(self, open_loop: OpenLoopRun, k: int) -> bool:
-        """Go on from the open-loop run at step ``k`` with another delay or response of the tracker, if measurements follow it far better with that.
-
-        Where they do with many delays, as before a late tracker shows the first motion, they are not fused until one is found.
-        """
-        if not self._health.fusing:
-            return False
-        expected, delay, was_late = self.ekf.expected, self.ekf.delay, self.late
-        found = self.timing.found(expected, delay)
-        self.late = found is None and self.timing.undecided(expected, delay)
-        if found is None and (was_late or not self.late):
-            return False
-        kind, note = "latency", "poses are older than their stamps, by a time that is not known yet"
-        if found is not None:
-            if found.response is not None:
-                expected.responds(found.response, found.deviation if found.delay is None else 0.0)
-                expected.late_by(0.0, 0.0)  # a response tells by itself how late a tracker is,
-                expected.jitter = 0.0  # and looks like jitter before it is known
-                self.end_of_jitter.clear()
-                kind, note = "response", in_words(found.response)
-            if found.delay is not None:
-                kind = "latency"
-                expected.late_by(found.delay, found.deviation)
-                whole_ms = 1e3 * (expected.model.delay + expected.delay)
-                note = f"poses are {abs(whole_ms):.0f} ms {'older' if whole_ms > 0.0 else 'newer'} than their stamps"
-            self._inputs.measurements.early_s = max(-expected.delay, 0.0)
-            self.timing.followed(found)
-            self._health.distances.clear()
-        advice = "; check the tracker's clock, or set tracker.delay_s" if kind == "latency" else ""
-        self._health.note("tracker", kind, note + advice)
-        self.reinitialise(open_loop, k)
-        return True
-
-    def follow_jitter(self, open_loop: OpenLoopRun, k: int) -> bool:
-        """Go on from the open-loop run at step ``k`` with stamps that scatter, if measurements follow it far better with that than the filter.
-
-        Where they scatter less than they did, the filter goes on as it is, with half of that.
-        """
-        if not self._health.fusing or self.not_fused:
-            return False
-        search = self.model_error_search
-        if self.ekf.expected.jitter and self.end_of_jitter.less:
-            half = 0.5 * self.ekf.expected.jitter
-            self.ekf.expected.jitter = half if half > 0.5 * search.jitter.options.smallest_s else 0.0
-            self.end_of_jitter.clear()
-        probability, deviation = search.stamp_jitter(self.ekf.expected.jitter)
-        if probability <= 0.5 or self.timing.other(self.ekf.expected, self.ekf.delay) > 0.5:
-            self._scatters_since = k
-        lasts = seconds(k - self._scatters_since) > search.jitter.options.lasts_s
-        if probability <= search.options.believed or not lasts:
-            return False
-        self.ekf.expected.jitter = deviation
-        self.end_of_jitter.clear()
-        search.begin_again()
-        self.timing.begin_again(self.ekf.expected, self.ekf.delay)
-        self._health.note(
-            "tracker",
-            "jitter",
-            f"stamps scatter by {1e3 * deviation:.0f} ms; stamp poses when they are measured, not when they arrive",
-        )
-        self.reinitialise(open_loop, k)
-        return True
-
-    def leave_moving_frame(self, open_loop: OpenLoopRun, k: int) -> bool:
-        """Go on from the open-loop run at step ``k`` if the frame of the tracker moves; measurements are not fused as long as it does."""
-        was, frame = self.moving, self.model_error_search.frame
-        self.moving = self._health.fusing and not self.late and frame.moves(was)
-        if was or not self.moving:
-            return False
-        velocity, turn = frame.rates(open_loop.tips.last.mean[:3])
-        self._health.note(
-            "tracker",
-            "moving frame",
-            f"measured positions depart from the model as by a frame that moves by {1e3 * math.hypot(*velocity):.1f} mm/s and "
-            f"{math.degrees(math.hypot(*turn)):.1f} deg/s; check the field generator, the tracker's stand and the robot's base",
-        )
-        self.reinitialise(open_loop, k)
-        return True
-
-    def follow_model_error(self, open_loop: OpenLoopRun, k: int) -> bool:
-        """Go on from the open-loop run at step ``k`` with a larger model error, if measurements follow that far better than the filter.
-
-        Without it, the filter takes the error of the model for a force and for wrong parameters, which move the velocities too.
-        """
-        if not self._health.fusing or self.not_fused:
-            return False
-        found = self.model_error_search.found(self.ekf.model_error)
-        if found is None:
-            return False
-        self._health.model_error = found
-        self.ekf.expect_model_error(found)
-        self.model_error_search.begin_again()
-        self.reinitialise(open_loop, k)
-        return True
-
-    def leave_refuted(self, open_loop: OpenLoopRun, k: int) -> bool:
-        """Go on from the open-loop run at step ``k`` where that foretells measurements far better, and the estimate refutes the robot file.
-
-        Inputs that were wrong for a while have bent parameters and registration then, which are certain by now and would not come back for long.
-        """
-        if (
-            not self._health.fusing
-            or self.not_fused
-            or not (self.ekf.refuted and self.model_error_search.astray)
-        ):
-            return False
-        self.model_error_search.forgive()
-        self.reinitialise(open_loop, k)
-        return True
+        again = self.alternatives.conclude(open_loop, k)
+        if again:
+            self.reinitialise(open_loop, k)
+        return again
 
     def inflate_covariance(self, tip: TipEstimate, open_loop: OpenLoopRun, farthest: float) -> None:
         """Have the covariance of ``tip`` hold what else may be right: the open-loop run where the tracker may be late, its frame may move, or the
@@ -356,13 +198,11 @@ class FusedRun:
             shift = self.ekf.shift_in_base()
             if math.hypot(*shift.tolist()) < farthest:
                 tip.covariance[:3, :3] += np.multiply.outer(shift, shift)
-        timing, search = self.timing.other(self.ekf.expected, self.ekf.delay), self.model_error_search
-        moves, scatter = search.frame.probability, search.stamp_jitter(self.ekf.expected.jitter)[0]
-        other = max(timing, moves, scatter, search.probability(self.ekf.model_error))
+        other = self.alternatives.probability
         if not self._health.fusing or other < NEGLIGIBLE:
             return
-        if self.not_fused:
-            fusing = 1.0 - (timing if self.late else moves)
+        if self.alternatives.not_fused:
+            fusing = 1.0 - self.alternatives.reason_not_to_fuse
             tip.covariance[:3, :3] += allowance(fusing) * np.multiply.outer(self._apart, self._apart)
             return
         mean = open_loop.tips.last.mean

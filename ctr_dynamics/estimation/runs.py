@@ -62,7 +62,7 @@ class Runs:
         self.open_loop = OpenLoopRun(
             nominal,
             RunInputs(self._interpolated, load, no_effect, np.zeros(0)),
-            ekf.tips.size + math.ceil(self.fused.timing.reach_s / DT),
+            ekf.tips.size + math.ceil(self.fused.alternatives.timing.reach_s / DT),
         )
         self.clear()
 
@@ -146,6 +146,16 @@ class Runs:
         self.fused.update(k, due, self.open_loop)
         self._inputs.measurements.forget(k)
         return result
+
+    def conclude(self, moves_as_modelled: bool) -> bool:
+        """Whether the fused run has begun again from the open-loop run: measurements show that something else is right than the filter counts on.
+
+        ``moves_as_modelled``: whether the open-loop run moves as the robot does, but for faults. Else how measurements follow it says nothing.
+        """
+        if not moves_as_modelled:
+            self.fused.alternatives.clear_timing()
+            return False
+        return self.fused.begin_again(self.open_loop, self.k)
 
     def judge(self, result: StepResult) -> None:
         """Count the outcome of a step; after too many failures in a row there is no state to go on from."""
