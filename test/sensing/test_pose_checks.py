@@ -54,6 +54,19 @@ def test_a_vibration_at_half_or_a_quarter_of_the_rate_is_no_second_tracker(check
     assert {v.use for v in verdicts} == {"accept"}
 
 
+@pytest.mark.parametrize("left_out", [(3.0, 0.0, 0.0), (0.0, 0.0, 0.0), (math.nan, 0.0, 0.0)])
+def test_poses_that_are_left_out_do_not_move_those_of_their_burst(checks, left_out):
+    rng, errors = np.random.default_rng(4), []
+    for k, (true, position, quaternion) in enumerate(stream(800)):
+        stamp = T0 + (k // 4 * 4 + 3) * POSE_PERIOD + k % 4 * 100_000
+        bad = k > 300 and rng.random() < 0.4
+        verdict = checks.check(stamp, stamp, left_out if bad else position, quaternion)
+        assert (verdict.use == "drop") == bad
+        if k > 300 and not bad:
+            errors.append(verdict.stamp_ns - true)
+    assert max(map(abs, errors)) < 1_500_000
+
+
 def test_another_frame_is_dropped(checks):
     verdicts = feed(checks, stream(3), frame_id="aurora")
     assert {v.kind for v in verdicts} == {Kind.OTHER_FRAME}

@@ -160,6 +160,36 @@ def test_bursts_with_a_lost_message_recover(stamps):
     assert max(abs(e) for e in late) < 8_000_000
 
 
+def bursts(count, size=4, left_out=range(0)):
+    """Stamps of arrival of ``count`` messages, handed over by ``size``, without those ``left_out``; and their true times."""
+    found = []
+    for k in range(count):
+        stamp = T0 + (k // size * size + size - 1) * PERIOD + k % size * 100_000
+        if k not in left_out:
+            found.append((T0 + k * PERIOD, stamp))
+    return found
+
+
+@pytest.mark.parametrize("size", [2, 4, 10])
+def test_bursts_are_spaced_evenly_as_soon_as_a_pause_is_over(stamps, size):
+    messages = bursts(800, size, range(400, 500))
+    verdicts = feed(stamps, [(stamp, stamp) for _, stamp in messages])
+    errors = [v.stamp_ns - true for v, (true, _) in zip(verdicts[400:], messages[400:], strict=True)]
+    assert max(map(abs, errors)) < 1_500_000
+
+
+def test_messages_that_are_left_out_keep_their_place_in_a_burst(stamps):
+    rng, errors = np.random.default_rng(4), []
+    for k, (true, stamp) in enumerate(bursts(800)):
+        if k > 300 and rng.random() < 0.4:
+            stamps.pass_over(stamp, stamp)
+            continue
+        (verdict,) = feed(stamps, [(stamp, stamp)])
+        if k > 300:
+            errors.append(verdict.stamp_ns - true)
+    assert max(map(abs, errors)) < 1_500_000
+
+
 @pytest.mark.parametrize(
     ("grid", "arrives"),
     [(10_000_000, True), (7_000_000, True), (16_000_000, True), (10_000_000, False), (7_000_000, False)],

@@ -134,9 +134,12 @@ class PoseChecks:
         pose: Pose = (tuple(position), tuple(quaternion_xyzw))
         if not all(map(math.isfinite, (*pose[0], *pose[1]))):
             text = f"pose at {stamp_ns} ns holds a value that is not finite; it was left out"
+            self.stamps.pass_over(stamp_ns, arrival_ns)
             return self._drop(Kind.NOT_FINITE, at, 0.0, "", text)
         wrong = self._placeholder(at, pose) or self._repeated(stamp_ns, at, pose) or self._unlike(at, pose)
         if wrong is not None:
+            if wrong.kind in (Kind.PLACEHOLDER, Kind.OUT_OF_REACH):
+                self.stamps.pass_over(stamp_ns, arrival_ns)
             return wrong
         unset = self._joint_ns is not None and abs(self._joint_ns) > self.limits.unrelated_s * 1e9
         stamped = self.stamps.check(stamp_ns, arrival_ns, zero_is_wrong=unset)

@@ -62,6 +62,7 @@ class StampChecks:
         self._arrival_ns: int | None = None
         self._period_ns = self._rhythm_ns = self._given_period_s * 1e9
         self._burst_ns, self._grid_ns = 0.0, 0
+        self._resumes = False  # whether a pause was so short ago that the window is not full
         self._even = False  # whether enough stamps are known, and none follows another at once
         self._taken = self._ahead = self._ahead_ago = self._back = 0
         self._standing, self._standing_since_ns, self._moving = 0, 0, 0
@@ -157,6 +158,15 @@ class StampChecks:
             self._look()
         return self._retimed(stamp_ns, arrival_ns, at)
 
+    def pass_over(self, stamp_ns: int, arrival_ns: int | None) -> None:
+        """Take in the stamp of a message that is left out for its values: where stamps come in bursts, it has its place among the others."""
+        if (
+            self.mode == "bursts"
+            and self.newest_ns is not None
+            and 0 <= stamp_ns - self.newest_ns < LEAP_S * 1e9
+        ):
+            self.take(stamp_ns, arrival_ns)
+
     def _note_arrival(self, arrival_ns: int, offset: int) -> None:
         """Follow the least arrival - stamp, ns, over one to two stretches."""
         if not self._arrivals:
@@ -242,7 +252,7 @@ class StampChecks:
     def _step(self, stamp_ns: int, step: int, pause: int, at: int) -> None:
         """Note the step from the newest stamp."""
         if step > max(LEAP_S * 1e9, 20.0 * self._period_ns) and self._standing < STANDING:
-            self._before_leap_ns, self._since_leap = self.newest_ns, 1
+            self._before_leap_ns, self._since_leap, self._resumes = self.newest_ns, 1, True
             self._steps.clear()
             self._total = self._standing = 0
             return
@@ -266,8 +276,9 @@ class StampChecks:
 
     def _look(self) -> None:
         """Name the pattern of the last stamps."""
-        if len(self._steps) < 6:
-            return
+        self._resumes &= len(self._steps) < WINDOW
+        if len(self._steps) < 6 or (self.mode and self._resumes):
+            return  # after a pause, stamps are what they were before it until the window is full
         self._even = len(self._steps) == WINDOW and min(s for s, _ in self._steps) > 0.25 * self._period_ns
         mode: Mode = ""
         if self._standing >= STANDING and not self._handed_over_at_once():
