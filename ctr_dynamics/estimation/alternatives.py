@@ -173,7 +173,7 @@ class Alternatives:
     def _weigh(self) -> None:
         """How likely something else is now than the filter counts on."""
         search, timing = self.model_error, self._other_timing
-        moves, scatter = search.frame.probability, search.stamp_jitter(self._ekf.expected.jitter)[0]
+        moves, scatter = search.frame.probability, search.stamp_jitter(self._ekf.expected.scatter)[0]
         self.probability = max(timing, moves, scatter, search.probability(self._ekf.model_error))
         self.reason_not_to_fuse = timing if self.late else moves
 
@@ -223,7 +223,7 @@ class Alternatives:
             half = 0.5 * self._ekf.expected.jitter
             self._ekf.expected.jitter = half if half > 0.5 * search.jitter.options.smallest_s else 0.0
             self.end_of_jitter.clear()
-        probability, deviation = search.stamp_jitter(self._ekf.expected.jitter)
+        probability, deviation = search.stamp_jitter(self._ekf.expected.scatter)
         if probability <= 0.5 or self._other_timing > 0.5:
             self._scatters_since = k
         lasts = seconds(k - self._scatters_since) > search.jitter.options.lasts_s

@@ -146,8 +146,8 @@ class Estimator:
         self._look_for_motion()
 
     def add_tracker_pose(
-        self, stamp_ns: int, position: Sequence[float], quaternion_xyzw: Sequence[float], frame_id: str = ""
-    ) -> None:
+        self, stamp_ns: int, position: Sequence[float], quaternion_xyzw: Sequence[float], frame_id: str = "", stamp_error_s: float = 0.0,
+    ) -> None:  # fmt: skip
         """Take in a tracker pose. Unusable ones are counted, not raised.
 
         Args:
@@ -155,9 +155,10 @@ class Estimator:
             position: (3,) m in the tracker's frame.
             quaternion_xyzw: (4,) of the sensor in the tracker's frame.
             frame_id: of its header; empty stands for the expected one.
+            stamp_error_s: 1-sigma of the stamp, s, where it is known to be no time of measurement.
         """
         joints_ns = next(reversed(self.inputs.joints.stamps), None)
-        self.inputs.measurements.add(stamp_ns, position, quaternion_xyzw, frame_id, joints_ns)
+        self.inputs.measurements.add(stamp_ns, position, quaternion_xyzw, frame_id, joints_ns, stamp_error_s)
 
     def add_tip_load(
         self, stamp_ns: int, force: Sequence[float], torque: Sequence[float], frame_id: str = ""
@@ -330,9 +331,8 @@ class Estimator:
         if not runs.running:
             return self._start(k)
         self._conclude()
-        # Uncorrected steps say nothing of the robot, nor do those that will be corrected at once: measurements wait for the correction. Where that
-        # is not soon, they are fused for the time being, and counted when they are fused again; but not where they would be taken for what the
-        # actuators have done.
+        # Uncorrected steps say nothing of the robot: measurements wait for the correction. Where that is not soon, they are fused for the time being,
+        # and counted when they are fused again; but not where they would be taken for what the actuators have done.
         lag = late.lag
         soon = lag <= late.options.reuse_lag
         awaited = self.inputs.awaits_joints(k, late.options.reuse_lag)

@@ -111,6 +111,7 @@ class FusedRun:
         not_fused = self.alternatives.not_fused
         for measurement, time_s, position, quaternion in due:
             measurement.fused_k = k
+            self.ekf.expected.stamp_error = measurement.stamp_error_s
             motion, residual = self.residuals(time_s, position, quaternion, open_loop)
             if self._inputs.missing_at(time_s - self.ekf.tracker.age):
                 update = Update.impossible("no joint states at its time")

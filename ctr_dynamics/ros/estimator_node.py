@@ -257,11 +257,7 @@ class EstimatorNode(Node):
         self._estimator.add_joint_state(given.stamp_ns, given.names, given.positions)
 
     def _take_tracker(self, message: PoseIn, arrival_ns: int) -> None:
-        pose = self._gate.pose(message, arrival_ns)
-        if pose is not None:
-            self._estimator.add_tracker_pose(
-                pose.stamp_ns, pose.position, pose.quaternion_xyzw, pose.frame_id
-            )
+        self._gate.give_pose(message, arrival_ns)
 
     def _take_load(self, message: WrenchIn, arrival_ns: int) -> None:
         load = self._gate.load(message, arrival_ns)

@@ -95,7 +95,19 @@ class InputGate:
         if self._left_out(self.checks.poses.findings, verdict) or not verdict.orientation:
             self._health.dropped += 1
             return None
-        return message if verdict.stamp_ns is None else message._replace(stamp_ns=verdict.stamp_ns)
+        if verdict.stamp_ns is None:
+            return message
+        return message._replace(stamp_ns=verdict.stamp_ns, stamp_error_s=verdict.error_s)
+
+    def give_pose(self, message: PoseIn, arrival_ns: int) -> None:
+        """Give the estimator the pose to use, if there is one. ``arrival_ns``: see :meth:`joint_state`."""
+        pose = self.pose(message, arrival_ns)
+        if pose is not None:
+            # an error that is zero need not be known by other estimators of the same interface
+            error = {"stamp_error_s": pose.stamp_error_s} if pose.stamp_error_s else {}
+            self._estimator.add_tracker_pose(
+                pose.stamp_ns, pose.position, pose.quaternion_xyzw, pose.frame_id, **error
+            )
 
     def load(self, message: WrenchIn, arrival_ns: int) -> WrenchIn | None:
         """The load to use; None where it is left out. ``arrival_ns``: see :meth:`joint_state`."""

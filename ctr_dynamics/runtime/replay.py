@@ -146,11 +146,7 @@ class Player:
                 rejection = self._clock.rejection(given.stamp_ns, item.log_ns)
                 self.estimator.health.note("joints", "far ahead", rejection)
         elif isinstance(message, PoseIn):
-            pose = self._gate.pose(message, item.log_ns)
-            if pose is not None:
-                self.estimator.add_tracker_pose(
-                    pose.stamp_ns, pose.position, pose.quaternion_xyzw, pose.frame_id
-                )
+            self._gate.give_pose(message, item.log_ns)
         else:
             load = self._gate.load(message, item.log_ns)
             if load is not None:

@@ -138,3 +138,20 @@ def test_jitter_that_ends_is_forgotten():
     run = play(messages)
     assert "stamps scatter" in run.estimator.health.tracker["jitter"].last
     assert run.estimator.runs.fused.ekf.expected.jitter < 0.003
+
+
+def test_a_stamp_of_stated_error_counts_less_where_the_tip_moves():
+    """As a pose does whose time had to be guessed, since it was handed over with others."""
+    messages = bag_messages("clean_sweep", 1.2)
+
+    def stated(made):
+        add = made.add_tracker_pose
+        made.add_tracker_pose = lambda *arguments: add(*arguments, stamp_error_s=0.02)
+
+    variances = []
+    for prepare in (lambda made: None, stated):
+        run = play(messages, prepare=prepare)
+        found = [i.variance[:3].sum() for out in run.outputs for i in out.innovations]
+        variances.append(np.array(found))
+        assert run.estimator.health.tracker.get("jitter") is None
+    assert variances[1].max() > 4.0 * variances[0].max()

@@ -190,6 +190,48 @@ def test_messages_that_are_left_out_keep_their_place_in_a_burst(stamps):
     assert max(map(abs, errors)) < 1_500_000
 
 
+def test_bursts_amid_an_even_rhythm_are_left_out_until_they_are_known(stamps):
+    first, size = 201, 4
+    messages = [(s, s) for s, _ in even(first)] + bursts_from(first, 200, size) + bursts_from(401, 100, 1)
+    wrong = 0
+    for k, (verdict, (stamp, _)) in enumerate(zip(feed(stamps, messages), messages, strict=True)):
+        if verdict.use != "drop":
+            used = stamp if verdict.stamp_ns is None else verdict.stamp_ns
+            wrong += abs(used - (T0 + k * PERIOD)) > 2_000_000
+    assert wrong <= 3  # the first of each of some bursts
+    assert stamps.findings.count(Kind.BURSTS) > 150
+
+
+def bursts_from(first, count, size):
+    """Stamps and arrivals of ``count`` messages from number ``first`` on, handed over by ``size``."""
+    rows = range(first, first + count)
+    found = [
+        T0 + (first + (k - first) // size * size + size - 1) * PERIOD + (k - first) % size * 100_000
+        for k in rows
+    ]
+    return [(stamp, stamp) for stamp in found]
+
+
+@pytest.mark.parametrize("lost", [0.1, 0.3])
+def test_where_messages_of_bursts_are_lost_the_error_of_their_times_is_told(stamps, lost):
+    rng = np.random.default_rng(5)
+    kept = [row for row in bursts(2000) if rng.random() > lost]
+    errors, told = [], []
+    for k, (true, stamp) in enumerate(kept):
+        (verdict,) = feed(stamps, [(stamp, stamp)])
+        if k > 100 and verdict.stamp_ns:
+            errors.append(verdict.stamp_ns - true)
+            told.append(verdict.error_s * 1e9)
+    rms = np.sqrt(np.mean(np.square(errors)))
+    assert rms < PERIOD
+    assert 0.5 * rms < np.sqrt(np.mean(np.square(told))) < 2.0 * rms
+
+
+def test_times_of_whole_bursts_are_known_well(stamps):
+    verdicts = feed(stamps, [(stamp, stamp) for _, stamp in bursts(200)])
+    assert 0.0 < verdicts[-1].error_s < 1e-3
+
+
 @pytest.mark.parametrize(
     ("grid", "arrives"),
     [(10_000_000, True), (7_000_000, True), (16_000_000, True), (10_000_000, False), (7_000_000, False)],

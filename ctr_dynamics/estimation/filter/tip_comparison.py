@@ -66,7 +66,8 @@ def compare_with_tip(
     if (bent > NEGLIGIBLE * noise.diagonal()).any():
         more += np.diag(bent)
         S += more
-    if adapted.noisy or expected.jitter or expected.slower:
+    scatter = expected.scatter
+    if adapted.noisy or scatter or expected.slower:
         S += (adapted.noise - 1.0 if adapted.noisy else 0.0) * noise
         slower = expected.slower.observed_tip(tip_at, time) if expected.slower else None
         if slower is not None:
@@ -74,10 +75,10 @@ def compare_with_tip(
             added = np.multiply.outer(change, change)
             more += added
             S += added
-        if expected.jitter:
+        if scatter:
             before, at = tracker.observed_tip(tip_at, time - dt) or tip, len(pi) - STATES + DELAY
             earlier = tracker.innovation(bias, before, pi, position, quaternion)[1]
-            scattered = with_jitter(nu, S, noise, expected.jitter, -H[:, at], -earlier[:, at], dt)
+            scattered = with_jitter(nu, S, noise, scatter, -H[:, at], -earlier[:, at], dt)
             nu, S, steadier = scattered.nu, scattered.S, scattered.steadier
             more += scattered.more
         whitened = np.linalg.solve(np.linalg.cholesky(S), nu)

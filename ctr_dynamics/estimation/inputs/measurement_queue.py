@@ -49,7 +49,7 @@ class QueuedMeasurement:
     """A tracker pose on its way into the filter.
 
     Attributes:
-        stamp_ns: of its header. position: (3,) m, quaternion: (4,) wxyz, in the tracker's frame.
+        stamp_ns: of its header. stamp_error_s: 1-sigma of that, s. position: (3,) m, quaternion: (4,) wxyz, in the tracker's frame.
         late_s: how long after its stamp it came, by the steps that were taken.
         fused_k: the step after which it was fused; None before.
     """
@@ -59,6 +59,7 @@ class QueuedMeasurement:
     quaternion: Floats
     late_s: float
     fused_k: int | None = None
+    stamp_error_s: float = 0.0
 
 
 class DueMeasurement(NamedTuple):
@@ -112,8 +113,9 @@ class MeasurementQueue:
         quaternion_xyzw: Sequence[float],
         frame_id: str,
         joints_ns: int | None,
+        stamp_error_s: float = 0.0,
     ) -> None:
-        """Take in a tracker pose (m, x y z w); ``joints_ns``: stamp of the newest joint state."""
+        """Take in a tracker pose (m, x y z w); ``joints_ns``: stamp of the newest joint state; ``stamp_error_s``: 1-sigma of the pose's, s."""
         options, health = self.options, self._health
         try:
             point, quaternion, norm = pose_values(stamp_ns, position, quaternion_xyzw, frame_id, self.frame)
@@ -141,7 +143,9 @@ class MeasurementQueue:
             return
         if late > options.late_steps * STEP_NS * 1e-9:
             health.late += 1
-        self.measurements.append(QueuedMeasurement(stamp_ns, point, quaternion, late))
+        self.measurements.append(
+            QueuedMeasurement(stamp_ns, point, quaternion, late, stamp_error_s=stamp_error_s)
+        )
         self.measurements.sort(key=lambda m: m.stamp_ns)
         if self._timeline.t0_ns is None and len(self.measurements) > options.before_joints:
             del self.measurements[0]

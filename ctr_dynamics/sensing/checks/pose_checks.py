@@ -171,6 +171,7 @@ class PoseChecks:
             timed.stamp_ns,
             orientation=oriented.orientation,
             retract_ns=stamped.retract_ns,
+            error_s=timed.error_s,
         )
 
     # -- poses that are none --

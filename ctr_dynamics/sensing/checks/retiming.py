@@ -6,7 +6,12 @@ sides. The bounds of many measurements together leave little freedom.
 
 from __future__ import annotations
 
-RESYNC_BURSTS = 2.5  # a spacing that lies more bursts behind has lost messages, or the sensor has paused
+import math
+import statistics
+
+FOLLOWED = 4  # bursts whose least lateness is followed
+REMEMBERED = 8  # bursts whose scatter tells the error
+LEAST_ERROR = 0.02  # of a period: what a bound that is followed slowly leaves
 LEAK = 0.002  # of a period: bounds of a grid are loosened by it at every message, as the period is not known exactly
 
 
@@ -20,25 +25,37 @@ class Retiming:
     def __init__(self, time_ns: int) -> None:
         self.time_ns = time_ns
         self.error_s = 0.0
-        self._late: list[
-            int
-        ] = []  # ns by which the stamp of the last message of each burst lies after its time
+        # ns by which the stamp of the last message of each burst lies after its time, without messages that were lost and as it was
+        self._late: list[int] = []
+        self._lateness: list[int] = []
         self._stamp_ns = time_ns
         self._low = self._high = 0.0
 
     def from_bursts(self, stamp_ns: int, period_ns: float, burst_ns: float) -> int:
         """Time of a measurement stamped on arrival. ``period_ns``: mean interval; ``burst_ns``: time from burst to burst."""
-        if (
-            stamp_ns - self._stamp_ns > 0.5 * burst_ns
-        ):  # a burst begins: the one before it ended with its freshest measurement
-            self._late = [*self._late[-3:], self._stamp_ns - self.time_ns]
-            self.time_ns += min(self._late) // 4
+        begins = stamp_ns - self._stamp_ns > 0.5 * burst_ns
+        if begins:
+            self._end_burst(period_ns)
         time_ns = self.time_ns + round(period_ns)
-        if stamp_ns - time_ns > RESYNC_BURSTS * burst_ns:
+        if begins and time_ns < stamp_ns - round(
+            burst_ns
+        ):  # what is older would have come with the burst before
             time_ns = stamp_ns - round(burst_ns - period_ns)
         self._stamp_ns, self.time_ns = stamp_ns, max(min(time_ns, stamp_ns), self.time_ns + 1)
-        self.error_s = 0.25e-9 * period_ns
         return self.time_ns
+
+    def _end_burst(self, period_ns: float) -> None:
+        """Follow what the burst that is over tells: it ended with its freshest measurement, unless that was lost."""
+        late, recent = self._stamp_ns - self.time_ns, self._late[-FOLLOWED:]
+        lost = 0
+        if recent and late > max(recent) + 0.5 * period_ns:
+            # some of its messages were lost: those behind them have been given times too early by as many periods
+            lost = int((late - min(recent)) / period_ns + 0.1)
+            self.time_ns += round(lost * period_ns)
+        self._late = [*recent[1 - FOLLOWED :], late - round(lost * period_ns)]
+        self.time_ns += min(self._late) // 4
+        self._lateness = [*self._lateness[1 - REMEMBERED :], late]
+        self.error_s = 1e-9 * math.hypot(LEAST_ERROR * period_ns, statistics.pstdev(self._lateness))
 
     def from_grid(self, stamp_ns: int, period_ns: float, grid_ns: int, latest_ns: int | None) -> int:
         """Time of a measurement whose stamp is rounded down to ``grid_ns``; ``latest_ns``: when it had arrived, on the same clock."""

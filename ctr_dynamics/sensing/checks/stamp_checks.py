@@ -64,6 +64,7 @@ class StampChecks:
         self._burst_ns, self._grid_ns = 0.0, 0
         self._resumes = False  # whether a pause was so short ago that the window is not full
         self._even = False  # whether enough stamps are known, and none follows another at once
+        self._steady_ns = 0.0  # mean time between messages when that was even last; 0 where it is not usual
         self._taken = self._ahead = self._ahead_ago = self._back = 0
         self._standing, self._standing_since_ns, self._moving = 0, 0, 0
         self._back_ns = 0
@@ -152,10 +153,21 @@ class StampChecks:
             return ACCEPT  # late, and before others: nothing to learn from
         pause = -1 if arrival_ns is None or self._arrival_ns is None else arrival_ns - self._arrival_ns
         self._arrival_ns = arrival_ns
+        hurried = not self.mode and 0 < step < self.limits.short_interval * self._steady_ns
+        if hurried and self._even:  # the rhythm is over: look at what follows by itself
+            self._steps.clear()
+            self._total, self._even = 0, False
         self._step(stamp_ns, step, pause, at)
         self.newest_ns = stamp_ns
-        if self._taken % LOOK_EVERY == 0 or (self.mode and step > 0):
+        if self._taken % LOOK_EVERY == 0 or hurried or (self.mode and step > 0):
             self._look()
+        if hurried and not self.mode:
+            text = (
+                f"stamp of the {self.noun} follows the one before after {step * 1e-6:.2g} ms, usual are {self._steady_ns * 1e-6:.3g} ms: "
+                "it tells the arrival; stamp at acquisition; left out"
+            )
+            self.findings.add(Kind.BURSTS, at, 1.0, "", text)
+            return Verdict("drop", Kind.BURSTS, text)
         return self._retimed(stamp_ns, arrival_ns, at)
 
     def pass_over(self, stamp_ns: int, arrival_ns: int | None) -> None:
@@ -280,6 +292,10 @@ class StampChecks:
         if len(self._steps) < 6 or (self.mode and self._resumes):
             return  # after a pause, stamps are what they were before it until the window is full
         self._even = len(self._steps) == WINDOW and min(s for s, _ in self._steps) > 0.25 * self._period_ns
+        if self._even:
+            self._steady_ns = self._period_ns
+        elif len(self._steps) == WINDOW:
+            self._steady_ns = 0.0
         mode: Mode = ""
         if self._standing >= STANDING and not self._handed_over_at_once():
             mode, self._grid_ns = "unusable", 0
@@ -351,13 +367,12 @@ class StampChecks:
                 "stamp at acquisition; until then their times are spaced evenly"
             )
             self.findings.add(Kind.BURSTS, at, size, "", text)
-            self.retiming = self.retiming or Retiming(stamp_ns - round(self._period_ns))
-            return Verdict(
-                "correct",
-                Kind.BURSTS,
-                text,
-                self.retiming.from_bursts(stamp_ns, self._period_ns, self._burst_ns),
-            )
+            if self.retiming is None:
+                if self._steps[-1][0] < 0.5 * self._burst_ns:  # its place in its burst is not known
+                    return Verdict("drop", Kind.BURSTS, text)
+                self.retiming = Retiming(stamp_ns - round(self._burst_ns))
+            time_ns = self.retiming.from_bursts(stamp_ns, self._period_ns, self._burst_ns)
+            return Verdict("correct", Kind.BURSTS, text, time_ns, error_s=self.retiming.error_s)
         grid_s = self._grid_ns * 1e-9
         if self.mode == "unusable":
             size_s = grid_s or (at - self._standing_since_ns) * 1e-9
@@ -380,7 +395,7 @@ class StampChecks:
         synchronous = self._arrivals and -self._grid_ns < quickest <= self.limits.same_clock_s * 1e9
         latest_ns = arrival_ns if synchronous else None
         time_ns = self.retiming.from_grid(first_ns, self._period_ns, self._grid_ns, latest_ns)
-        return Verdict("correct", Kind.ROUNDED, text, time_ns)
+        return Verdict("correct", Kind.ROUNDED, text, time_ns, error_s=self.retiming.error_s)
 
 
 def _scatter(values: list[int]) -> float:

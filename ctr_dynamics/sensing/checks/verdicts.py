@@ -78,7 +78,7 @@ class Verdict:
     Attributes:
         use: "accept" as it is; "correct": take it with what differs below; "drop".
         kind, text: what was found, with value, limit, unit and what to do; None and empty where nothing was. An accepted message may have one.
-        stamp_ns: the time to use instead of its stamp.
+        stamp_ns: the time to use instead of its stamp. error_s: 1-sigma of that, s.
         rotations: (N,) rad to use instead of its own.
         orientation: False where only the position of a pose is to be used.
         retract_ns: stamp of a message accepted earlier that has turned out wrong; as it was given out, so corrected where it was.
@@ -91,6 +91,7 @@ class Verdict:
     rotations: tuple[float, ...] | None = None
     orientation: bool = True
     retract_ns: int | None = None
+    error_s: float = 0.0
 
 
 ACCEPT = Verdict("accept")
