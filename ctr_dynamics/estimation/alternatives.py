@@ -60,8 +60,8 @@ class Alternatives:
     Attributes:
         timing, model_error, end_of_jitter: the searches.
         probability: that anything else is right than the filter counts on. reason_not_to_fuse: that of what measurements are not fused for.
-        late: whether the tracker is late by a time that is not known yet. moving: whether its frame moves. Measurements are then compared and not
-            fused.
+        late: whether the tracker is late by a time that is not known yet. doubted: whether its latency has probably changed, and has to last before
+            it is followed. moving: whether its frame moves. Measurements are then compared and not fused.
     """
 
     def __init__(self, ekf: RodEkf, inputs: InputBuffer, health: Health) -> None:
@@ -82,11 +82,14 @@ class Alternatives:
         self.timing.clear()
         self.model_error.clear()
         self.end_of_jitter.clear()
-        self.late = self.moving = False
+        self.late = self.doubted = self.moving = False
         self._compared: list[Compared] = []
         self._news = False  # whether measurements have counted since anything was concluded
         self.probability = self.reason_not_to_fuse = 0.0
         self._scatters_since = 0  # step, since when stamps probably scatter
+        self._doubted_since: int | None = (
+            None  # step, since when the latency has probably changed; None where it has not
+        )
 
     def clear_timing(self) -> None:
         """Forget what measurements told of the tracker's timing."""
@@ -103,7 +106,7 @@ class Alternatives:
     @property
     def not_fused(self) -> str:
         """Why measurements are compared and not fused; empty where they are."""
-        return UNKNOWN_DELAY if self.late else MOVING_FRAME if self.moving else ""
+        return UNKNOWN_DELAY if self.late or self.doubted else MOVING_FRAME if self.moving else ""
 
     @property
     def late_by_m(self) -> float | None:
@@ -156,12 +159,12 @@ class Alternatives:
         """
         self.count()
         if not self._health.fusing:
-            self.moving = False
+            self.moving = self.doubted = False
         if not self._news:
             return False
         self._news = False
         again = self._health.fusing and (
-            self._follow_timing()
+            self._follow_timing(k)
             or self._follow_jitter(k)
             or self._leave_moving_frame(open_loop)
             or self._follow_model_error()
@@ -175,20 +178,26 @@ class Alternatives:
         search, timing = self.model_error, self._other_timing
         moves, scatter = search.frame.probability, search.stamp_jitter(self._ekf.expected.scatter)[0]
         self.probability = max(timing, moves, scatter, search.probability(self._ekf.model_error))
-        self.reason_not_to_fuse = timing if self.late else moves
+        self.reason_not_to_fuse = timing if self.late or self.doubted else moves
 
     @property
     def _other_timing(self) -> float:
         return self.timing.other(self._ekf.expected, self._ekf.delay)
 
-    def _follow_timing(self) -> bool:
+    def _follow_timing(self, k: int) -> bool:
         """Another delay or response of the tracker, with which measurements follow the open-loop run far better.
 
-        Where they do with many delays, as before a late tracker shows the first motion, they are not fused until one is found.
+        Where they do with many delays, as before a late tracker shows the first motion, they are not fused until one is found. Nor are they while a
+        delay is likelier than not, but has not lasted yet: the filter would make a force of it.
         """
         expected, delay, was_late = self._ekf.expected, self._ekf.delay, self.late
         found = self.timing.found(expected, delay)
         self.late = found is None and self.timing.undecided(expected, delay)
+        likely = found is None and self.timing.changed(delay) > 0.5
+        self._doubted_since = (k if self._doubted_since is None else self._doubted_since) if likely else None
+        self.doubted = self._doubted_since is not None and (
+            seconds(k - self._doubted_since) <= self.timing.late.options.longest_s
+        )
         if found is None and (was_late or not self.late):
             return False
         kind, note = "latency", "poses are older than their stamps, by a time that is not known yet"

@@ -204,3 +204,19 @@ def test_a_tracker_that_comes_back_is_not_late():
     found = search(straight, 0.0, foretold=told, seen=seen, seconds=9.6)
     assert found.belief(0.0).late < 0.5
     assert found.found(0.0) is None
+
+
+@pytest.mark.parametrize("late", [0.03, 0.06])
+def test_a_latency_that_comes_and_goes_is_not_taken_for_a_force(late):
+    messages = [
+        m.shifted(late) if m.kind == "pose" and 3.5e9 < m.stamp < 5.0e9 else m
+        for m in bag_messages("clean_sweep", 7.0)
+    ]
+    run = play(messages)
+    errors, steps = truth_error(run, "clean_sweep", "p_trk", since=1.0)
+    deviation = np.sqrt(run.column("tip_covariance")[steps][:, range(3), range(3)].sum(axis=1))
+    off = np.linalg.norm(errors, axis=-1)
+    assert (off < np.maximum(3.0 * deviation, 3e-3)).all()
+    assert off.max() < 3e-3
+    assert np.sqrt((off[-300:] ** 2).mean()) < 3e-4  # normal again
+    assert run.estimator.runs.fused.ekf.delay == pytest.approx(0.0, abs=5e-3)

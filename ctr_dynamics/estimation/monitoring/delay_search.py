@@ -330,7 +330,7 @@ class DelaySearch:
         return None
 
     def explains_better(self, other: DelaySearch) -> bool:
-        """Whether delays since the start explain what both have counted better, with their prior, than those of ``other``."""
+        """Whether delays, since the start or since a change, explain what both have counted better, with their prior, than those of ``other``."""
         if not (self._evidence and other._evidence):
             return bool(self._evidence)
         since = max(search._evidence[0].stamp_ns for search in (self, other))
@@ -338,14 +338,19 @@ class DelaySearch:
         return until > since and self._explained(since, until) > other._explained(since, until)
 
     def _explained(self, since_ns: int, until_ns: int) -> float:
-        """Logarithm of the evidence of all delays since the start together, with their prior, from measurements after ``since_ns``."""
+        """Logarithm of the evidence of all delays together, with their prior, from measurements after ``since_ns``."""
         before, now = (
             next((e for e in reversed(self._evidence) if e.stamp_ns <= stamp_ns), self._evidence[0])
             for stamp_ns in (since_ns, until_ns)
         )
         decay = math.exp((before.stamp_ns - now.stamp_ns) * 1e-9 / self.options.memory_s)
         each = math.log(self.options.prior / len(self.delays))
-        return each + float(np.logaddexp.reduce(now.delays - decay * before.delays))
+        ways = now.delays - decay * before.delays
+        if self.options.changes:
+            # before a change the delay was what it had been: no evidence counts that this had before ``since_ns``
+            former = np.where(now.began_ns > before.stamp_ns, before.changed.max(), before.changed)
+            ways = np.logaddexp(ways, now.changed - decay * former)
+        return each + float(np.logaddexp.reduce(ways))
 
     def _until(self, seconds: float) -> list[Evidence]:
         """What was known ``seconds`` before the last measurement."""

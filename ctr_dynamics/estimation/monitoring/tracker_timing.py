@@ -94,6 +94,10 @@ class TrackerTiming:
         response = self.response.belief(expected.response)
         return max(self.late.belief(delay).late, self.behind.belief(delay).late, response.late, instead)
 
+    def changed(self, delay: float) -> float:
+        """Probability of another delay than ``delay`` (s), beside the response that the filter counts on."""
+        return max(self.late.belief(delay).late, self.behind.belief(delay).late)
+
     def found(self, expected: ExpectedTracker, delay: float) -> Found | None:
         """What is believed instead of the ``expected`` tracker with the estimated ``delay`` (s); None where nothing is."""
         if self.instead and not self.response.explains_better(self.instead):
