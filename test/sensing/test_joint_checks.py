@@ -274,6 +274,18 @@ def test_one_message_off_the_rhythm_and_beside_the_motion_is_left_out(checks):
     assert "left out; look for a second driver" in text
 
 
+def test_a_second_driver_does_not_take_over_while_the_first_sends_no_numbers(checks):
+    """The first moves by where the second one rests: the actuators could have come there."""
+    rows, used = joint_rows(400), []
+    rest = tuple(a + 0.1 for a in rows[299][2])
+    for k, row in enumerate(rows):
+        broken = 300 <= k < 345
+        checks.check(*(turned(row, math.nan) if broken else row))
+        if k >= 300:
+            used.append(checks.check(*delayed(row, 4_000_000, rest)).use)
+    assert used.count("drop") >= 95
+
+
 def test_a_driver_that_loses_its_rhythm_is_used_on(checks):
     """As where it begins to stamp on arrival: what lies on the line of its motion is no second driver's."""
     rng, rows = np.random.default_rng(2), joint_rows(300)

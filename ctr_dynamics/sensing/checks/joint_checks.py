@@ -72,6 +72,7 @@ class JointChecks:
         self._two: TwoTrains | None = None  # of two drivers
         # messages that were left out as strays, and the time of the last; those of them that were of a second driver and are not counted yet
         self._strays, self._of_other = (0, 0), 0
+        self._unusable_ns = 0  # stamp of the last joint state without usable values
         self._pending = 0  # joint states left out since the last accepted one
         self._held = 0  # joint states that are zero throughout, at the start
         self._held_ns = 0  # stamp of the first of them
@@ -106,6 +107,7 @@ class JointChecks:
         bad = self.motion.bad_value(raw)
         if bad is not None and (self._train is None or not bad[1] < ABSURD):
             kind, size, text = bad
+            self._unusable_ns, self._other = stamp_ns, None  # the driver is still there
             return self._drop(kind, at, size, "", text)
         last, self._last = self._last, (stamp_ns, raw)
         if last is not None:
@@ -174,11 +176,13 @@ class JointChecks:
 
     def _stray(self, train: Train, state: _JointState) -> Jump | None:
         """What a second driver sends first: between two messages of a driver that keeps a rhythm, and beside its motion."""
-        since_ns, rhythm_ns = state.stamp_ns - train.stamp_ns, 1e9 * self._watch.rhythm_s
+        before_ns, rhythm_ns = max(train.stamp_ns, self._unusable_ns), 1e9 * self._watch.rhythm_s
+        since_ns = state.stamp_ns - before_ns
         if not self._watch.off_beat or not 0 < since_ns < TOO_SOON * rhythm_ns:
             return None
-        # a message that is stamped late or early lies on the way there, too
-        ahead = train.at(train.stamp_ns + round(2.0 * rhythm_ns))
+        # a message that is stamped late or early lies on the way there, too; but none behind one that was sent on time
+        sent = self._unusable_ns > train.stamp_ns
+        ahead = train.values if sent else train.at(train.stamp_ns + round(2.0 * rhythm_ns))
         return self.motion.beside(train.values, ahead, state.values, since_ns * 1e-9)
 
     def _accept(self, train: Train, state: _JointState, stamped: Verdict) -> Verdict:
