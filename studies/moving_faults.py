@@ -112,19 +112,41 @@ def knocked(p: cdr.PoseIn) -> cdr.PoseIn:
     return p._replace(position=(p.position[0] + 0.02, *p.position[1:]), quaternion_xyzw=(x, y, z, w))
 
 
-def late(seconds: float, begin_s: float = 0.0) -> Edit:
-    """Poses stamped on arrival, which is late, from ``begin_s`` on."""
+def late(seconds: float, begin_s: float = 0.0, end_s: float = math.inf) -> Edit:
+    """Poses stamped on arrival, which is late, from ``begin_s`` to ``end_s``."""
     ns = round(seconds * 1e9)
 
     def change(messages: Messages) -> Messages:
-        since = messages[0].log_ns + begin_s * 1e9
+        first = messages[0].log_ns
         moved = [
             m._replace(log_ns=m.log_ns + ns, data=shifted(m.data, ns))
-            if m.topic == T and m.log_ns >= since
+            if m.topic == T and begin_s <= (m.log_ns - first) * 1e-9 < end_s
             else m
             for m in messages
         ]
         return sorted(moved, key=lambda m: m.log_ns)
+
+    return change
+
+
+def in_bursts(size: int, begin_s: float = 0.0, end_s: float = math.inf, lost: float = 0.0) -> Edit:
+    """Poses that a driver hands over and stamps ``size`` at a time, of which it loses a part ``lost``."""
+
+    def change(messages: Messages) -> Messages:
+        rng, first = np.random.default_rng(5), messages[0].log_ns
+        here = [
+            i for i, m in enumerate(messages) if m.topic == T and begin_s <= (m.log_ns - first) * 1e-9 < end_s
+        ]
+        moved: list[RawMessage | None] = list(messages)
+        for burst in zip(*[iter(here)] * size, strict=False):
+            last = messages[burst[-1]]
+            stamp = cdr.decode_stamp(last.data)
+            for place, i in enumerate(burst):
+                after = 100_000 * place
+                data = shifted(messages[i].data, stamp + after - cdr.decode_stamp(messages[i].data))
+                handed_over = messages[i]._replace(log_ns=last.log_ns + after, data=data)
+                moved[i] = None if rng.random() < lost else handed_over
+        return sorted((m for m in moved if m is not None), key=lambda m: m.log_ns)
 
     return change
 
@@ -229,6 +251,10 @@ FAULTS: dict[str, tuple[Edit, float]] = {  # the change, and when it ends (s); i
     "a frame that turns by 0.03 rad/s": (moving_frame(0.0, 0.03), math.inf),
     "poses of 1e160 for 2 s": (in_span(T, pose(huge)), END_S),
     "poses 80 ms late, not told": (late(0.08), math.inf),
+    "poses 40 ms late for 2 s": (late(0.04, BEGIN_S, END_S), END_S),
+    "poses in bursts of four": (in_bursts(4), math.inf),
+    "poses in bursts of four for 2 s": (in_bursts(4, BEGIN_S, END_S), END_S),
+    "poses in bursts of four, one in seven lost": (in_bursts(4, lost=1.0 / 7.0), math.inf),
     "stamps that scatter by 5 ms": (scattered(0.005), math.inf),
     "a low-pass filter of 60 ms on the poses": (smoothed(0.06), math.inf),
     "latency that jumps by 60 ms": (late(0.06, BEGIN_S), math.inf),

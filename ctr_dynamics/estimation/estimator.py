@@ -411,7 +411,7 @@ class Estimator:
         self._stability_due |= k % options.stability_every == 0
         if too_old:
             return self._invalid(k, too_old, innovations)
-        fused.inflate_covariance(tip, self.runs.open_loop, self._largest_deviation)
+        shown = fused.with_alternatives(tip, self.runs.open_loop, self._largest_deviation)
         self._unexpected.inflate(tip.covariance, stamp)
         since = fused.measured_ns if fused.measured_ns is not None else self.t0_ns
         health.tracker_age_s = max(0.0, (stamp - (since or stamp)) * 1e-9)
@@ -426,7 +426,7 @@ class Estimator:
         problem = health.problem = self._problem(stamp, tip.position_deviation, unsettled)
         return StepOutput(
             stamp, k, not problem, problem, tip.position, tip.quaternion, tip.covariance[:6, :6], tip.twist, tip.covariance[6:, 6:],
-            predicted[:3], predicted[3:], self._backbone.rows(fused.state), modes, fused.ekf.force,
+            predicted[:3], predicted[3:], self._backbone.rows(shown), modes, fused.ekf.force,
             tip.force_sigma, innovations, SolverStats(result.iterations, result.sweeps, result.reason),
             fused.state.inputs.beta.tolist(), self._jacobian.measure(fused.state),
         )  # fmt: skip

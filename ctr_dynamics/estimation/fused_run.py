@@ -185,6 +185,15 @@ class FusedRun:
             self.reinitialise(open_loop, k)
         return again
 
+    def with_alternatives(self, tip: TipEstimate, open_loop: OpenLoopRun, farthest: float) -> State:
+        """Have ``tip`` hold what else may be right; returns the state that it belongs to. ``farthest``: see :meth:`inflate_covariance`."""
+        self.inflate_covariance(tip, open_loop, farthest)
+        if self.alternatives.doubted:
+            self.withdraw(tip, open_loop)
+        state = open_loop.state if self.alternatives.doubted else self.state
+        assert state is not None
+        return state
+
     def inflate_covariance(self, tip: TipEstimate, open_loop: OpenLoopRun, farthest: float) -> None:
         """Have the covariance of ``tip`` hold what else may be right: the open-loop run where the tracker may be late, its frame may move, or the
         model may err more than the filter counts on, the tracker where it is not fused, has been shifted since the start, or lies apart without
@@ -210,6 +219,17 @@ class FusedRun:
         turn = rotations.to_vector(rotations.multiply(tip.quaternion, rotations.conjugate(mean[3:7])))
         apart = np.concatenate([tip.position - mean[:3], turn, tip.twist - mean[7:13]])
         tip.covariance[:] += allowance(other) * np.multiply.outer(apart, apart)
+
+    def withdraw(self, tip: TipEstimate, open_loop: OpenLoopRun) -> None:
+        """Have ``tip`` be that of the open-loop run, as where the latency has probably changed: what was fused since has led the filter astray.
+
+        Its covariance holds the filter's tip, too.
+        """
+        mean = open_loop.tips.last.mean
+        turn = rotations.to_vector(rotations.multiply(tip.quaternion, rotations.conjugate(mean[3:7])))
+        apart = np.concatenate([tip.position - mean[:3], turn, tip.twist - mean[7:13]])
+        tip.covariance[:] += np.multiply.outer(apart, apart)
+        tip.position[:], tip.quaternion[:], tip.twist[:] = mean[:3], mean[3:7], mean[7:13]
 
     def checkpoint(self) -> FusedState:
         """What :meth:`restore` returns to."""

@@ -78,3 +78,19 @@ def test_nothing_is_concluded_without_a_new_measurement_nor_where_none_is_fused(
     alternatives.moving = True
     assert not alternatives.conclude(open_loop, run.estimator.k)
     assert not alternatives.not_fused
+
+
+def test_while_the_latency_is_doubted_the_open_loop_run_is_published_with_room_for_the_filter(late):
+    """Poses of a tracker that is late by a time that is not known are not fused meanwhile."""
+    on_time = bag_messages("clean_sweep", 3.0)
+    made = play([m for m in on_time if m.stamp < 2.0e9]).estimator
+    made.runs.fused.alternatives.doubted = True
+    for message in on_time:
+        if 2.0e9 <= message.stamp < 2.02e9:
+            message.give(made)
+    (*_, out) = made.advance()
+    assert out.tip_position.tolist() == out.predicted_position.tolist()
+    apart = ((made.runs.fused.ekf.tip_estimate().position - out.tip_position) ** 2).sum() ** 0.5
+    assert apart > 1e-4  # m
+    assert out.tip_covariance[:3, :3].trace() ** 0.5 > 0.9 * apart
+    assert out.backbone[-1, 1:4] == pytest.approx(out.tip_position, abs=1e-3)
