@@ -87,9 +87,8 @@ class Alternatives:
         self._news = False  # whether measurements have counted since anything was concluded
         self.probability = self.reason_not_to_fuse = 0.0
         self._scatters_since = 0  # step, since when stamps probably scatter
-        self._doubted_since: int | None = (
-            None  # step, since when the latency has probably changed; None where it has not
-        )
+        # step, since when the latency has probably changed; None where it has not
+        self._doubted_since: int | None = None
 
     def clear_timing(self) -> None:
         """Forget what measurements told of the tracker's timing."""
@@ -159,7 +158,8 @@ class Alternatives:
         """
         self.count()
         if not self._health.fusing:
-            self.moving = self.doubted = False
+            self.moving, self._doubted_since = False, None
+        self._doubt(k)
         if not self._news:
             return False
         self._news = False
@@ -195,9 +195,7 @@ class Alternatives:
         self.late = found is None and self.timing.undecided(expected, delay)
         likely = found is None and self.timing.changed(delay) > 0.5
         self._doubted_since = (k if self._doubted_since is None else self._doubted_since) if likely else None
-        self.doubted = self._doubted_since is not None and (
-            seconds(k - self._doubted_since) <= self.timing.late.options.longest_s
-        )
+        self._doubt(k)
         if found is None and (was_late or not self.late):
             return False
         kind, note = "latency", "poses are older than their stamps, by a time that is not known yet"
@@ -219,6 +217,11 @@ class Alternatives:
         advice = "; check the tracker's clock, or set tracker.delay_s" if kind == "latency" else ""
         self._health.note("tracker", kind, note + advice)
         return True
+
+    def _doubt(self, k: int) -> None:
+        """Doubt a latency that has probably changed for as long as the longest delay needs to show, also where no measurement comes."""
+        since, longest_s = self._doubted_since, self.timing.late.options.longest_s
+        self.doubted = since is not None and seconds(k - since) <= longest_s
 
     def _follow_jitter(self, k: int) -> bool:
         """Stamps that scatter, with which measurements follow the open-loop run far better than the filter.

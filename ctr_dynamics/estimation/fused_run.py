@@ -215,9 +215,7 @@ class FusedRun:
             fusing = 1.0 - self.alternatives.reason_not_to_fuse
             tip.covariance[:3, :3] += allowance(fusing) * np.multiply.outer(self._apart, self._apart)
             return
-        mean = open_loop.tips.last.mean
-        turn = rotations.to_vector(rotations.multiply(tip.quaternion, rotations.conjugate(mean[3:7])))
-        apart = np.concatenate([tip.position - mean[:3], turn, tip.twist - mean[7:13]])
+        apart = _apart(tip, open_loop.tips.last.mean)
         tip.covariance[:] += allowance(other) * np.multiply.outer(apart, apart)
 
     def withdraw(self, tip: TipEstimate, open_loop: OpenLoopRun) -> None:
@@ -226,8 +224,7 @@ class FusedRun:
         Its covariance holds the filter's tip, too.
         """
         mean = open_loop.tips.last.mean
-        turn = rotations.to_vector(rotations.multiply(tip.quaternion, rotations.conjugate(mean[3:7])))
-        apart = np.concatenate([tip.position - mean[:3], turn, tip.twist - mean[7:13]])
+        apart = _apart(tip, mean)
         tip.covariance[:] += np.multiply.outer(apart, apart)
         tip.position[:], tip.quaternion[:], tip.twist[:] = mean[:3], mean[3:7], mean[7:13]
 
@@ -240,3 +237,9 @@ class FusedRun:
         """Return to a checkpoint."""
         self.state = stored.state.copy_into(self.state)
         self.ekf.restore(stored.filter)
+
+
+def _apart(tip: TipEstimate, mean: Floats) -> Floats:
+    """(12,) of pose and twist, by which ``tip`` differs from the ``mean`` (13,) of a tip: position, rotation vector, velocity and rate."""
+    turn = rotations.to_vector(rotations.multiply(tip.quaternion, rotations.conjugate(mean[3:7])))
+    return np.concatenate([tip.position - mean[:3], turn, tip.twist - mean[7:13]])

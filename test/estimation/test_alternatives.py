@@ -2,7 +2,7 @@
 
 import pytest
 
-from .estimation_cases import bag_messages, play
+from .estimation_cases import START_NS, bag_messages, play
 
 
 @pytest.fixture(scope="module")
@@ -84,8 +84,10 @@ def test_while_the_latency_is_doubted_the_open_loop_run_is_published_with_room_f
     """Poses of a tracker that is late by a time that is not known are not fused meanwhile."""
     on_time = bag_messages("clean_sweep", 3.0)
     made = play([m for m in on_time if m.stamp < 2.0e9]).estimator
-    made.runs.fused.alternatives.doubted = True
-    for message in on_time:
+    alternatives = made.runs.fused.alternatives
+    alternatives._doubted_since = made.k
+    joints = [m for m in on_time if m.kind == "joints"]  # the tracker is silent from here on
+    for message in joints:
         if 2.0e9 <= message.stamp < 2.02e9:
             message.give(made)
     (*_, out) = made.advance()
@@ -94,3 +96,11 @@ def test_while_the_latency_is_doubted_the_open_loop_run_is_published_with_room_f
     assert apart > 1e-4  # m
     assert out.tip_covariance[:3, :3].trace() ** 0.5 > 0.9 * apart
     assert out.backbone[-1, 1:4] == pytest.approx(out.tip_position, abs=1e-3)
+    for message in joints:
+        if 2.02e9 <= message.stamp < 2.5e9:
+            message.give(made)
+    outputs = made.advance()
+    until = 2.0 + alternatives.timing.late.options.longest_s
+    for out in outputs[:: len(outputs) // 8]:
+        same = out.tip_position.tolist() == out.predicted_position.tolist()
+        assert same == ((out.stamp_ns - START_NS) * 1e-9 < until)
