@@ -82,6 +82,25 @@ class InputGate:
 
     def pose(self, message: PoseIn, arrival_ns: int) -> PoseIn | None:
         """The pose to use, with its time as the checks want it; None where it is left out. ``arrival_ns``: see :meth:`joint_state`."""
+        verdict = self._pose_verdict(message, arrival_ns)
+        if verdict is None or verdict.stamp_ns is None:
+            return None if verdict is None else message
+        return message._replace(stamp_ns=verdict.stamp_ns)
+
+    def give_pose(self, message: PoseIn, arrival_ns: int) -> None:
+        """Give the estimator the pose to use, if there is one. ``arrival_ns``: see :meth:`joint_state`."""
+        verdict = self._pose_verdict(message, arrival_ns)
+        if verdict is None:
+            return
+        stamp_ns = message.stamp_ns if verdict.stamp_ns is None else verdict.stamp_ns
+        # an error that is zero need not be known by other estimators of the same interface
+        error = {"stamp_error_s": verdict.error_s} if verdict.error_s else {}
+        self._estimator.add_tracker_pose(
+            stamp_ns, message.position, message.quaternion_xyzw, message.frame_id, **error
+        )
+
+    def _pose_verdict(self, message: PoseIn, arrival_ns: int) -> Verdict | None:
+        """The verdict on a pose that is used; None for one that is left out."""
         self._follow_resets()
         expected = self._estimator.runs.expected_orientation()
         verdict = self.checks.pose(
@@ -95,19 +114,7 @@ class InputGate:
         if self._left_out(self.checks.poses.findings, verdict) or not verdict.orientation:
             self._health.dropped += 1
             return None
-        if verdict.stamp_ns is None:
-            return message
-        return message._replace(stamp_ns=verdict.stamp_ns, stamp_error_s=verdict.error_s)
-
-    def give_pose(self, message: PoseIn, arrival_ns: int) -> None:
-        """Give the estimator the pose to use, if there is one. ``arrival_ns``: see :meth:`joint_state`."""
-        pose = self.pose(message, arrival_ns)
-        if pose is not None:
-            # an error that is zero need not be known by other estimators of the same interface
-            error = {"stamp_error_s": pose.stamp_error_s} if pose.stamp_error_s else {}
-            self._estimator.add_tracker_pose(
-                pose.stamp_ns, pose.position, pose.quaternion_xyzw, pose.frame_id, **error
-            )
+        return verdict
 
     def load(self, message: WrenchIn, arrival_ns: int) -> WrenchIn | None:
         """The load to use; None where it is left out. ``arrival_ns``: see :meth:`joint_state`."""

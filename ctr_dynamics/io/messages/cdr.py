@@ -119,16 +119,12 @@ class JointStateIn(NamedTuple):
 
 
 class PoseIn(NamedTuple):
-    """A geometry_msgs/PoseStamped: position in m, quaternion in ROS order x, y, z, w.
-
-    ``stamp_error_s``: 1-sigma of the stamp where it was corrected, s; 0 as it comes.
-    """
+    """A geometry_msgs/PoseStamped: position in m, quaternion in ROS order x, y, z, w."""
 
     stamp_ns: int
     frame_id: str
     position: tuple[float, float, float]
     quaternion_xyzw: tuple[float, float, float, float]
-    stamp_error_s: float = 0.0
 
 
 class WrenchIn(NamedTuple):
