@@ -14,6 +14,7 @@ Each outcome is one line of the output; a run that is stopped goes on where it w
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import tempfile
 import time
@@ -25,7 +26,7 @@ import numpy as np
 from ctr_dynamics.benchmarks.fleet import record, scenario_for
 from ctr_dynamics.benchmarks.fleet_robots import Draw, drawn, fleet_robot, seed_of
 from ctr_dynamics.diagnosis.diagnosis_result import Diagnosis
-from ctr_dynamics.diagnosis.next_experiment import Contrast, next_experiment
+from ctr_dynamics.diagnosis.next_experiment import Contrast, contrast_of, next_experiment
 from ctr_dynamics.diagnosis.pipeline import diagnose_recordings
 from ctr_dynamics.diagnosis.recording import read_recording
 from ctr_dynamics.diagnosis.run_context import RunContext
@@ -58,22 +59,6 @@ def first_scenario(robot: Robot, seed: int) -> Scenario:
     ]
     tubes = [TubeMotion(rotation=[turn]) for turn in turns]
     return Scenario(duration_s=FIRST_S, seed=seed, tubes=tubes, solver=Solver(nodes=30))
-
-
-def contrast_of(diagnosis: Diagnosis) -> Contrast | None:
-    """The likeliest cause against its rivals, as the next experiment compares them."""
-    d = diagnosis
-    cause = next((c for c in d.causes if c.candidate is not None and c.rivals), None)
-    if (
-        cause is None
-        or cause.candidate is None
-        or d.problem is None
-        or d.extended is None
-        or d.sensitivities is None
-    ):
-        return None
-    rivals = [c for c in d.sensitivities.by_candidate if c.effect in cause.rivals[: d.options.design.rivals]]
-    return Contrast(d.problem, d.extended, d.sensitivities, cause.candidate, rivals) if rivals else None
 
 
 def best_shipped(contrast: Contrast, robot: Robot) -> tuple[str, float]:
@@ -164,25 +149,22 @@ def main() -> None:
     if options.table:
         print(table(rows))
         return
-    done, robots, number = {(r["robot"], r["number"]) for r in rows}, options.robots.split(","), options.first
-    while sum("after" in r for r in rows) < options.ties:
+    done, robots = {(r["robot"], r["number"]) for r in rows}, options.robots.split(",")
+    for number in itertools.count(options.first):
+        if sum("after" in r for r in rows) >= options.ties:
+            break
         name = robots[number % len(robots)]
-        if (name, number) not in done:
+        if (name, number) in done:
+            continue
+        try:
             row = run_case(name, number)
-            rows.append(row)
-            with path.open("a") as stream:
-                stream.write(json.dumps(row) + "\n")
-            print(
-                name,
-                number,
-                row["hidden"],
-                row["before"],
-                row.get("separation"),
-                row.get("shipped"),
-                row.get("after"),
-                flush=True,
-            )
-        number += 1
+        except RuntimeError as error:  # a case that cannot be made is said, not lost
+            print(f"{name} {number}: {error}", flush=True)
+            continue
+        rows.append(row)
+        with path.open("a") as stream:
+            stream.write(json.dumps(row) + "\n")
+        print(row, flush=True)
 
 
 if __name__ == "__main__":

@@ -115,18 +115,7 @@ def knocked(p: cdr.PoseIn) -> cdr.PoseIn:
 def late(seconds: float, begin_s: float = 0.0, end_s: float = math.inf) -> Edit:
     """Poses stamped on arrival, which is late, from ``begin_s`` to ``end_s``."""
     ns = round(seconds * 1e9)
-
-    def change(messages: Messages) -> Messages:
-        first = messages[0].log_ns
-        moved = [
-            m._replace(log_ns=m.log_ns + ns, data=shifted(m.data, ns))
-            if m.topic == T and begin_s <= (m.log_ns - first) * 1e-9 < end_s
-            else m
-            for m in messages
-        ]
-        return sorted(moved, key=lambda m: m.log_ns)
-
-    return change
+    return during(T, lambda m: [m._replace(log_ns=m.log_ns + ns, data=shifted(m.data, ns))], begin_s, end_s)
 
 
 def in_bursts(size: int, begin_s: float = 0.0, end_s: float = math.inf, lost: float = 0.0) -> Edit:

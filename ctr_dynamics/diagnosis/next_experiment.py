@@ -57,23 +57,29 @@ def next_experiment(diagnosis: Diagnosis, context: RunContext | None = None) -> 
         scenario = scenario_of(d.robot, motion_blocks(d.robot, options)[:2], options)
         text = "A weight that is cut, and a motion of all tubes: bending and torsion, which these bags do not show"
         return NextExperiment(text, _described(scenario, text), None, None)
-    if d.problem is None or d.extended is None or d.sensitivities is None:
+    contrast = contrast_of(d)
+    if contrast is None:
         return None
-    cause = next((c for c in d.causes if c.candidate is not None and c.rivals), None)
-    if cause is None or cause.candidate is None or cause.separation is None:
-        return None
-    rivals = [c for c in d.sensitivities.by_candidate if c.effect in cause.rivals[: options.rivals]]
-    if not rivals:
-        return None
-    contrast = Contrast(d.problem, d.extended, d.sensitivities, cause.candidate, rivals)
     before = contrast.smallest(contrast.nothing)
     designed = _designed(contrast, options, context or RunContext())
     if designed is None:
         return None
     scenario, after = designed
-    names = ", ".join(dict.fromkeys(c.effect for c in rivals))
-    text = f"{_kinds(scenario)}, {scenario.duration_s:.0f} s; tells {cause.effect} from {names}"
+    text = f"{_kinds(scenario)}, {scenario.duration_s:.0f} s; tells {contrast.effect} from {', '.join(contrast.rivals)}"
     return NextExperiment(text, _described(scenario, text), before, after)
+
+
+def contrast_of(diagnosis: Diagnosis) -> Contrast | None:
+    """The first cause that has rivals, against the likeliest of these; None where none has."""
+    d = diagnosis
+    if d.problem is None or d.extended is None or d.sensitivities is None:
+        return None
+    cause = next((c for c in d.causes if c.candidate is not None and c.rivals), None)
+    if cause is None or cause.candidate is None or cause.separation is None:
+        return None
+    likeliest = cause.rivals[: d.options.design.rivals]
+    rivals = [c for c in d.sensitivities.by_candidate if c.effect in likeliest]
+    return Contrast(d.problem, d.extended, d.sensitivities, cause.candidate, rivals) if rivals else None
 
 
 def _kinds(scenario: Scenario) -> str:
@@ -120,6 +126,9 @@ class Contrast:
 
     Args:
         problem, fit, sensitivities: of the bags at hand. own: the cause, which ``fit`` holds. rivals: what could do the same.
+
+    Attributes:
+        effect, rivals: IDs of the cause and of its rivals.
     """
 
     def __init__(
@@ -131,6 +140,7 @@ class Contrast:
         rivals: Sequence[Candidate],
     ) -> None:
         self.problem, self._fit = problem, fit
+        self.effect, self.rivals = own.effect, tuple(dict.fromkeys(rival.effect for rival in rivals))
         active = {q.key for q in fit.active}
         others: dict[tuple[str, str], EffectQuantity] = {
             q.key: q for rival in rivals for q in rival.quantities if q.key not in active

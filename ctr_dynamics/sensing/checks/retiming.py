@@ -8,11 +8,17 @@ from __future__ import annotations
 
 import math
 import statistics
+from collections import deque
 
 FOLLOWED = 4  # bursts whose least lateness is followed
 REMEMBERED = 8  # bursts whose scatter tells the error
 LEAST_ERROR = 0.02  # of a period: what a bound that is followed slowly leaves
 LEAK = 0.002  # of a period: bounds of a grid are loosened by it at every message, as the period is not known exactly
+
+
+def begins_burst(step_ns: int, burst_ns: float) -> bool:
+    """Whether a message that follows the one before after ``step_ns`` begins a burst, where these come every ``burst_ns``."""
+    return step_ns > 0.5 * burst_ns
 
 
 class Retiming:
@@ -25,36 +31,33 @@ class Retiming:
     def __init__(self, time_ns: int) -> None:
         self.time_ns = time_ns
         self.error_s = 0.0
-        # ns by which the stamp of the last message of each burst lies after its time, without messages that were lost and as it was
-        self._late: list[int] = []
-        self._lateness: list[int] = []
+        # ns by which the stamp of the last message of each burst lies after its time: as it was, and but for messages that were lost
+        self._lateness = deque[int](maxlen=REMEMBERED)
+        self._late = deque[int](maxlen=FOLLOWED)
         self._stamp_ns = time_ns
         self._low = self._high = 0.0
 
     def from_bursts(self, stamp_ns: int, period_ns: float, burst_ns: float) -> int:
         """Time of a measurement stamped on arrival. ``period_ns``: mean interval; ``burst_ns``: time from burst to burst."""
-        begins = stamp_ns - self._stamp_ns > 0.5 * burst_ns
+        begins = begins_burst(stamp_ns - self._stamp_ns, burst_ns)
         if begins:
             self._end_burst(period_ns)
         time_ns = self.time_ns + round(period_ns)
-        if begins and time_ns < stamp_ns - round(
-            burst_ns
-        ):  # what is older would have come with the burst before
+        if begins and time_ns < stamp_ns - round(burst_ns):
+            # what is that old would have come with the burst before
             time_ns = stamp_ns - round(burst_ns - period_ns)
         self._stamp_ns, self.time_ns = stamp_ns, max(min(time_ns, stamp_ns), self.time_ns + 1)
         return self.time_ns
 
     def _end_burst(self, period_ns: float) -> None:
         """Follow what the burst that is over tells: it ended with its freshest measurement, unless that was lost."""
-        late, recent = self._stamp_ns - self.time_ns, self._late[-FOLLOWED:]
-        lost = 0
-        if recent and late > max(recent) + 0.5 * period_ns:
+        late, lost_ns = self._stamp_ns - self.time_ns, 0
+        if self._late and late > max(self._late) + 0.5 * period_ns:
             # some of its messages were lost: those behind them have been given times too early by as many periods
-            lost = int((late - min(recent)) / period_ns + 0.1)
-            self.time_ns += round(lost * period_ns)
-        self._late = [*recent[1 - FOLLOWED :], late - round(lost * period_ns)]
-        self.time_ns += min(self._late) // 4
-        self._lateness = [*self._lateness[1 - REMEMBERED :], late]
+            lost_ns = round(int((late - min(self._late)) / period_ns + 0.1) * period_ns)
+        self._late.append(late - lost_ns)
+        self._lateness.append(late)
+        self.time_ns += lost_ns + min(self._late) // 4
         self.error_s = 1e-9 * math.hypot(LEAST_ERROR * period_ns, statistics.pstdev(self._lateness))
 
     def from_grid(self, stamp_ns: int, period_ns: float, grid_ns: int, latest_ns: int | None) -> int:

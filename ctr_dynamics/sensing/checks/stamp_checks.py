@@ -11,7 +11,7 @@ from collections import deque
 from typing import Literal
 
 from ctr_dynamics.sensing.checks.check_limits import CheckLimits
-from ctr_dynamics.sensing.checks.retiming import Retiming
+from ctr_dynamics.sensing.checks.retiming import Retiming, begins_burst
 from ctr_dynamics.sensing.checks.verdicts import ACCEPT, Findings, Kind, Verdict
 
 WINDOW = 32  # intervals between stamps that are looked at
@@ -368,7 +368,9 @@ class StampChecks:
             )
             self.findings.add(Kind.BURSTS, at, size, "", text)
             if self.retiming is None:
-                if self._steps[-1][0] < 0.5 * self._burst_ns:  # its place in its burst is not known
+                if not begins_burst(
+                    self._steps[-1][0], self._burst_ns
+                ):  # its place in its burst is not known
                     return Verdict("drop", Kind.BURSTS, text)
                 self.retiming = Retiming(stamp_ns - round(self._burst_ns))
             time_ns = self.retiming.from_bursts(stamp_ns, self._period_ns, self._burst_ns)
