@@ -234,8 +234,15 @@ class SearchOptions:
     batch: int = option(
         2, COUNT, "first fits, which others must be able to beat; fixed, whatever the workers"
     )
-    first_part_causes: int = option(
-        4, COUNT, "that lead in the first part that nuisances do not explain, and are fitted to the whole"
+    beam: int = option(
+        4,
+        COUNT,
+        "sets of causes that explain most of a first part, to which more causes are added where it ends",
+    )
+    half_left: float = option(
+        0.55,
+        "of the misfit",
+        "where a part ends: a further cause that leaves more is no half of two that explain it",
     )
     give_up: float = option(8.0, "deviations", "of the cost above the best one's at which a fit is given up")
     enough: float = option(2.0, "times the noise", "what leaves no more ends the trial of other sizes")

@@ -13,9 +13,9 @@ from ctr_dynamics.diagnosis.inference.candidates import Candidate
 from ctr_dynamics.diagnosis.inference.contact_plane import time_of_divergence
 from ctr_dynamics.diagnosis.inference.discretisation_error import change_solution, correct_discretisation
 from ctr_dynamics.diagnosis.inference.evidence import WeighedHypotheses, probabilities, weigh
-from ctr_dynamics.diagnosis.inference.first_unexplained import search_first_unexplained
 from ctr_dynamics.diagnosis.inference.fit_problem import Problem
 from ctr_dynamics.diagnosis.inference.fit_quality import excess, explains, is_acceptable, is_far_from_noise
+from ctr_dynamics.diagnosis.inference.growing_search import search_growing_parts
 from ctr_dynamics.diagnosis.inference.hypotheses import (
     Hypothesis,
     check_time_error,
@@ -112,15 +112,14 @@ def search_once(
     screened = screen(problem, here, recalibrated, (), pool)
     out_of_phase = recalibrated.chi2 > o.far_from_noise * problem.size  # and derivatives mislead
     if out_of_phase:
-        state.add(search_first_unexplained(state))
+        search_growing_parts(state)
     if not (out_of_phase and is_acceptable(problem, state.best.fit)):
         fit_single_causes(state, screened, here)
     if begin_again_without_causes(state):
         return search_once(problem, state.pool, state.recalibrated, context, plane_sought=plane_sought)
     large_misfit = excess(problem, recalibrated) > o.large_misfit
     if large_misfit and excess(problem, state.best.fit) > o.little_left and not context.out_of_time:
-        if not out_of_phase:
-            state.add(search_first_unexplained(state))
+        search_growing_parts(state)
         if excess(problem, state.best.fit) > o.little_left:
             screened, here = try_large_sizes(state, screened, here)
     imitated = off_nominal(problem, recalibrated.point) and off_nominal(problem, state.best.fit.point)
@@ -137,6 +136,14 @@ def search_once(
     refit_contenders(state)
     try_other_sizes(state)
     at_best = add_alternatives(state, screened)
+    best = state.best
+    unexplained = whiteness(problem, best.fit).p < o.suspicious_p and not best.has_impacts
+    if unexplained and not context.out_of_time:
+        search_growing_parts(state)
+    if state.best is not best:
+        drop_causes(state)
+        refit_contenders(state)
+        at_best = add_alternatives(state, screened)
     return WeighedHypotheses(
         state.found,
         probabilities(state.found, problem),

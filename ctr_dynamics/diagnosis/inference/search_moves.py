@@ -46,6 +46,7 @@ class SearchState:
         pool: candidates. recalibrated: the fit without causes, from which the search begins.
         found: hypotheses, likeliest first; the one without causes is among them.
         plane_sought: whether a contact plane has been looked for. Only the data and the nominal model tell of it, whatever the search begins from.
+        grown: whether growing parts of the recordings have been searched.
     """
 
     problem: Problem
@@ -54,6 +55,7 @@ class SearchState:
     context: RunContext
     found: list[Hypothesis]
     plane_sought: bool = False
+    grown: bool = False
 
     @property
     def best(self) -> Hypothesis:
