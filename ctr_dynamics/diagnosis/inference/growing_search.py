@@ -62,14 +62,13 @@ def search_growing_parts(state: SearchState) -> None:
     state.context.report("the first part that tolerances do not explain")
     leading = _first_unexplained(state.problem)
     single: list[Partial] = []
-    beam = state.problem.options.search.beam
     tried: set[frozenset[Key]] = set()
     for number in range(1, MOST_CAUSES + 1):
         more = [new for one in leading for new in _with_one_more(state, one, tried)]
         more.sort(key=lambda one: -one.merit)
         leading = _grown(state, more)
         if number == 1:
-            single = leading or more[:beam]
+            single = leading or more[: state.problem.options.search.beam]
         whole = [Hypothesis(one.members, one.whole) for one in leading if one.whole is not None]
         if whole or state.context.out_of_time:
             state.add(whole)
@@ -119,8 +118,11 @@ def _with_one_more(state: SearchState, begun: Partial, tried: set[frozenset[Key]
         if keys not in tried:
             tried.add(keys)
             jobs.append(delayed(fit_addition)(problem, Addition(begun.members, item, begun.fit, here)))
-    found, beyond = state.run_fits(jobs), begun.fit.chi2 - problem.size
-    return [Partial(e.members, begun.part, e.fit, (e.fit.chi2 - problem.size) / beyond) for e in found]
+    misfit = max(begun.fit.chi2 - problem.size, 1.0)
+    return [
+        Partial(e.members, begun.part, e.fit, (e.fit.chi2 - problem.size) / misfit)
+        for e in state.run_fits(jobs)
+    ]
 
 
 def _followed(problem: Problem, begun: Partial) -> Partial:
