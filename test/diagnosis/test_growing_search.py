@@ -1,4 +1,4 @@
-"""The first part of a recording that nuisances do not explain tells the cause, where the whole is out of phase."""
+"""Causes are found where the part of a recording that is explained ends, while the whole is out of phase."""
 
 from dataclasses import replace
 

@@ -79,11 +79,10 @@ def fit_growing(
     causes: Sequence[EffectQuantity] = (),
     start: Mapping[Key, float] | None = None,
     *,
-    first_part: float | None = None,
     limit: float = math.inf,
 ) -> Fit | None:
     """The fit to the whole recordings to which growing parts lead; None where no part is explained. Arguments: see :func:`explain_growing_parts`."""
-    done = explain_growing_parts(problem, causes, start, first_part=first_part, limit=limit)
+    done = explain_growing_parts(problem, causes, start, limit=limit)
     if not causes:
         problem.explained = done.part, done.point
     if done.fit is not None or not done.part:

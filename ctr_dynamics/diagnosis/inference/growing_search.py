@@ -12,11 +12,17 @@ from dataclasses import dataclass
 from joblib import delayed
 
 from ctr_dynamics.diagnosis.forward_model import Key
-from ctr_dynamics.diagnosis.inference.candidates import Candidate, causes_of
+from ctr_dynamics.diagnosis.inference.candidates import Candidate, causes_of, keys_of
 from ctr_dynamics.diagnosis.inference.fit_problem import Problem
 from ctr_dynamics.diagnosis.inference.fit_quality import MOST_CAUSES, is_acceptable
 from ctr_dynamics.diagnosis.inference.growing_fit import explain_growing_parts, part_of
-from ctr_dynamics.diagnosis.inference.hypotheses import Addition, Hypothesis, fit_addition, with_form
+from ctr_dynamics.diagnosis.inference.hypotheses import (
+    Addition,
+    Hypothesis,
+    fit_addition,
+    fit_hypothesis,
+    with_form,
+)
 from ctr_dynamics.diagnosis.inference.map_fit import Fit, fit
 from ctr_dynamics.diagnosis.inference.screening import one_form_each, screen
 from ctr_dynamics.diagnosis.inference.search_moves import SearchState
@@ -73,8 +79,15 @@ def search_growing_parts(state: SearchState) -> None:
         if whole or state.context.out_of_time:
             state.add(whole)
             return
-    jobs = [delayed(_fitted_to_whole)(state.problem, one, state.cost_limit) for one in single]
-    state.add(state.run_fits(jobs))
+    limit = state.cost_limit
+    state.add(
+        state.run_fits(
+            [
+                delayed(fit_hypothesis)(state.problem, one.members, one.fit.point, limit=limit, polish=False)
+                for one in single
+            ]
+        )
+    )
 
 
 def _first_unexplained(problem: Problem) -> list[Partial]:
@@ -114,7 +127,7 @@ def _with_one_more(state: SearchState, begun: Partial, tried: set[frozenset[Key]
     promising = one_form_each([item for item in screened if item.gain > least])
     jobs = []
     for item in promising[: o.further if begun.members else problem.options.screening.candidates]:
-        keys = frozenset().union(*(c.keys for c in (*begun.members, item.candidate)))
+        keys = keys_of((*begun.members, item.candidate))
         if keys not in tried:
             tried.add(keys)
             jobs.append(delayed(fit_addition)(problem, Addition(begun.members, item, begun.fit, here)))
@@ -134,9 +147,3 @@ def _followed(problem: Problem, begun: Partial) -> Partial:
     part = min(max(done.part, begun.part) * problem.options.calibration.growth, 1.0)
     found = fit(part_of(own, part), causes, done.point, polish=False)
     return begun if found is None else Partial(begun.members, part, found)
-
-
-def _fitted_to_whole(problem: Problem, begun: Partial, limit: float) -> Hypothesis | None:
-    own = with_form(problem, begun.members)
-    found = fit(own, causes_of(begun.members), begun.fit.point, polish=False, limit=limit)
-    return None if found is None else Hypothesis(begun.members, found)

@@ -368,9 +368,8 @@ class StampChecks:
             )
             self.findings.add(Kind.BURSTS, at, size, "", text)
             if self.retiming is None:
-                if not begins_burst(
-                    self._steps[-1][0], self._burst_ns
-                ):  # its place in its burst is not known
+                if not begins_burst(self._steps[-1][0], self._burst_ns):
+                    # its place in its burst is not known
                     return Verdict("drop", Kind.BURSTS, text)
                 self.retiming = Retiming(stamp_ns - round(self._burst_ns))
             time_ns = self.retiming.from_bursts(stamp_ns, self._period_ns, self._burst_ns)
