@@ -34,22 +34,29 @@ _COMPRESSION = CompressionType.LZ4
 
 
 class _Channels:
-    """Registers a topic's definition and channel when its first message comes."""
+    """Registers a topic's definition and channel when its first message of a type comes."""
 
     def __init__(self, writer: Writer) -> None:
         self.writer = writer
         self.schemas: dict[str, int] = {}
-        self.channels: dict[str, int] = {}
+        self._channels: dict[tuple[str, str], int] = {}
 
-    def add(self, topic: str, ros_type: str) -> int:
+    def of(self, topic: str, ros_type: str) -> int:
+        """The channel of a topic; ``ros_type``: empty stands for that of the topic table."""
+        kind = ros_type or TOPIC[topic].ros_type
+        channel = self._channels.get((topic, kind))
+        return self._add(topic, kind) if channel is None else channel
+
+    def _add(self, topic: str, ros_type: str) -> int:
         definition = schema(ros_type)
         if ros_type not in self.schemas:
             self.schemas[ros_type] = self.writer.register_schema(
                 ros_type, "ros2msg", definition.text.encode()
             )
         metadata = {"offered_qos_profiles": "", "topic_type_hash": definition.type_hash}
-        self.channels[topic] = self.writer.register_channel(topic, "cdr", self.schemas[ros_type], metadata)
-        return self.channels[topic]
+        channel = self.writer.register_channel(topic, "cdr", self.schemas[ros_type], metadata)
+        self._channels[topic, ros_type] = channel
+        return channel
 
 
 class BagWriter:
@@ -71,14 +78,12 @@ class BagWriter:
         """Write one serialised message; log time and publish time are both `log_ns`.
 
         Args:
-            ros_type: needed for topics outside the topic table.
+            ros_type: that of the topic table where it is empty; needed for other types and for topics outside the table.
 
         Raises:
             KeyError: a topic outside the table without a type.
         """
-        channel = self._channels.channels.get(topic)
-        if channel is None:
-            channel = self._channels.add(topic, ros_type or TOPIC[topic].ros_type)
+        channel = self._channels.of(topic, ros_type)
         sequence = self._sequence.get(channel, 0)
         self._sequence[channel] = sequence + 1
         log_ns = max(log_ns, 0)  # unsigned in MCAP
@@ -144,7 +149,7 @@ class LiveRecorder:
         Args:
             log_ns: time of arrival.
             publish_ns: time of publishing, `log_ns` when not known.
-            ros_type: needed for topics outside the topic table.
+            ros_type: that of the topic table where it is empty; needed for other types and for topics outside the table.
 
         Raises:
             OSError: the disk is full or gone, then the file so far stays readable; or the file was deleted.
@@ -152,9 +157,7 @@ class LiveRecorder:
         with self._lock:
             if not self._open:
                 return
-            channel = self._channels.channels.get(topic)
-            if channel is None:
-                channel = self._channels.add(topic, ros_type or TOPIC[topic].ros_type)
+            channel = self._channels.of(topic, ros_type)
             log_ns = max(log_ns, 0)
             self._writer.add_message(
                 channel, log_ns, data, log_ns if publish_ns is None else max(publish_ns, 0)

@@ -45,7 +45,7 @@ from ctr_dynamics.ros.topic_names import NAME, NAMESPACE, message_class, node_to
 from ctr_dynamics.runtime import node_diagnostics
 from ctr_dynamics.runtime.input_gate import InputGate
 from ctr_dynamics.runtime.memory import keep_memory
-from ctr_dynamics.runtime.recorder import Recorder
+from ctr_dynamics.runtime.recorder import Recorded, Recorder
 from ctr_dynamics.runtime.ring_buffer_recording import RingBufferRecording
 from ctr_dynamics.runtime.step_encoder import StepEncoder
 from ctr_dynamics.runtime.step_loop import Clock, StepLoop
@@ -202,10 +202,11 @@ class EstimatorNode(Node):
         def arrived(data: bytes) -> None:
             arrival_ns = now_ns()
             loop.offer(partial(self._take, topic, data, arrival_ns), len(data))
+            message = Recorded(topic.name, arrival_ns, data, topic.ros_type)
             if record is not None:
-                record.put(topic.name, arrival_ns, data)
+                record.put(message)
             if ring_buffer is not None:
-                ring_buffer.put(topic.name, arrival_ns, data)
+                ring_buffer.put(message)
 
         return arrived
 

@@ -16,6 +16,7 @@ from ctr_dynamics.io.messages.encode import Encoded, encode_diagnostics
 from ctr_dynamics.ros.qos import QosFaults
 from ctr_dynamics.ros.topic_names import message_class, node_topic
 from ctr_dynamics.runtime.clock_offset import RisingStamps
+from ctr_dynamics.runtime.recorder import Recorded
 from ctr_dynamics.runtime.step_encoder import StepEncoder
 
 
@@ -27,7 +28,7 @@ class Outputs:
         profile: their quality of service.
         faults: told about subscribers that do not fit.
         encoder: makes the messages.
-        record: also given every message of the table (topic, stamp in ns, bytes).
+        record: also given every message of the table.
         transforms: publisher on /tf, which is taken over; None where the encoder makes none.
     """
 
@@ -37,7 +38,7 @@ class Outputs:
         profile: QoSProfile,
         faults: QosFaults,
         encoder: StepEncoder,
-        record: Callable[[str, int, bytes], None] | None = None,
+        record: Callable[[Recorded], None] | None = None,
         transforms: Publisher[Any] | None = None,
     ) -> None:
         self._node, self._transforms = node, transforms
@@ -111,4 +112,4 @@ class Outputs:
     def _send(self, topic: str, stamp_ns: int, data: bytes) -> None:
         self._publishers[topic].publish(data)
         if self._record is not None:
-            self._record(topic, stamp_ns, data)
+            self._record(Recorded(topic, stamp_ns, data))

@@ -5,13 +5,22 @@ from __future__ import annotations
 import queue
 import threading
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
+
+
+class Recorded(NamedTuple):
+    """A serialised message of a live run: topic, time of arrival or stamp, bytes, and its type; empty stands for that of the topic table."""
+
+    topic: str
+    log_ns: int
+    data: bytes
+    ros_type: str = ""
 
 
 class Writer(Protocol):
     """What the recorder needs of a bag writer, such as `io.bag_writer.LiveRecorder`."""
 
-    def write(self, topic: str, log_ns: int, data: bytes) -> None: ...
+    def write(self, topic: str, log_ns: int, data: bytes, ros_type: str) -> None: ...
     def close(self) -> None: ...
 
 
@@ -31,15 +40,16 @@ class Recorder:
         self.error = ""
         self._writer = writer
         self._log_error = log_error
-        self._queue: queue.SimpleQueue[tuple[str, int, bytes] | None] = queue.SimpleQueue()
+        self._queue: queue.SimpleQueue[Recorded | None] = queue.SimpleQueue()
         self._bytes = 0  # that wait
         self._lock = threading.Lock()
         self._thread = threading.Thread(target=self._run, name="recorder", daemon=True)
         self._thread.start()
 
-    def put(self, topic: str, log_ns: int, data: bytes) -> None:
+    def put(self, message: Recorded) -> None:
         """Have one message written; returns at once."""
-        if self.error or self._queue.qsize() > self.LIMIT or self._bytes + len(data) > self.LIMIT_BYTES:
+        size = len(message.data)
+        if self.error or self._queue.qsize() > self.LIMIT or self._bytes + size > self.LIMIT_BYTES:
             if not (self.dropped or self.error):
                 self._log_error(
                     f"the disk is behind by {self._queue.qsize()} messages of {self._bytes} bytes: further ones are not recorded"
@@ -47,8 +57,8 @@ class Recorder:
             self.dropped += 1
             return
         with self._lock:
-            self._bytes += len(data)
-        self._queue.put((topic, log_ns, data))
+            self._bytes += size
+        self._queue.put(message)
 
     def close(self) -> None:
         """Write what is queued, finish the file, end the thread."""
@@ -59,12 +69,12 @@ class Recorder:
 
     def _run(self) -> None:
         try:
-            while (item := self._queue.get()) is not None:
+            while (message := self._queue.get()) is not None:
                 with self._lock:
-                    self._bytes -= len(item[2])
-                self._writer.write(*item)
+                    self._bytes -= len(message.data)
+                self._writer.write(*message)
                 self.written += 1
-        except OSError as error:
+        except Exception as error:  # whatever it is: nobody would see this thread end
             self.error = f"{type(error).__name__}: {error}"
             self._log_error(f"recording stopped: {self.error}")
         try:

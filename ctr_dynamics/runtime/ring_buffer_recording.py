@@ -16,6 +16,7 @@ from ctr_dynamics.estimation.step_output import Status
 from ctr_dynamics.io.atomic_files import check_target
 from ctr_dynamics.io.bag_writer import write_bag
 from ctr_dynamics.io.messages.topics import TIP_LOAD
+from ctr_dynamics.runtime.recorder import Recorded
 
 LIMIT_BYTES = 256 * 2**20  # kept in memory, whatever the rates of the inputs
 
@@ -50,8 +51,8 @@ class RingBufferRecording:
         self.error = ""
         self._span_ns = round(seconds * 1e9)
         self._metadata, self._log = dict(metadata), log
-        self._kept: deque[tuple[str, int, bytes]] = deque()
-        self._load: tuple[str, int, bytes] | None = None  # the last known load before what is kept
+        self._kept: deque[Recorded] = deque()
+        self._load: Recorded | None = None  # the last known load before what is kept
         self._bytes = 0
         self._lock = threading.Lock()
         self._asked_ns: int | None = None
@@ -59,18 +60,19 @@ class RingBufferRecording:
         self._thread = threading.Thread(target=self._run, name="ring buffer recording", daemon=True)
         self._thread.start()
 
-    def put(self, topic: str, log_ns: int, data: bytes) -> None:
-        """Keep one message that arrived at ``log_ns``, and let go of what is too old."""
+    def put(self, message: Recorded) -> None:
+        """Keep one message, and let go of what is too old."""
+        log_ns = message.log_ns
         with self._lock:
-            if self._kept and log_ns < self._kept[-1][1] - self._span_ns:
+            if self._kept and log_ns < self._kept[-1].log_ns - self._span_ns:
                 self._kept.clear()  # the clock went back: what was before is of another time
                 self._load, self._bytes = None, 0
-            self._kept.append((topic, log_ns, data))
-            self._bytes += len(data)
-            while log_ns - self._kept[0][1] > self._span_ns or self._bytes > LIMIT_BYTES:
+            self._kept.append(message)
+            self._bytes += len(message.data)
+            while log_ns - self._kept[0].log_ns > self._span_ns or self._bytes > LIMIT_BYTES:
                 old = self._kept.popleft()
-                self._bytes -= len(old[2])
-                if old[0] == TIP_LOAD:
+                self._bytes -= len(old.data)
+                if old.topic == TIP_LOAD:
                     self._load = old
                 if not self._kept:
                     break
@@ -86,12 +88,12 @@ class RingBufferRecording:
         """Have the recording written; returns at once."""
         self._queue.put(why)
 
-    def messages(self) -> list[tuple[str, int, bytes]]:
+    def messages(self) -> list[Recorded]:
         """What is kept now, in order of arrival; a load that was given before stands first."""
         with self._lock:
             kept, load = list(self._kept), self._load
         if load is not None and kept:
-            kept.insert(0, (load[0], kept[0][1], load[2]))
+            kept.insert(0, load._replace(log_ns=kept[0].log_ns))
         return kept
 
     def describe(self, status: Status) -> Status:
@@ -127,5 +129,5 @@ class RingBufferRecording:
         if not messages:
             raise InputError("no input has come yet", where=str(self.path))
         with write_bag(self.path, self._metadata) as writer:
-            for topic, log_ns, data in messages:
-                writer.write(topic, log_ns, data)
+            for message in messages:
+                writer.write(*message)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from types import SimpleNamespace
 from typing import NamedTuple
 
@@ -13,6 +14,7 @@ from geometry_msgs.msg import TransformStamped
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 
+from ctr_dynamics.io.bag_reader import open_bag
 from ctr_dynamics.io.messages import topics
 from ctr_dynamics.io.messages.cdr import CdrWriter
 from ctr_dynamics.io.messages.encode import Encoded
@@ -44,9 +46,13 @@ def test_who_publishes_what_is_named(start):
         live.wait_for_status("publishers", 0)
 
 
-def test_a_tracker_of_another_type_is_read(start):
+def test_a_tracker_of_another_type_is_read_and_recorded(start, tmp_path):
     """Its publisher has a participant of its own: DDS lets none have a topic in two types."""
-    with start({"input_timeout_s": 4.0}) as live, Listener(live.domain, [], name="ndi") as other:
+    path = tmp_path / "live.mcap"
+    with (
+        start({"input_timeout_s": 4.0, "record.path": str(path)}) as live,
+        Listener(live.domain, [], name="ndi") as other,
+    ):
         robot = live.resting_robot()
         live.listener.node.destroy_publisher(robot.publishers.pop(topics.TRACKER_TIP))
         publisher = other.node.create_publisher(TransformStamped, topics.TRACKER_TIP, 10)
@@ -65,6 +71,10 @@ def test_a_tracker_of_another_type_is_read(start):
         last = live.messages(topics.INNOVATION)[-1]
         assert dict(zip(last.name, last.position, strict=True))["accepted"] == 1.0
         robot.stop()  # its thread publishes by the other participant, which ends first
+    bag = open_bag(path)
+    assert bag.topics[topics.TRACKER_TIP].messages > 5
+    recorded = [item.message for item in bag.inputs() if item.topic == topics.TRACKER_TIP]
+    assert all(math.hypot(*pose.position) < 0.5 for pose in recorded), "read as they were received"
 
 
 class Step(NamedTuple):

@@ -11,6 +11,7 @@ from ctr_dynamics.io.messages import topics
 from ctr_dynamics.io.messages.cdr import decode_stamp
 from ctr_dynamics.io.messages.encode import encode_joint_state, encode_wrench_stamped
 from ctr_dynamics.runtime import ring_buffer_recording
+from ctr_dynamics.runtime.recorder import Recorded
 from ctr_dynamics.runtime.ring_buffer_recording import RingBufferRecording
 
 MS = 1_000_000
@@ -34,11 +35,11 @@ def made(tmp_path):
 def test_it_keeps_the_last_seconds_and_the_load_that_stood_before_them(made):
     recording, lines = made
     load = encode_wrench_stamped(0, "ctr_base", (0.0, -0.5, 0.0), (0.0, 0.0, 0.0))
-    recording.put(topics.TIP_LOAD, 0, load)
+    recording.put(Recorded(topics.TIP_LOAD, 0, load))
     for i in range(1000):
-        recording.put(topics.JOINT_STATES, i * 10 * MS, joints(i * 10 * MS))
+        recording.put(Recorded(topics.JOINT_STATES, i * 10 * MS, joints(i * 10 * MS)))
     kept = recording.messages()
-    assert kept[0] == (topics.TIP_LOAD, kept[1][1], load)
+    assert kept[0] == Recorded(topics.TIP_LOAD, kept[1].log_ns, load)
     assert len(kept) == 1 + 201
     recording.close(active=True)
     bag = open_bag(recording.path)
@@ -53,12 +54,12 @@ def test_memory_is_bounded_and_a_clock_that_goes_back_starts_again(made, monkeyp
     recording, _ = made
     monkeypatch.setattr(ring_buffer_recording, "LIMIT_BYTES", 1000)
     for i in range(100):
-        recording.put(topics.JOINT_STATES, 100 * S + i, bytes(100))
-    assert sum(len(data) for _, _, data in recording.messages()) <= 1000
-    recording.put(topics.JOINT_STATES, 5 * S, bytes(2000))
+        recording.put(Recorded(topics.JOINT_STATES, 100 * S + i, bytes(100)))
+    assert sum(len(message.data) for message in recording.messages()) <= 1000
+    recording.put(Recorded(topics.JOINT_STATES, 5 * S, bytes(2000)))
     assert recording.messages() == []  # a single message beyond the limit is not kept either
-    recording.put(topics.JOINT_STATES, 5 * S, bytes(20))
-    assert [log_ns for _, log_ns, _ in recording.messages()] == [5 * S]
+    recording.put(Recorded(topics.JOINT_STATES, 5 * S, bytes(20)))
+    assert [message.log_ns for message in recording.messages()] == [5 * S]
 
 
 def test_an_alarm_is_written_at_once_and_then_once_in_the_kept_length(made, monkeypatch):
@@ -82,7 +83,7 @@ def test_what_cannot_be_written_is_said_and_the_thread_goes_on(made, tmp_path):
     assert (
         "no input" in recording.describe(Status("misfit", WARN, "misfit", {})).values["ring buffer recording"]
     )
-    recording.put(topics.JOINT_STATES, 0, joints(0))
+    recording.put(Recorded(topics.JOINT_STATES, 0, joints(0)))
     recording.save("asked again")
     recording.close(active=False)
     assert recording.error == ""
