@@ -37,7 +37,7 @@ class Compared(NamedTuple):
         stamp_ns: of its header. time_s: its own time, s from the first step.
         quaternion: (4,) wxyz, measured.
         motion: the open-loop run there. tips: stamps (k,) s and positions (k, 3) m of that run.
-        update: what the filter has made of it. delay: with which delay beyond the nominal one, s.
+        update: what the filter has made of it. delay: with which delay beyond the nominal one, s. stamp_error_s: 1-sigma that is stated of its stamp.
     """
 
     stamp_ns: int
@@ -47,6 +47,7 @@ class Compared(NamedTuple):
     tips: tuple[Floats, Floats]
     update: Update
     delay: float
+    stamp_error_s: float
 
 
 class Alternatives:
@@ -86,6 +87,7 @@ class Alternatives:
         self._compared: list[Compared] = []
         self._news = False  # whether measurements have counted since anything was concluded
         self.probability = self.reason_not_to_fuse = 0.0
+        self._stamp_error_s = 0.0  # that is stated of the last stamp
         self._scatters_since = 0  # step, since when stamps probably scatter
         # step, since when the latency has probably changed; None where it has not
         self._doubted_since: int | None = None
@@ -123,7 +125,8 @@ class Alternatives:
         if not self._compared:
             return
         expected = self._ekf.expected
-        for stamp_ns, time_s, quaternion, motion, tips, update, delay in self._compared:
+        for stamp_ns, time_s, quaternion, motion, tips, update, delay, stamp_error_s in self._compared:
+            self._stamp_error_s = stamp_error_s
             assert update.foretold is not None
             seen = motion.position + motion.residual
             self.end_of_jitter.add(stamp_ns, update.steadier)
@@ -176,9 +179,14 @@ class Alternatives:
     def _weigh(self) -> None:
         """How likely something else is now than the filter counts on."""
         search, timing = self.model_error, self._other_timing
-        moves, scatter = search.frame.probability, search.stamp_jitter(self._ekf.expected.scatter)[0]
+        moves, scatter = search.frame.probability, search.stamp_jitter(self._scatter)[0]
         self.probability = max(timing, moves, scatter, search.probability(self._ekf.model_error))
         self.reason_not_to_fuse = timing if self.late or self.doubted else moves
+
+    @property
+    def _scatter(self) -> float:
+        """s, deviation of stamps that the filter counts on now."""
+        return self._ekf.expected.scatter(self._stamp_error_s)
 
     @property
     def _other_timing(self) -> float:
@@ -235,13 +243,13 @@ class Alternatives:
             half = 0.5 * self._ekf.expected.jitter
             self._ekf.expected.jitter = half if half > 0.5 * search.jitter.options.smallest_s else 0.0
             self.end_of_jitter.clear()
-        probability, deviation = search.stamp_jitter(self._ekf.expected.scatter)
+        probability, deviation = search.stamp_jitter(self._scatter)
         if probability <= 0.5 or self._other_timing > 0.5:
             self._scatters_since = k
         lasts = seconds(k - self._scatters_since) > search.jitter.options.lasts_s
         if probability <= search.options.believed or not lasts:
             return False
-        self._ekf.expected.jitter = deviation
+        self._ekf.expected.jitter = math.sqrt(max(deviation**2 - self._stamp_error_s**2, 0.0))
         self.end_of_jitter.clear()
         search.begin_again()
         self.timing.begin_again(self._ekf.expected, self._ekf.delay)

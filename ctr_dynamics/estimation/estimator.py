@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from ctr_dynamics.estimation.backbone import Backbone
 from ctr_dynamics.estimation.discretisation import discretise
 from ctr_dynamics.estimation.estimator_options import EstimatorOptions
+from ctr_dynamics.estimation.filter.covariance_factor import Vibrating
 from ctr_dynamics.estimation.inputs.input_buffer import InputBuffer
 from ctr_dynamics.estimation.inputs.measurement_queue import tracker_of
 from ctr_dynamics.estimation.inputs.unseen_load import UnseenLoad
@@ -29,9 +30,8 @@ from ctr_dynamics.estimation.monitoring.health import Health
 from ctr_dynamics.estimation.monitoring.innovation_log import InnovationLog
 from ctr_dynamics.estimation.monitoring.settling import Settling
 from ctr_dynamics.estimation.monitoring.statuses import all_statuses
-from ctr_dynamics.estimation.monitoring.twist_error import TwistError, UnseenVibration
-from ctr_dynamics.estimation.monitoring.unexpected_innovation import UnexpectedInnovation
 from ctr_dynamics.estimation.out_of_sequence import OutOfSequence
+from ctr_dynamics.estimation.published_covariance import PublishedCovariance
 from ctr_dynamics.estimation.runs import Runs
 from ctr_dynamics.estimation.step_output import Innovation, SolverStats, StepOutput
 from ctr_dynamics.estimation.timeline import seconds
@@ -109,13 +109,10 @@ class Estimator:
         self._modes = ModeTracker(self.model, self.options.modes_every)
         self._jacobian = JacobianTracker(self._modes.coarse, self.options.jacobian_every)
         self._without_idle = 0  # steps since the last idle work
-        self._unexpected = UnexpectedInnovation(self._largest_deviation, noise)
-        self._twist_error = TwistError(self.discretisation.vibration, self.robot)
-        self._unseen_vibration = UnseenVibration(
-            self.discretisation.vibration, self.options.unseen_fraction * self._largest_deviation
-        )
+        largest = self._largest_deviation
+        unseen = self.options.unseen_fraction * largest
+        self._covariance = PublishedCovariance(self.discretisation, self.robot, largest, unseen)
         self._unseen_load = UnseenLoad(self.discretisation.vibration, noise)
-        self._driven_m = 0.0  # by which actuators may have moved the tip unknown to the last step
 
     # -- inputs --
 
@@ -174,9 +171,7 @@ class Estimator:
         change = self.inputs.add_load(stamp_ns, force, torque, frame_id)
         if change is not None:
             self.late.load_changed(change.from_ns, change.jumped)
-            self._twist_error.load_changed(change.begin_ns, change.end_ns, change.difference)
-            if change.jumped:
-                self._unexpected.load_jumped(change.from_ns)
+            self._covariance.load_changed(change)
             self._unseen_load.look(self._settling, change=change)
 
     # -- time --
@@ -337,7 +332,7 @@ class Estimator:
         soon = lag <= late.options.reuse_lag
         awaited = self.inputs.awaits_joints(k, late.options.reuse_lag)
         mark = None if soon else self.innovations.mark()
-        astray = self._driven_m > self.robot.tracker.noise.position.value
+        astray = self._covariance.driven_m > self.robot.tracker.noise.position.value
         result = runs.step(k, fuse=not awaited if lag == 0 else not (soon or astray), extrapolated=lag > 0)
         late.history.record(k)
         runs.judge(result)
@@ -350,10 +345,22 @@ class Estimator:
 
     def _conclude(self) -> None:
         """Have the filter count on something else, if the measurements up to the last step show that it is right."""
-        runs, late = self.runs, self.late
-        moves_as_modelled = not self._settling.lacks_vibration(self.timeline.stamp(runs.k))
+        runs, late, stamp = self.runs, self.late, self.timeline.stamp(self.runs.k)
+        moves_as_modelled = not self._settling.lacks_vibration(stamp)
         if late.lag <= late.options.reuse_lag and runs.conclude(moves_as_modelled):
+            lacking = self._settling.lacking(stamp)
+            left = self._covariance.unseen_vibration.left(*lacking) if lacking else 0.0
+            runs.fused.reinitialise(runs.open_loop, runs.k, self._vibrating(left))
+            self.health.restarts += 1
             late.history.restart(runs.k)
+
+    def _vibrating(self, deviation: float) -> Vibrating | None:
+        """How the robot may vibrate about the open-loop run, which moves its tip by ``deviation`` (m); None where it is less than is measured."""
+        state = self.runs.open_loop.state
+        if state is None or deviation < self.robot.tracker.noise.position.value:
+            return None
+        deviation = min(deviation, self.options.vibrating_fraction * self._length)
+        return self._modes.vibrating(state, self.model.parameters, deviation)
 
     def _start(self, k: int) -> StepOutput:
         """Both runs at rest at step ``k``, unless there is no equilibrium."""
@@ -366,6 +373,7 @@ class Estimator:
             self.inputs.forget(k)
             return self._invalid(k, reason)
         self.late.history.restart(k)
+        self.inputs.actuator_error.corrected()
         self._modes.clear()
         self._jacobian.clear()
         self._watch_start(self.timeline.stamp(k))
@@ -378,8 +386,7 @@ class Estimator:
         fused, health, options, late = self.runs.fused, self.health, self.options, self.late
         assert fused.state is not None
         tip = fused.ekf.tip_estimate()
-        open_loop = self.runs.open_loop.tips.last
-        predicted = open_loop.mean[:7].copy()
+        predicted = self.runs.open_loop.tips.last.mean[:7].copy()
         if not (tip.finite and math.isfinite(sum(predicted.tolist()))):
             self.runs.stop()
             health.failed("not finite")
@@ -389,6 +396,7 @@ class Estimator:
         deviation = tip.position_deviation
         if deviation > self._length:  # a tip that is known no better than that is not estimated any more
             fused.reinitialise(self.runs.open_loop, k)
+            health.restarts += 1
             self.late.history.record(k)
             health.failed("led astray")
             return self._invalid(
@@ -402,9 +410,8 @@ class Estimator:
         unsettled = self._settling.problem(stamp)
         if self._settling.begun:
             return self._begin_vibrating(k, unsettled, innovations)
-        self._unexpected.take(
-            innovations, fused.ekf.refuted, fused.agreed or bool(unsettled) or not health.fusing
-        )
+        confirmed = fused.agreed or bool(unsettled) or not health.fusing
+        self._covariance.take(innovations, fused.ekf.refuted, confirmed)
         if unsettled:  # measurements tell nothing of the model's error either
             fused.alternatives.clear_model_error()
             self.innovations.pass_over()
@@ -412,17 +419,11 @@ class Estimator:
         if too_old:
             return self._invalid(k, too_old, innovations)
         shown = fused.with_alternatives(tip, self.runs.open_loop, self._largest_deviation)
-        self._unexpected.inflate(tip.covariance, stamp)
         since = fused.measured_ns if fused.measured_ns is not None else self.t0_ns
         health.tracker_age_s = max(0.0, (stamp - (since or stamp)) * 1e-9)
         modes = self._modes.measure(fused.state, k)
-        periods_s = self.inputs.joint_period_s, fused.pose_period_s
-        self._twist_error.inflate(tip, stamp, open_loop, fused.ekf, periods_s, modes)
-        if (apart := self._settling.unseen(stamp)) is not None:
-            self._unseen_vibration.inflate(tip.covariance, apart)
-        self._driven_m = self.inputs.actuator_error.inflate(
-            tip.covariance, tip.position, self._length, stamp, late.lag * STEP_NS
-        )
+        lag_ns = late.lag * STEP_NS
+        self._covariance.inflate(tip, stamp, self.runs, self.inputs, self._settling, modes, lag_ns)
         problem = health.problem = self._problem(stamp, tip.position_deviation, unsettled)
         return StepOutput(
             stamp, k, not problem, problem, tip.position, tip.quaternion, tip.covariance[:6, :6], tip.twist, tip.covariance[6:, 6:],
@@ -435,11 +436,10 @@ class Estimator:
         """Begin again at step ``k`` from the open-loop run, about which the robot may vibrate in a way that is not known."""
         open_loop, fused, settling, vibrating = self.runs.open_loop, self.runs.fused, self._settling, None
         settling.begun = False
-        if settling.vibrates and open_loop.state is not None:
-            farthest = self.options.vibrating_fraction * self._length
-            deviation = min(max(self._largest_deviation, settling.apart), farthest)
-            vibrating = self._modes.vibrating(open_loop.state, self.model.parameters, deviation)
+        if settling.vibrates:
+            vibrating = self._vibrating(max(self._largest_deviation, settling.apart))
         fused.reinitialise(open_loop, k, vibrating)
+        self.health.restarts += 1
         fused.alternatives.clear_timing()
         self.late.repeated = k, lambda: fused.reinitialise(open_loop, k, vibrating)
         self.late.history.record(k, always=True)
@@ -460,7 +460,7 @@ class Estimator:
             return f"joint states are missing: the last is {age_s:.3f} s old, limit {limit_s:g} s"
         if unsettled:
             return unsettled
-        deviations = Deviations(deviation, self._driven_m, self._largest_deviation)
+        deviations = Deviations(deviation, self._covariance.driven_m, self._largest_deviation)
         return deviations.problem(self.health, self.runs.fused.alternatives.late_by_m)
 
     def _look_for_motion(self) -> None:

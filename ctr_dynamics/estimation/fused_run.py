@@ -111,14 +111,14 @@ class FusedRun:
         not_fused = self.alternatives.not_fused
         for measurement, time_s, position, quaternion in due:
             measurement.fused_k = k
-            self.ekf.expected.stamp_error = measurement.stamp_error_s
+            given = time_s, position, quaternion, measurement.stamp_error_s
             motion, residual = self.residuals(time_s, position, quaternion, open_loop)
-            if self._inputs.missing_at(time_s - self.ekf.tracker.age):
+            if self._inputs.missing_at(time_s - self.ekf.expected.age):
                 update = Update.impossible("no joint states at its time")
             elif self._health.fusing and not not_fused:
-                update = self.ekf.update(self.state, time_s, position, quaternion)
+                update = self.ekf.update(self.state, *given)
             else:
-                update = self.ekf.compare(time_s, position, quaternion)
+                update = self.ekf.compare(*given)
                 if not_fused:
                     update = update._replace(reason=update.reason.replace(FUSION_OFF, not_fused))
             if motion is not None and residual is not None:
@@ -128,8 +128,8 @@ class FusedRun:
                 self._apart = motion.residual
                 tips = open_loop.tips.positions()
                 compared = Compared(
-                    measurement.stamp_ns, time_s, quaternion, motion, tips, update, self.ekf.delay
-                )
+                    measurement.stamp_ns, time_s, quaternion, motion, tips, update, self.ekf.delay, measurement.stamp_error_s,
+                )  # fmt: skip
                 self.alternatives.add(compared)
             newer = self.measured_ns is None or measurement.stamp_ns > self.measured_ns
             if not self.agreed and update.accepted and newer and not self.ekf.tracker_fault()[0]:
@@ -165,7 +165,7 @@ class FusedRun:
         position, _ = tracker.to_base(position, quaternion, fused.quaternion)
         estimate = tracker.registered(self.ekf.bias, fused)[:3]
         assert inputs.t0_ns is not None
-        joints, rates = inputs.joints.at(inputs.t0_ns + (own_s - tracker.age + tracker.delay) * 1e9)
+        joints, rates = inputs.joints.at(inputs.t0_ns + (time_s - self.ekf.expected.age) * 1e9)
         motion = MotionPoint(
             position - tip.position, tip.position, tip.quaternion, tip.velocity, acceleration,
             joints[:n], rates[:n], rates[n:],
@@ -176,14 +176,6 @@ class FusedRun:
         """Go on from the open-loop run at step ``k``: a correction has led this run astray. ``vibrating``: how the robot may move beside it."""
         assert open_loop.state is not None
         self.start(open_loop.state.copy(), seconds(k), vibrating)
-        self._health.restarts += 1
-
-    def begin_again(self, open_loop: OpenLoopRun, k: int) -> bool:
-        """Go on from the open-loop run at step ``k`` if measurements show that something else is right than the filter counts on."""
-        again = self.alternatives.conclude(open_loop, k)
-        if again:
-            self.reinitialise(open_loop, k)
-        return again
 
     def with_alternatives(self, tip: TipEstimate, open_loop: OpenLoopRun, farthest: float) -> State:
         """Have ``tip`` hold what else may be right; returns the state that it belongs to. ``farthest``: see :meth:`inflate_covariance`."""

@@ -94,6 +94,7 @@ class Runs:
         """Both runs at rest at step ``k``; returns the reason when there is no equilibrium."""
         t = seconds(k)
         self._interpolated.clear()
+        self.fused.confirmed = 0
         self.fused.ekf.forget_parameters()
         self.fused.ekf.gate.rejections = 0
         try:
@@ -128,6 +129,7 @@ class Runs:
         self.open_loop.append_tip(t)
         if not result.ok:
             self.fused.reinitialise(self.open_loop, k)
+            self._health.restarts += 1
             return result
         self._health.count_substeps(result.substeps)
         ekf, state = self.fused.ekf, self.fused.state
@@ -148,14 +150,14 @@ class Runs:
         return result
 
     def conclude(self, moves_as_modelled: bool) -> bool:
-        """Whether the fused run has begun again from the open-loop run: measurements show that something else is right than the filter counts on.
+        """Whether measurements show that something else is right than the filter counts on: the fused run is to go on from the open-loop run.
 
         ``moves_as_modelled``: whether the open-loop run moves as the robot does, but for faults. Else how measurements follow it says nothing.
         """
         if not moves_as_modelled:
             self.fused.alternatives.clear_timing()
             return False
-        return self.fused.begin_again(self.open_loop, self.k)
+        return self.fused.alternatives.conclude(self.open_loop, self.k)
 
     def judge(self, result: StepResult) -> None:
         """Count the outcome of a step; after too many failures in a row there is no state to go on from."""

@@ -11,7 +11,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from rclpy.clock import JumpThreshold, TimeJump
+from rclpy.clock import JumpHandle, JumpThreshold, TimeJump
 from rclpy.duration import Duration
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.logging import get_logging_directory
@@ -122,6 +122,7 @@ class EstimatorNode(Node):
             self.recorder.put if self.recorder else None,
             frames,
         )
+        self._jumps: JumpHandle | None = None  # of the clock
         self._now_ns = self._clock_source()
         self.loop = self._new_loop()
         self._unwatch = watch(self, lambda: self.settings, self._prepare, self._apply)
@@ -431,6 +432,8 @@ class EstimatorNode(Node):
     def take_down(self) -> None:
         """Finish the recording, write the timing report, take the outputs away."""
         self._unwatch()
+        if self._jumps is not None:
+            self._jumps.unregister()
         if self.recorder is not None:
             self.recorder.close()
         if self.ring_buffer is not None:

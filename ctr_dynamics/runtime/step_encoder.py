@@ -8,11 +8,11 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
 
 import numpy as np
 
-from ctr_dynamics.estimation.step_output import ERROR, OK, Innovation, StepOutput
+from ctr_dynamics.estimation.monitoring.statuses import output as output_status
+from ctr_dynamics.estimation.step_output import Innovation, StepOutput
 from ctr_dynamics.io.messages import templates, topics
 from ctr_dynamics.io.messages.cdr import ENCAPSULATION
 from ctr_dynamics.io.messages.encode import Encoded, StatusLike, encode_diagnostics
@@ -24,15 +24,6 @@ _XYZW = [1, 2, 3, 0]
 _INNOVATION = [f"{label}.{axis}" for label in ("residual", "variance") for axis in topics.AXES]
 _INNOVATION += ["nis", "dof", "accepted", "delay_s"]
 _NO_TORQUE = np.zeros(3)
-
-
-class OutputStatus(NamedTuple):
-    """Status of the outputs themselves: ERROR with the reason while they are invalid."""
-
-    name: str
-    level: int
-    message: str
-    values: dict[str, str]
 
 
 def mode_names(count: int) -> list[str]:
@@ -117,12 +108,10 @@ class StepEncoder:
         return messages
 
     def diagnostics(self, out: StepOutput, statuses: Sequence[StatusLike]) -> bytes:
-        """The /diagnostics message of a step, led by the status of the outputs."""
-        if out.valid:
-            output = OutputStatus("output", OK, "valid", {})
-        else:
-            output = OutputStatus("output", ERROR, out.reason or "outputs are invalid", {})
-        return encode_diagnostics(out.stamp_ns, [output, *statuses], self.hardware_id)
+        """The /diagnostics message of a step, led by the status of its output; the estimator's own may be steps ahead of it."""
+        own = output_status("" if out.valid else out.reason or "outputs are invalid", out.k + 1)
+        others = [status for status in statuses if status.name != own.name]
+        return encode_diagnostics(out.stamp_ns, [own, *others], self.hardware_id)
 
     def _outputs(self, out: StepOutput) -> list[Encoded]:
         stamp, modes = out.stamp_ns, out.modes

@@ -10,6 +10,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from ctr_dynamics.estimation.monitoring.health import Health
+from ctr_dynamics.estimation.monitoring.statuses import all_statuses
+from ctr_dynamics.estimation.step_output import ERROR
 from ctr_dynamics.io.messages import cdr, encode, topics
 from ctr_dynamics.io.messages.schemas import schema, typestore
 from ctr_dynamics.io.messages.templates import NotFiniteError
@@ -71,7 +74,7 @@ def test_invalid_step_publishes_valid_false_and_the_reason(step, innovation):
     diagnostics = STORE.deserialize_cdr(
         messages[topics.DIAGNOSTICS].data, "diagnostic_msgs/msg/DiagnosticArray"
     )
-    assert diagnostics.status[0].level == step_encoder.ERROR
+    assert diagnostics.status[0].level == ERROR
     assert diagnostics.status[0].message == "joint gap of 2.1 s, limit 0.1 s"
     assert diagnostics.status[0].hardware_id == "robot"
 
@@ -84,6 +87,18 @@ def test_diagnostics_once_a_second_and_at_changes_of_validity_or_alarm(step):
         if topics.DIAGNOSTICS in by_topic(encoder.encode(out, list, alarm=400 <= k < 500)):
             due.append(k)
     assert due == [0, 100, 103, 333, 400, 500, 666]
+
+
+def test_the_status_of_the_output_is_that_of_its_own_step(step):
+    """The estimator may be steps ahead of what is encoded, as where a replay takes several at once."""
+    health = Health(problem="", steps=40)
+    out = step(k=7, points=2, valid=False, reason="joint states are missing")
+    data = step_encoder.StepEncoder().diagnostics(out, all_statuses(health))
+    found = STORE.deserialize_cdr(data, "diagnostic_msgs/msg/DiagnosticArray").status
+    named = [status for status in found if status.name.endswith("output")]
+    assert [status.message for status in named] == ["joint states are missing"]
+    assert found[0] is named[0]
+    assert len(found) == len(all_statuses(health))
 
 
 def test_diagnostics_bytes(reference):

@@ -252,7 +252,9 @@ class RodEkf:
 
     # -- measurement update --
 
-    def update(self, state: State, stamp: float, position: Floats, quaternion: Floats) -> Update:
+    def update(
+        self, state: State, stamp: float, position: Floats, quaternion: Floats, stamp_error_s: float = 0.0
+    ) -> Update:
         """Correct fields, parameters and tracker states by a measurement.
 
         nu = z - h(tip(stamp - delay), b),  S = H Pi H^T + R,  K = Pi H^T S^-1,
@@ -262,10 +264,11 @@ class RodEkf:
             state: of the simulator; corrected in place.
             stamp: s from the first step, of the measurement.
             position, quaternion: (3,) m and (4,) wxyz, in the tracker's frame.
+            stamp_error_s: 1-sigma that is stated of the stamp, s.
         """
         # 1. Innovation against the tip of the measurement's own time.
         self.adapted.jump(stamp, self.pi)
-        compared = self._comparison(stamp, position, quaternion)
+        compared = self._comparison(stamp, position, quaternion, stamp_error_s)
         if isinstance(compared, Update):
             return compared
         nu, H, S, more, record = compared
@@ -365,9 +368,11 @@ class RodEkf:
             self.adapted.correct(gain, H, noise * np.eye(3))
         x[first : first + 3] -= self.bias[SHIFT]
 
-    def compare(self, stamp: float, position: Floats, quaternion: Floats) -> Update:
+    def compare(
+        self, stamp: float, position: Floats, quaternion: Floats, stamp_error_s: float = 0.0
+    ) -> Update:
         """The innovation of a measurement that is not fused; arguments as of :meth:`update`."""
-        compared = self._comparison(stamp, position, quaternion)
+        compared = self._comparison(stamp, position, quaternion, stamp_error_s)
         if isinstance(compared, Update):
             return compared
         nu, _, S, _, record = compared
@@ -381,10 +386,13 @@ class RodEkf:
         """The tip of that time (s) with its columns."""
         return self.tips.at(time, self.simulator.scheme.dt)
 
-    def _comparison(self, stamp: float, position: Floats, quaternion: Floats) -> Update | Comparison:
+    def _comparison(
+        self, stamp: float, position: Floats, quaternion: Floats, stamp_error_s: float
+    ) -> Update | Comparison:
         """A measurement against the tip of its time; the record alone where there is nothing to compare it with."""
         return compare_with_tip(
-            self.expected, self._tip_at, self.simulator.scheme.dt, self.bias, self.pi, self.adapted, stamp, position, quaternion
+            self.expected, self._tip_at, self.simulator.scheme.dt, self.bias, self.pi, self.adapted, stamp, position, quaternion,
+            stamp_error_s,
         )  # fmt: skip
 
     def _correct(self, state: State, x: Floats) -> None:

@@ -34,14 +34,13 @@ class ExpectedTracker:
     Attributes:
         model: with the response that is known now. slower: the tracker whose response is slower by its deviation; None where nothing was found.
         delay: s, expected beyond the nominal one; delay_sigma: s, its deviation.
-        jitter: s, by which stamps are found to scatter. stamp_error: s, 1-sigma that is stated of the stamp of the measurement at hand.
+        jitter: s, by which stamps are found to scatter beyond what is stated of them.
     """
 
     def __init__(self, model: TrackerModel) -> None:
         self.model = model
         self.slower: TrackerModel | None = None
         self.delay, self.delay_sigma, self.jitter = 0.0, float(model.state_sigma[DELAY]), 0.0
-        self.stamp_error = 0.0
         self._found, self._oldest = response_of(model), model.window[-1][0]
 
     @property
@@ -50,9 +49,13 @@ class ExpectedTracker:
         return max(0.0, self.model.delay) + max(0.0, self.delay) + self._oldest
 
     @property
-    def scatter(self) -> float:
-        """s, deviation of the stamp of the measurement at hand."""
-        return math.hypot(self.jitter, self.stamp_error)
+    def age(self) -> float:
+        """How much older than its stamp a measurement is in the mean, s."""
+        return self.model.age + self.delay
+
+    def scatter(self, stamp_error_s: float) -> float:
+        """s, deviation of a stamp of which ``stamp_error_s`` is stated, 1-sigma."""
+        return math.hypot(self.jitter, stamp_error_s)
 
     def late_by(self, delay: float, sigma: float) -> None:
         """Another ``delay`` beyond the nominal one and its deviation ``sigma``, both s."""

@@ -44,6 +44,7 @@ def compare_with_tip(
     stamp: float,
     position: Floats,
     quaternion: Floats,
+    stamp_error_s: float = 0.0,
 ) -> Update | Comparison:
     """A measurement against the tip of its time; the record alone where there is nothing to compare it with.
 
@@ -51,7 +52,7 @@ def compare_with_tip(
         expected: the tracker.
         tip_at: the tip with its columns at a time (s); None outside the window. dt: s, of a step.
         bias: (22,) tracker states. pi: (r + 22, r + 22) covariance. adapted: noise of the tracker.
-        stamp, position, quaternion: of the measurement; see :meth:`~ctr_dynamics.estimation.filter.ekf.RodEkf.update`.
+        stamp, position, quaternion, stamp_error_s: of the measurement; see :meth:`~ctr_dynamics.estimation.filter.ekf.RodEkf.update`.
     """
     tracker = expected.model
     time = stamp - tracker.delay - bias[DELAY]
@@ -66,7 +67,7 @@ def compare_with_tip(
     if (bent > NEGLIGIBLE * noise.diagonal()).any():
         more += np.diag(bent)
         S += more
-    scatter = expected.scatter
+    scatter = expected.scatter(stamp_error_s)
     if adapted.noisy or scatter or expected.slower:
         S += (adapted.noise - 1.0 if adapted.noisy else 0.0) * noise
         slower = expected.slower.observed_tip(tip_at, time) if expected.slower else None

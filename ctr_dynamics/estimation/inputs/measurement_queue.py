@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from ctr_dynamics.estimation.inputs.input_validation import UNIT, Unusable, pose_values
 from ctr_dynamics.estimation.monitoring.health import Health
-from ctr_dynamics.estimation.timeline import Timeline
+from ctr_dynamics.estimation.timeline import DT, Timeline
 from ctr_dynamics.io.messages.topics import STEP_NS
 from ctr_dynamics.model.model import Model
 from ctr_dynamics.parameters import Settings, axes_mask
@@ -155,16 +155,22 @@ class MeasurementQueue:
         self._health.dropped += 1
         self._health.note("tracker", kind, text)
 
+    def _shown_s(self, measurement: QueuedMeasurement) -> float:
+        """The newest time that a measurement may show, s from t0."""
+        assert self._timeline.t0_ns is not None
+        stamp_s = (measurement.stamp_ns - self._timeline.t0_ns) * 1e-9
+        return self.tracker.own_time(stamp_s) - self.tracker.delay + self.early_s
+
     def due(self, t: float) -> list[DueMeasurement]:
         """Measurements that have not been fused and whose own time is past, ``t`` (s) included."""
         t0_ns, tracker = self._timeline.t0_ns, self.tracker
         assert t0_ns is not None
         due = []
         for measurement in self.measurements:
-            stamp_s = (measurement.stamp_ns - t0_ns) * 1e-9
-            if tracker.own_time(stamp_s) - tracker.delay + self.early_s > t + 1e-9:
+            if self._shown_s(measurement) > t + 1e-9:
                 break  # so are all behind it
             if measurement.fused_k is None:
+                stamp_s = (measurement.stamp_ns - t0_ns) * 1e-9
                 due.append(
                     DueMeasurement(
                         measurement,
@@ -175,13 +181,10 @@ class MeasurementQueue:
 
     def first_fusion(self, k: int) -> float:
         """The first step after ``k`` at which a measurement has been fused or now will be; infinite where there is none."""
-        t0_ns = self._timeline.t0_ns
-        assert t0_ns is not None
-        delay_ns = (self.tracker.delay - self.early_s) * 1e9
         first = math.inf
         for measurement in self.measurements:
             if measurement.fused_k is None:
-                own = math.ceil((measurement.stamp_ns - t0_ns - delay_ns) / STEP_NS - 1e-3)
+                own = math.ceil(self._shown_s(measurement) / DT - 1e-3)
                 first = min(first, max(k + 1, own))
             elif measurement.fused_k > k:
                 first = min(first, measurement.fused_k)

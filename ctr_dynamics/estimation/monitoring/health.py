@@ -56,6 +56,7 @@ class MeasurementCounts(NamedTuple):
     residuals: Residuals
     unused_residuals: Residuals
     recent: list[tuple[float, bool]]
+    distances: list[float]
 
 
 @dataclass
@@ -91,8 +92,7 @@ class Health:
         model_error: by which the robot is found to depart from its model beyond the robot file; None while it is not.
         refutation: what refutes the tolerances of the robot file; empty where nothing does.
         residuals: of the measurements that were used; unused_residuals: of those that were rejected or dropped.
-        distances: m, between measured and published positions, of the last measurements. apart_m: their median, as half of them may be outliers,
-            whatever the filter made of them; 0 before there are ``FEWEST_APART``.
+        distances: m, between measured and published positions, of the last measurements.
         outside: how many of the recent measurements lay outside the gate.
         consistency: watches the innovations. stability: of the equilibrium that belongs to the present actuators.
     """
@@ -133,7 +133,6 @@ class Health:
     unused_residuals: Residuals = NOTHING_COMPARED
 
     distances: deque[float] = field(default_factory=lambda: deque(maxlen=APART))
-    apart_m: float = 0.0
     outside: int = 0
 
     # -- counting --
@@ -165,8 +164,6 @@ class Health:
             self.outside = sum(not other for _, other in self.recent)
         if innovation.fused_residual is not None:
             self.distances.append(float(np.linalg.norm(innovation.fused_residual)))
-            if len(self.distances) >= FEWEST_APART:
-                self.apart_m = statistics.median(self.distances)
         if again:
             return
         used = bool(innovation.dof) and (innovation.accepted or not self.fusing)
@@ -197,7 +194,7 @@ class Health:
         """What has been counted of measurements, for :meth:`restore_counts`."""
         return MeasurementCounts(
             self.nis_count, self.nis_sum, self.nis_dof, self.accepted, self.rejected, self.dropped,
-            self.residuals, self.unused_residuals, list(self.recent),
+            self.residuals, self.unused_residuals, list(self.recent), list(self.distances),
         )  # fmt: skip
 
     def restore_counts(self, counts: MeasurementCounts) -> None:
@@ -207,17 +204,28 @@ class Health:
         self.residuals, self.unused_residuals = counts.residuals, counts.unused_residuals
         self.recent.clear()
         self.recent.extend(counts.recent)
+        self.distances.clear()
+        self.distances.extend(counts.distances)
         self.outside = sum(not within for _, within in self.recent)
 
     def reinitialise(self) -> None:
-        """Wait for joints and watch afresh; counters of what was odd stay."""
+        """Wait for joints and watch afresh; counters of what was odd stay, and so does a model error that was found."""
         self.problem = WAITING
         self.recent.clear()
         self.distances.clear()
-        self.outside, self.apart_m = 0, 0.0
+        self.outside = 0
         self.consistency.clear()
+        self.stability, self.refutation = None, ""
+        self.tracker_age_s = self.force_sigma = self.shift_m = 0.0
+        self.noise_ratio = 1.0
 
     # -- what it comes to --
+
+    @property
+    def apart_m(self) -> float:
+        """m between measured and published positions: the median of the last, as half of them may be outliers, whatever the filter made of them; 0
+        before there are ``FEWEST_APART``."""
+        return statistics.median(self.distances) if len(self.distances) >= FEWEST_APART else 0.0
 
     @property
     def tracker_alive(self) -> bool:

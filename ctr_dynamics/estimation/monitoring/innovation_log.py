@@ -9,7 +9,7 @@ from typing import NamedTuple
 from ctr_dynamics.estimation.monitoring.health import Health, MeasurementCounts
 from ctr_dynamics.estimation.step_output import Innovation
 
-REMEMBERED = 200  # reported innovations: corrections reach back less than 2 s, 80 measurements at 40 Hz
+REMEMBERED_NS = 10_000_000_000  # of reported stamps: corrections reach back over a window of 2 s and a gap of the joints of 3 s at most
 
 
 class Mark(NamedTuple):
@@ -29,7 +29,7 @@ class InnovationLog:
     def __init__(self, health: Health) -> None:
         self._health = health
         self._waiting: list[Innovation] = []  # for the next output
-        self._reported: deque[Innovation] = deque(maxlen=REMEMBERED)
+        self._reported: deque[int] = deque()  # stamps, ns
         self._unjudged: deque[Innovation] = deque()  # by the consistency monitor
         self._newest_ns = self._published_ns = 0  # newest stamp of all, and of those before the last clearing
 
@@ -49,7 +49,9 @@ class InnovationLog:
     def take(self) -> list[Innovation]:
         """The innovations for the next output."""
         waiting, self._waiting = self._waiting, []
-        self._reported.extend(waiting)
+        self._reported.extend(innovation.stamp_ns for innovation in waiting)
+        while self._reported and self._reported[0] < self._newest_ns - REMEMBERED_NS:
+            self._reported.popleft()
         self._unjudged.extend(waiting)
         return waiting
 
@@ -76,7 +78,7 @@ class InnovationLog:
         """Of what has come since ``mark``, take back the innovations of measurements that have been counted before."""
         again = self._waiting[mark.waiting :]
         if again:
-            counted = {i.stamp_ns for i in (*self._reported, *self._waiting[: mark.waiting])}
+            counted = {*self._reported, *(i.stamp_ns for i in self._waiting[: mark.waiting])}
             self._recount(mark, [i for i in again if i.stamp_ns not in counted])
 
     def _recount(self, mark: Mark, new: Sequence[Innovation]) -> None:

@@ -13,7 +13,7 @@ SNAP_WARNING_S = 1.0  # a snap that is nearer than this is warned of: time to st
 def all_statuses(health: Health) -> list[Status]:
     """One status a part."""
     return [
-        output(health),
+        output(health.problem, health.steps),
         solver(health),
         inputs(health, "joints"),
         tracker(health),
@@ -29,10 +29,9 @@ def snap_ahead(health: Health) -> bool:
     return stability(health).level > OK
 
 
-def output(health: Health) -> Status:
-    """Whether the last output is valid, and why not."""
-    level = ERROR if health.problem else OK
-    return Status("output", level, health.problem or "valid", {"steps": str(health.steps)})
+def output(problem: str, steps: int) -> Status:
+    """Whether an output is valid, and the ``problem`` that it has; ``steps``: that have been taken."""
+    return Status("output", ERROR if problem else OK, problem or "valid", {"steps": str(steps)})
 
 
 def solver(health: Health) -> Status:
