@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ctr_dynamics.estimation.discretisation import VibrationErrors
 from ctr_dynamics.estimation.filter.ekf import RodEkf
 from ctr_dynamics.estimation.filter.filter_records import Update
 from ctr_dynamics.estimation.inputs.input_buffer import InputBuffer
@@ -98,6 +99,15 @@ class Alternatives:
         self.timing.clear()
         self._weigh()
 
+    def starts_in_motion(self, modes: VibrationErrors) -> None:
+        """The open-loop run lacks the vibration that the robot has, in its ``modes``; the filter begins again with one of any phase."""
+        self.count()
+        if self.timing.moving:
+            self.timing.begin_again(self._ekf.expected, self._ekf.delay)
+        else:
+            self.timing.starts_in_motion(modes)
+        self._weigh()
+
     def clear_model_error(self) -> None:
         """Forget what measurements told of the model's error."""
         self.count()
@@ -154,10 +164,11 @@ class Alternatives:
 
     # -- conclusions --
 
-    def conclude(self, open_loop: OpenLoopRun, k: int) -> bool:
+    def conclude(self, open_loop: OpenLoopRun, k: int, moves_as_modelled: bool = True) -> bool:
         """Whether measurements show that something else is right: the fused run is to go on from the open-loop run at step ``k``.
 
-        The filter counts on that then. Where measurements are not fused, nothing is concluded.
+        The filter counts on that then. Where measurements are not fused, nothing is concluded; nothing but the timing where the open-loop run
+        does not move as the robot does.
         """
         self.count()
         if not self._health.fusing:
@@ -167,14 +178,19 @@ class Alternatives:
             return False
         self._news = False
         again = self._health.fusing and (
-            self._follow_timing(k)
-            or self._follow_jitter(k)
+            self._follow_timing(k) or (moves_as_modelled and self._follow_other(open_loop, k))
+        )
+        self._weigh()
+        return again
+
+    def _follow_other(self, open_loop: OpenLoopRun, k: int) -> bool:
+        """Anything else than another timing."""
+        return (
+            self._follow_jitter(k)
             or self._leave_moving_frame(open_loop)
             or self._follow_model_error()
             or self._leave_refuted()
         )
-        self._weigh()
-        return again
 
     def _weigh(self) -> None:
         """How likely something else is now than the filter counts on."""

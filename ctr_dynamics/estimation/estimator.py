@@ -348,9 +348,8 @@ class Estimator:
         runs, late, stamp = self.runs, self.late, self.timeline.stamp(self.runs.k)
         moves_as_modelled = not self._settling.lacks_vibration(stamp)
         if late.lag <= late.options.reuse_lag and runs.conclude(moves_as_modelled):
-            lacking = self._settling.lacking(stamp)
-            left = self._covariance.unseen_vibration.left(*lacking) if lacking else 0.0
-            runs.fused.reinitialise(runs.open_loop, runs.k, self._vibrating(left))
+            vibrating = self._vibrating(runs.fused.alternatives.timing.lacking_m)
+            runs.fused.reinitialise(runs.open_loop, runs.k, vibrating)
             self.health.restarts += 1
             late.history.restart(runs.k)
 
@@ -440,7 +439,7 @@ class Estimator:
             vibrating = self._vibrating(max(self._largest_deviation, settling.apart))
         fused.reinitialise(open_loop, k, vibrating)
         self.health.restarts += 1
-        fused.alternatives.clear_timing()
+        fused.alternatives.starts_in_motion(self.discretisation.vibration)
         self.late.repeated = k, lambda: fused.reinitialise(open_loop, k, vibrating)
         self.late.history.record(k, always=True)
         return self._invalid(k, reason, innovations)

@@ -154,10 +154,7 @@ class Runs:
 
         ``moves_as_modelled``: whether the open-loop run moves as the robot does, but for faults. Else how measurements follow it says nothing.
         """
-        if not moves_as_modelled:
-            self.fused.alternatives.clear_timing()
-            return False
-        return self.fused.alternatives.conclude(self.open_loop, self.k)
+        return self.fused.alternatives.conclude(self.open_loop, self.k, moves_as_modelled)
 
     def judge(self, result: StepResult) -> None:
         """Count the outcome of a step; after too many failures in a row there is no state to go on from."""

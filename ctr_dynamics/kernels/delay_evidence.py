@@ -2,6 +2,8 @@
 
 import math
 
+import numpy as np
+
 from ctr_dynamics.kernels.compiler import njit
 
 compiled = njit(cache=True, nogil=True, error_model="numpy")
@@ -33,6 +35,35 @@ def weigh_delays(residual, before, told, level, evidence):
         evidence[i] = decay * old_evidence[i] + density_about(old_level[i], residual[i], total, spread)
         for axis in range(3):
             level[i, axis] = old_level[i, axis] + gain * (residual[i, axis] - old_level[i, axis])
+
+
+@compiled
+def weigh_vibrating(residual, transition, seen, gains, totals, noise, decay, states, evidence):
+    """Evidence for delays beside vibrations that the open-loop run lacks, with another measurement.
+
+    ``residual`` (d, 3): m, how far it lies from that run with every delay. ``transition`` (n, n): of level and vibrations of an axis since the last
+    one, ``seen`` (n,): which of them a measurement shows. ``gains`` (g, n) and ``totals`` (g,) m^2: of every amplitude. ``noise``: m^2.
+    ``decay``: part of the evidence that counts on. Moves ``states`` (g, d, 3, n) and ``evidence`` (g, d).
+    """
+    size = len(seen)
+    moved = np.empty(size)
+    for g in range(len(totals)):
+        spread = 3.0 * math.log(totals[g] / noise)
+        for i in range(len(residual)):
+            square = 0.0
+            for axis in range(3):
+                expected = 0.0
+                for row in range(size):
+                    value = 0.0
+                    for column in range(size):
+                        value += transition[row, column] * states[g, i, axis, column]
+                    moved[row] = value
+                    expected += seen[row] * value
+                apart = residual[i, axis] - expected
+                square += apart * apart
+                for row in range(size):
+                    states[g, i, axis, row] = moved[row] + gains[g, row] * apart
+            evidence[g, i] = decay * evidence[g, i] - 0.5 * (square / totals[g] + spread)
 
 
 @compiled

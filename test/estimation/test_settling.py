@@ -164,21 +164,6 @@ def test_after_a_start_in_motion_the_open_loop_run_tells_nothing_of_the_tracker_
     assert not settling.lacks_vibration(5 * MS)
 
 
-def test_what_the_open_loop_run_lacks_stays_known_after_measurements_have_not_agreed():
-    """How far a measurement lay from it soon after the start; a latency alone may move them apart later."""
-    settling, longest = Settling(NOISE, 2e-4), round(SettlingOptions().longest_s * 1e9)
-    assert settling.lacking(0) is None
-    settling.start(0, np.zeros(4))
-    settling.watch(10 * MS, np.array([0.1, 0.0, 0.0, 0.0]))
-    for ms, apart in ((20, 3e-3), (100, 4e-3), (900, 9e-3)):
-        settling.take([innovation(ms, (apart, 0.0, 0.0), "outside the gate")])
-    assert settling.lacking(500 * MS) == pytest.approx((4e-3, 0.5))
-    assert "have not agreed" in settling.problem(longest + 1)
-    assert settling.lacking(longest + 1) == pytest.approx((4e-3, 1.2))
-    settling.start(longest + 2, np.zeros(4))
-    assert settling.lacking(longest + 3) is None
-
-
 def test_nothing_is_seen_of_the_motion_until_joints_and_measurements_have_told():
     settling = Settling(NOISE, 2e-4)
     assert settling.unseen(0) is None

@@ -297,17 +297,6 @@ def test_a_robot_that_may_move_when_the_model_starts_is_off_by_as_much_as_is_ask
     np.testing.assert_allclose(farther, 4.0 * covariance)
 
 
-def test_a_vibration_that_the_model_lacks_dies_down_by_the_damping_of_its_modes():
-    found, period = UnseenVibration(vibration_errors(), 3e-3), 0.1
-    # of the variance, the modes have the squares of their reach
-    part = np.array([16.0, 1.0]) / 17.0
-    for apart, size in ((0.0, 3e-3), (6e-3, 6e-3)):
-        for elapsed in (0.0, period, 10.0 * period):
-            expected = size * np.sqrt(part @ np.exp(2.0 * MU[:2].real * elapsed))
-            assert found.left(apart, elapsed) == pytest.approx(expected)
-    assert UnseenVibration(VibrationErrors.none(), 3e-3).left(0.0, 1.0) == pytest.approx(3e-3)
-
-
 def test_a_phase_that_is_certain_or_measured_exactly_adds_nothing_nor_does_a_mode_too_fast_for_the_steps():
     slow = Modes(np.array([20.0, 90.0]), np.zeros(2), np.zeros(2), np.array([1e-2, 0.0]), np.eye(3)[:2])
     fast = slow._replace(frequency_hz=np.array([200.0, 300.0]))

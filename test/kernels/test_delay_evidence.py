@@ -4,7 +4,12 @@ import numpy as np
 import pytest
 
 from ctr_dynamics.estimation.monitoring.densities import log_density
-from ctr_dynamics.kernels.delay_evidence import compare_delays, weigh_changes, weigh_delays
+from ctr_dynamics.kernels.delay_evidence import (
+    compare_delays,
+    weigh_changes,
+    weigh_delays,
+    weigh_vibrating,
+)
 
 NOISE, TOTAL, GAIN, DECAY = 6e-8, 9e-8, 0.3, 0.99
 
@@ -50,6 +55,24 @@ def test_changes_are_weighed_as_by_numpy(rng):
     np.testing.assert_array_equal(begins_ns, np.where(new, now_ns, began_ns))
     was = np.where(new[:, None], now_level, before)
     np.testing.assert_allclose(level, was + GAIN * (residual - was), rtol=1e-12)
+
+
+def test_delays_beside_vibrations_are_weighed_as_by_numpy(rng):
+    amplitudes, size = 4, 7
+    residual, states = rng.normal(0, 4e-4, (30, 3)), rng.normal(0, 4e-4, (amplitudes, 30, 3, size))
+    evidence = rng.normal(0, 5, (amplitudes, 30))
+    transition, seen = rng.normal(0, 0.4, (size, size)), rng.integers(0, 2, size).astype(float)
+    gains, totals = rng.uniform(0, 0.5, (amplitudes, size)), TOTAL * rng.uniform(1, 4, amplitudes)
+    found, after = evidence.copy(), states.copy()
+    weigh_vibrating(residual, transition, seen, gains, totals, NOISE, DECAY, after, found)
+    before = states @ transition.T
+    apart = residual - before @ seen
+    np.testing.assert_allclose(
+        after, before + apart[..., None] * gains[:, None, None], rtol=1e-11, atol=1e-15
+    )
+    for g, total in enumerate(totals):
+        expected = DECAY * evidence[g] + log_density(lengths(apart[g]), total, NOISE)
+        np.testing.assert_allclose(found[g], expected, rtol=1e-11)
 
 
 def compared(delays, inside, ways, present, least, prior, now):

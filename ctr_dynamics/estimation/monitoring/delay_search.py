@@ -76,6 +76,20 @@ class Waiting(NamedTuple):
     present_s: float
 
 
+class Vibrations(NamedTuple):
+    """What is known of vibrations that the open-loop run lacks; see :mod:`ctr_dynamics.estimation.monitoring.moving_start`.
+
+    Attributes:
+        states: (g, d, 3, n) m, level and both phases of every mode, by amplitude, delay and axis.
+        covariance: (g, n, n) m^2, of each axis.
+        evidence: (g, d) logarithm.
+    """
+
+    states: Floats
+    covariance: Floats
+    evidence: Floats
+
+
 class Evidence(NamedTuple):
     """What the measurements up to ``stamp_ns`` say.
 
@@ -85,6 +99,7 @@ class Evidence(NamedTuple):
         changed: (d,) the same of a latency that has changed to every delay, at the time that speaks most for it; began_ns: (d,) stamp before that;
             changed_level: (d, 3) m, the level since then.
         moved: the same of a tracker that has been moved instead.
+        vibrations: that the open-loop run lacks since a start in motion; None where none are looked for.
     """
 
     stamp_ns: int
@@ -96,6 +111,7 @@ class Evidence(NamedTuple):
     began_ns: NDArray[np.int64]
     changed_level: Floats
     moved: Moved
+    vibrations: Vibrations | None = None
 
 
 class Belief(NamedTuple):

@@ -74,7 +74,7 @@ class Settling:
         self._newest_ns = 0  # stamp of the newest measurement
         self._moving_ns: int | None = None  # when the estimate started in motion
         self.begun = self.vibrates = False
-        self.apart = self._apart_at_start = 0.0
+        self.apart = 0.0
         self._start_ns: int | None = None
         self._residual: Floats | None = None
         self._compared = False  # two measurements
@@ -108,10 +108,7 @@ class Settling:
         """The model does not know how the robot moves at ``stamp_ns``, and ``why``, in words; ``vibrating``: it may vibrate as the model does not."""
         self._since_ns, self._why, self._agreed, self._measured = stamp_ns, why, 0, False
         self.begun = self.vibrates = vibrating
-        if why == STARTED_IN_MOTION:
-            self._moving_ns, self._apart_at_start = stamp_ns, self.apart
-        elif why != DISAGREED:  # what was lacking then still is
-            self._moving_ns = None
+        self._moving_ns = stamp_ns if why == STARTED_IN_MOTION else None
 
     def _rotated(self, elapsed_ns: int) -> float:
         """rad, by which a joint has turned in that time after a start where the robot moves: the same rate, and more than noise."""
@@ -154,9 +151,6 @@ class Settling:
         start, motion = self._start_ns, innovation.motion
         if motion is not None:
             self.apart = max(self.apart, float(np.linalg.norm(motion.residual)))
-            moving = self._moving_ns
-            if moving is not None and innovation.stamp_ns <= moving + self.options.compared_s * 1e9:
-                self._apart_at_start = self.apart
         if start is None or motion is None or innovation.stamp_ns < start:
             return
         if innovation.stamp_ns > start + self.options.compared_s * 1e9:
@@ -174,16 +168,6 @@ class Settling:
     def lacks_vibration(self, stamp_ns: int) -> bool:
         """Whether the open-loop run lacks a vibration at ``stamp_ns`` that the robot has: how measurements follow it tells nothing of the tracker."""
         return self._moving_ns is not None and stamp_ns <= self._moving_ns + self.options.longest_s * 1e9
-
-    def lacking(self, stamp_ns: int) -> tuple[float, float] | None:
-        """How the open-loop run lacks a vibration that the robot has since it moved when the model started; None where it lacks none.
-
-        Returns:
-            m, how far a measurement lay from that run at most soon after the start, and s from the start to ``stamp_ns``.
-        """
-        if self._moving_ns is None:
-            return None
-        return self._apart_at_start, (stamp_ns - self._moving_ns) * 1e-9
 
     def unseen(self, stamp_ns: int) -> float | None:
         """None where something has told how the robot moved when the model started: two joint states, and two measurements, of which the

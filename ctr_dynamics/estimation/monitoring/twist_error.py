@@ -146,7 +146,6 @@ class UnseenVibration:
 
     def __init__(self, modes: VibrationErrors, deviation: float) -> None:
         self._deviation, self._covariance = deviation, np.zeros((12, 12))
-        self._part, self._decay = np.ones(1), np.zeros(1)  # of the variance, by mode; of the amplitude, 1/s
         of_one = of_modes(modes)
         at_tip = of_one.reshape(-1, 12, 12)[:, range(3), range(3)].sum(axis=1)
         moves = at_tip > 0.0
@@ -154,16 +153,11 @@ class UnseenVibration:
             self._covariance[range(3), range(3)] = deviation**2 / 3.0
             return
         part = modes.reach[moves] ** 2 / (modes.reach[moves] ** 2).sum()
-        self._part, self._decay = part, -modes.exponent[moves].real
         add_by_modes(deviation**2 * part / at_tip[moves], of_one[moves], self._covariance)
 
     def inflate(self, covariance: Floats, apart: float) -> None:
         """Add it to the ``covariance`` (12, 12) of the tip, in place; ``apart``: m, that a measurement has shown."""
         covariance += max(apart / self._deviation, 1.0) ** 2 * self._covariance
-
-    def left(self, apart: float, elapsed_s: float) -> float:
-        """m, deviation of the tip by what is left of it ``elapsed_s`` after the start; ``apart``: see :meth:`inflate`."""
-        return max(apart, self._deviation) * math.sqrt(self._part @ np.exp(-2.0 * elapsed_s * self._decay))
 
 
 class EncoderVibration:
