@@ -54,12 +54,16 @@ def test_a_tracker_on_time_is_not_late(amplitude):
     search = measured(moving_start(), 0.0, amplitude, told=-2.0)
     assert search.always(0.0) is None
     assert search.belief(0.0).late < 0.01
+    assert search.shows(0.0)
+    assert not search.shows(0.08)
 
 
 def test_a_vibration_alone_tells_nothing_of_a_delay():
     """What the delay moves, any phase explains."""
     search = measured(moving_start(), 0.08, 4e-3, told=-2.0, path=lambda t: np.zeros((len(t), 3)))
     assert search.belief(0.0).late < 0.05
+    assert not search.shows(0.0)
+    assert not moving_start().shows(0.0)
 
 
 def test_the_vibration_is_over_when_it_is_less_than_is_measured():

@@ -29,6 +29,7 @@ def test_outputs_count_again_after_measurements_in_a_row():
         settling.take([innovation(1101 + i)])
     assert settling.problem(1200 * MS)
     settling.take([innovation(1201)])
+    assert settling.problem(1202 * MS, on_time=False), "a late tracker agrees as well"
     assert not settling.problem(1202 * MS)
     settling.begin(2000 * MS, "again")
     assert settling.problem(1999 * MS + round(options.longest_s * 1e9))
@@ -183,11 +184,14 @@ def test_nothing_is_seen_of_the_motion_until_joints_and_measurements_have_told()
 
 @pytest.mark.parametrize("since_s", [1.02, 1.1, 1.33])
 def test_a_start_in_a_vibration_follows_it_soon(since_s):
-    """The weight has just been cut, the joints rest: measurements alone tell how the robot vibrates. The model alone is centimetres off."""
-    run = play([m for m in bag_messages("clean_release", since_s + 1.5) if m.stamp >= since_s * 1e9])
+    """The weight has just been cut, the joints rest: measurements alone tell how the robot vibrates. The model alone is centimetres off.
+
+    A late tracker would show the same with another phase, so outputs wait as long as they do at most.
+    """
+    run = play([m for m in bag_messages("clean_release", since_s + 2.0) if m.stamp >= since_s * 1e9])
     first = next(out for out in run.outputs if not out.valid)
     assert first.stamp_ns - START_NS < (since_s + 0.08) * 1e9
-    error, steps = truth_error(run, "clean_release", "p_trk", since_s + 0.9)
+    error, steps = truth_error(run, "clean_release", "p_trk", since_s + 1.4)
     assert all(run.outputs[k].valid for k in steps)
     alone = run.column("predicted_position")[steps] - (run.column("tip_position")[steps] - error)
     assert rms(alone) > 4e-3
@@ -201,7 +205,7 @@ def test_a_start_in_a_vibration_follows_it_soon(since_s):
 
 def test_outputs_wait_where_the_known_load_has_changed_in_a_gap_of_everything():
     """A weight is cut while nothing is recorded, as where a file of a split bag is lost: nobody knows when, so the vibration is not known."""
-    messages = [m for m in bag_messages("clean_release", 3.0) if not 0.99e9 < m.stamp < 1.9e9]
+    messages = [m for m in bag_messages("clean_release", 4.0) if not 0.99e9 < m.stamp < 1.9e9]
     run = play(messages)
     error, steps = truth_error(run, "clean_release", "p_trk")
     distance = np.linalg.norm(error, axis=1)

@@ -29,6 +29,7 @@ Floats = NDArray[np.float64]
 MODES = 4  # slowest ones: those that the filter may begin with
 AMPLITUDES = 0.5 * 2.0 ** np.arange(7)  # by the noise, of one axis: up to 32 times
 MISTUNED = 0.03  # relative error of a frequency, at least: poses and insertions change it by that
+UNLIKELY = math.log(0.1)  # odds of another delay, from which on measurements have shown the present one
 SETTLED_S = 0.2  # for which amplitudes are compared before any is believed to be over
 MOVING_START = replace(DelaySearchOptions(), changes=False)
 
@@ -125,6 +126,21 @@ class MovingStart(DelaySearch):
         states, evidence = last.states.copy(), last.evidence.copy()
         weigh_vibrating(residual, transition, seen, gains, totals, noise, decay, states, evidence)
         return Vibrations(states, covariance, evidence)
+
+    def shows(self, present_s: float) -> bool:
+        """Whether measurements show that the tracker has the delay ``present_s`` (s).
+
+        All others together are unlikely then, were they as likely before. The filter is not asked: it foretells well with a late tracker, too.
+        """
+        if len(self._evidence) < 2:
+            return False
+        known, near = self._evidence[-1].delays, np.abs(self.delays - present_s) <= self.options.least_s
+        if not near.any() or near.all():
+            return True
+        present, other = (
+            np.logaddexp.reduce(part) - math.log(len(part)) for part in (known[near], known[~near])
+        )
+        return bool(other - present < UNLIKELY)
 
     @property
     def vibrates_m(self) -> float:

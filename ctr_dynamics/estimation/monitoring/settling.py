@@ -179,13 +179,13 @@ class Settling:
             return None
         return self.apart
 
-    def problem(self, stamp_ns: int) -> str:
-        """Why the output of ``stamp_ns`` does not count yet; empty where it does."""
+    def problem(self, stamp_ns: int, on_time: bool = True) -> str:
+        """Why the output of ``stamp_ns`` does not count yet; empty where it does. ``on_time``: whether the tracker is seen not to be late."""
         if self._since_ns is None or (self._why == DISAGREED and not self._measured):
             return ""
         options = self.options
         waited = (stamp_ns - self._since_ns) * 1e-9
-        if self._agreed >= options.agreeing or waited > options.longest_s:
+        if (self._agreed >= options.agreeing and on_time) or waited > options.longest_s:
             astray = self._measured and self._agreed < options.agreeing and self._why != DISAGREED
             self._since_ns = None
             if not astray:

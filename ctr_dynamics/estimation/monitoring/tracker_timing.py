@@ -78,6 +78,10 @@ class TrackerTiming:
         self.clear()
         self.moving = MovingStart(*self._moves, modes)
 
+    def on_time(self, delay: float) -> bool:
+        """Whether measurements show that the tracker has that ``delay`` (s); also where nothing makes that doubtful."""
+        return self.moving is None or self.moving.shows(delay)
+
     @property
     def lacking_m(self) -> float:
         """m, deviation of the tip by vibrations that the open-loop run lacks."""
