@@ -103,6 +103,8 @@ def test_no_answer_is_one_line(tmp_path, monkeypatch, capsys):
         ([INNER.replace("E=52GPa", "E=52kPa")], "is outside"),
         ([INNER.replace("E=52GPa+-0.4%", "E=52GPa+--1%")], "is not 0 or more"),
         ([INNER + ", EI=0.003N m^2"], "both EI and E are given"),
+        ([INNER + ", od=1.2mm"], "od is given twice"),
+        ([INNER.replace("radius=109.0037mm+-0.3%", "radius=0mm")], "radius 0 mm is none"),
     ],
 )
 def test_sheets_that_cannot_be_are_rejected(tmp_path, capsys, tubes, message):
@@ -112,6 +114,20 @@ def test_sheets_that_cannot_be_are_rejected(tmp_path, capsys, tubes, message):
     assert message in err
     assert err.count("\n") == 1
     assert not path.exists()
+
+
+def test_a_diameter_of_the_tip_without_its_mass_is_rejected(tmp_path, capsys):
+    path = tmp_path / "r.yaml"
+    assert new(path, "--tube", INNER, "--tip-diameter", "3mm") == 2
+    assert "a diameter is given and no mass" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("given", [[], REST])
+def test_a_rest_position_that_nobody_gave_is_said(tmp_path, capsys, given):
+    path = tmp_path / "r.yaml"
+    assert new(path, "--tube", INNER, "--tube", OUTER, *given) == 0
+    assert ("Rest position: bases 10 mm apart" in capsys.readouterr().err) == (not given)
+    assert ("Rest position" in path.read_text()) == (not given)
 
 
 def test_stiffnesses_and_curvature_as_they_are_published(tmp_path):

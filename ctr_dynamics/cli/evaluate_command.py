@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -43,6 +44,11 @@ def evaluate(
         if key in found:
             print(_row(label, found[key], factor, unit, found["nees"].get(nees)))
     print(f"{found['steps']} valid steps compared")
+    if found["outside"]:
+        print(
+            f"ctr-dynamics: note: {found['outside']} valid steps lie outside the time of the truth; is it that of this bag?",
+            file=sys.stderr,
+        )
     return 0
 
 

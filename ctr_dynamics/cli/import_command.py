@@ -78,7 +78,7 @@ def import_(
         print(f"{kind:<8}{len(log.stamp_ns)} rows, {span_s:.3f} s, {', '.join(log.names)}")
         if log.faults.count:
             print(
-                f"ctr-dynamics: {given[kind]}: {log.faults.count} rows left out: {'; '.join(log.faults.examples)}",
+                f"ctr-dynamics: {given[kind]}: {log.faults.count} rows left out: {log.faults}",
                 file=sys.stderr,
             )
     print(f"output  {output}, {count} messages")

@@ -134,9 +134,12 @@ def new(options: NewOptions) -> int:
         sheets.Sheet(options.name or file.stem, tuple(tubes), options.gravity, axes=options.axes), **values
     )
     robot = sheets.robot_from_sheet(sheet)
+    said = sheets.ASSUMED if sheet.beta and sheet.alpha else (*sheets.ASSUMED, sheets.REST_ASSUMED)
     with atomic_file(file) as temporary:
-        temporary.write_text(sheets.robot_file_text(robot, sheets.ASSUMED), encoding="utf-8")
+        temporary.write_text(sheets.robot_file_text(robot, said), encoding="utf-8")
     _show(robot)
+    if not (sheet.beta and sheet.alpha):
+        print(f"ctr-dynamics: note: {sheets.REST_ASSUMED}", file=sys.stderr)
     print(f"output  {file}")
     return 0
 
@@ -206,6 +209,11 @@ def _rest(robot: Robot) -> bool:
         print("ctr-dynamics: warning: no static equilibrium was found at rest", file=sys.stderr)
         return False
     x, y, z = 1e3 * found.tip_position
+    beta, alpha = (
+        ", ".join(f"{factor * value:.2f}" for value in values.value)
+        for factor, values in ((1e3, robot.rest.beta), (57.29577951308232, robot.rest.alpha))
+    )
+    print(f"rest         beta {beta} mm, alpha {alpha} deg")
     print(f"tip at rest  {x:.2f}, {y:.2f}, {z:.2f} mm in ctr_base")
     return True
 

@@ -7,11 +7,12 @@ from difflib import get_close_matches
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError
+from pydantic import Field, FiniteFloat, ValidationError, field_validator
 
 from ctr_dynamics.errors import InputError
 from ctr_dynamics.io.text_files import decode_text, read_bytes
 from ctr_dynamics.io.yaml_files import read_yaml
+from ctr_dynamics.robot.quantity import Block, problem, problem_line
 from ctr_dynamics.units import factor, units_of
 
 Kind = Literal["joints", "tracker", "load"]
@@ -21,16 +22,11 @@ EULER = ("roll", "pitch", "yaw")
 FORCE, TORQUE = ("fx", "fy", "fz"), ("mx", "my", "mz")
 _JOINT = re.compile(r"tube[1-9]_(rotation|translation)")
 _FRAME = ("frame", "framenumber", "frame_number", "frame number")
+_AGAIN = re.compile(r"(.+)#(\d+)")  # a name that has been there before
 _TIME = ("t", "time", "stamp", "timestamp")
 _ALIASES = {"tx": "x", "ty": "y", "tz": "z", "px": "x", "py": "y", "pz": "z", "q0": "qw"}
 _BRACKETS = re.compile(r"(.+?)\s*[\[(]\s*(.+?)\s*[\])]")
 Vector = Annotated[list[FiniteFloat], Field(min_length=3, max_length=3)]
-
-
-class Block(BaseModel):
-    """Part of a layout file: no unknown keys."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
 
 class Column(Block):
@@ -40,6 +36,15 @@ class Column(Block):
     unit: str = ""
     scale: FiniteFloat = 1.0
     offset: FiniteFloat = 0.0
+
+    @field_validator("scale")
+    @classmethod
+    def _not_zero(cls, scale: float) -> float:
+        if not scale:
+            raise problem(
+                "0 makes every value the offset; write the factor from the cell to the value, such as -1"
+            )
+        return scale
 
 
 class TimeColumn(Block):
@@ -127,9 +132,7 @@ def read_layout(path: Path) -> Layout:
     try:
         layout = Layout.model_validate(data)
     except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        place = ".".join(str(part) for part in first["loc"])
-        raise InputError(f"{place}: {first['msg']}", do="see docs/data.md", where=str(path)) from None
+        raise InputError(problem_line(error), do="see docs/data.md", where=str(path)) from None
     for kind in ("joints", "tracker", "load"):
         source: Source | None = getattr(layout, kind)
         for name, column in (source.values if source else {}).items():
@@ -138,7 +141,7 @@ def read_layout(path: Path) -> Layout:
                     f"{kind}.values holds '{name}'", do=f"known names: {_names(kind)}", where=str(path)
                 )
             if si_unit(name) != "1":
-                factor(column.unit or "none", si_unit(name), f"{path}: {kind}.values.{name}")
+                _check_unit(column.unit, name, f"{path}: {kind}.values.{name}")
     return layout
 
 
@@ -152,17 +155,38 @@ def layout_of_header(kind: Kind, header: list[str], where: str) -> Source:
     values: dict[str, Column] = {}
     for cell in header:
         name, unit = _split(cell)
+        if again := _AGAIN.fullmatch(cell):
+            name, unit = _split(again[1])
+            if known(kind, name) or name in _TIME:
+                raise InputError(
+                    f"column '{again[1]}' is there {again[2]} times",
+                    do="leave one of them, or give --layout",
+                    where=where,
+                )
+            continue
         if name in _TIME:
             if unit:
                 factor(unit, "s", f"{where}: column '{cell}'")
             time = time or TimeColumn(column=cell, unit=unit)
         elif known(kind, name):
             if si_unit(name) != "1":
-                factor(unit or "none", si_unit(name), f"{where}: column '{cell}'")
+                _check_unit(unit, name, f"{where}: column '{cell}'")
             values.setdefault(name, Column(column=cell, unit=unit))
     if time is None:
         raise InputError(f"no column of time among {_some(header)}", do=_time_cure(header), where=where)
     return Source(time=time, values=values)
+
+
+def _check_unit(unit: str, name: str, where: str) -> None:
+    """That a column of the value ``name`` has a unit of its kind.
+
+    Raises:
+        InputError: it has another one, or none.
+    """
+    si = si_unit(name)
+    if not unit:
+        raise InputError("has no unit", do=f"write one of {', '.join(units_of(si))}", where=where)
+    factor(unit, si, where)
 
 
 def _time_cure(header: list[str]) -> str:
@@ -189,6 +213,15 @@ def check_complete(kind: Kind, source: Source, header: list[str], where: str) ->
             near = get_close_matches(column, header, 1)
             hint = f"did you mean '{near[0]}'?" if near else f"the file has {_some(header)}"
             raise InputError(f"no column '{column}'", do=hint, where=where)
+    used: dict[str, str] = {}
+    for name, given in source.values.items():
+        if given.column in used:
+            raise InputError(
+                f"column '{given.column}' is that of {used[given.column]} and of {name}",
+                do="name one column for each",
+                where=where,
+            )
+        used[given.column] = name
     names = set(source.values)
     if kind == "joints":
         numbers = {int(name[4]) for name in names}

@@ -63,6 +63,7 @@ RELATIVE_START_S = 1_000_000_000  # stamps of such logs begin about here; a stam
 MAX_STAMP_S = 2**31 - 1  # what a ROS stamp holds
 RATES_HZ = {"joints": (5.0, 5000.0), "tracker": (1.0, 2000.0), "load": (0.0, 1e5)}
 QUATERNION_LIMIT = 0.05
+ALIKE = 0.1  # of the rows: times that stand still so often have been rounded. A driver that repeats itself now and then has fewer
 
 
 @dataclass
@@ -110,7 +111,7 @@ def read_log(kind: Kind, path: Path, layout: Layout, frame: str) -> Log:
     times: list[Decimal] = []
     rows: list[list[float]] = []
     lines: list[int] = []
-    last = Decimal("-Infinity")
+    last, alike = Decimal("-Infinity"), 0
     wanted = [source.time.column, *(source.values[name].column for name in names)]
     if source.time.frames:
         wanted.append(source.time.frames)
@@ -143,6 +144,7 @@ def read_log(kind: Kind, path: Path, layout: Layout, frame: str) -> Log:
         elif order <= last:
             what = f"time {cells[0][:30]}" if number_of_frame is None else f"frame {number_of_frame:g}"
             faults.add(number, f"{what} is not later than the row before")
+            alike += order == last
         else:
             times.append(time)
             rows.append(row)
@@ -152,8 +154,14 @@ def read_log(kind: Kind, path: Path, layout: Layout, frame: str) -> Log:
                 frames.append(number_of_frame)
     if not rows:
         raise InputError(
-            f"no usable row ({faults.count} left out; {'; '.join(faults.examples) or 'no rows at all'})",
+            f"no usable row ({faults.count} left out; {faults if faults.count else 'no rows at all'})",
             do="mend the file",
+            where=where,
+        )
+    if alike > ALIKE * (len(rows) + alike):
+        raise InputError(
+            f"{alike} of {len(rows) + alike} rows have the time of the row before",
+            do="write times with all their digits, at least to the millisecond",
             where=where,
         )
     log = Log(kind, names, [], np.array(rows), faults)
@@ -239,6 +247,10 @@ def _into_base(log: Log, source: Source, frame: str, where: str) -> None:
     Raises:
         InputError: the frame is not stated, or is another one and its registration is not given.
     """
+    if source.frame and frame and source.frame != frame:
+        raise InputError(
+            f"--frame says '{frame}' and the layout '{source.frame}'", do="leave one of them out", where=where
+        )
     frame = source.frame or frame
     rotation, translation = source.registration_rotation_rad, source.registration_translation_m
     if not frame:

@@ -13,6 +13,7 @@ from ctr_dynamics.errors import InputError
 from ctr_dynamics.io.text_files import check_regular
 
 MAX_LINE = 100_000  # characters; longer is no log
+EXAMPLES = 5  # rows that are named
 _DELIMITERS = ",;\t"
 _DECIMAL_COMMA = re.compile(r"[-+]?\d*,\d+(?:[eE][-+]?\d+)?")
 
@@ -25,9 +26,14 @@ class Faults:
     examples: list[str] = field(default_factory=list)
 
     def add(self, line: int, why: str) -> None:
+        """Count the row of that line, which is left out."""
         self.count += 1
-        if len(self.examples) < 5:
+        if len(self.examples) < EXAMPLES:
             self.examples.append(f"line {line}: {why}")
+
+    def __str__(self) -> str:
+        more = self.count - len(self.examples)
+        return "; ".join([*self.examples, *([f"and {more} more"] if more else [])])
 
 
 class CsvTable:
@@ -63,8 +69,8 @@ class CsvTable:
             self._first = 0
         elif all(_is_number(cell) for cell in cells):
             raise InputError(
-                "the first line holds numbers, not names of columns",
-                do="add a header line, or give a layout with header_line: 0 and columns '1', '2', ..",
+                f"line {self._first} holds numbers, not names of columns",
+                do="name the line with the names as header_line in a layout; 0 where there is none, and columns are '1', '2', ..",
                 where=str(path),
             )
 
@@ -106,6 +112,10 @@ class CsvTable:
                     continue
                 if len(cells) < len(self.header):
                     faults.add(number, f"{len(cells)} cells for {len(self.header)} columns")
+                    continue
+                if any(cells[len(self.header) :]):  # an empty one is what a separator at the end leaves
+                    comma = " (decimal commas need another separator)" if self.delimiter == "," else ""
+                    faults.add(number, f"{len(cells)} cells for {len(self.header)} columns{comma}")
                     continue
                 chosen = [cells[place] for place in places]
                 if self.delimiter != ",":

@@ -32,7 +32,7 @@ class TimeCells:
         """The time in a cell.
 
         Raises:
-            InputError: the first cell is a number, and neither unit nor rate are given.
+            InputError: the first cell is a number, and neither unit nor rate are given; or one that counts frames is not whole.
             InvalidOperation: no time of the kind that the first cell was.
         """
         kind = "date" if _DATE.fullmatch(cell) else "clock" if _CLOCK.fullmatch(cell) else "number"
@@ -44,7 +44,16 @@ class TimeCells:
             raise InvalidOperation
         if kind == "date":
             return _date(cell)
-        return self._clock(cell) if kind == "clock" else Decimal(cell)
+        if kind == "clock":
+            return self._clock(cell)
+        number = Decimal(cell)
+        if self._column.rate_hz is not None and number.is_finite() and number != number.to_integral_value():
+            raise InputError(
+                f"column '{self._column.column}' holds {cell[:30]}, and frames have whole numbers",
+                do="give the column's unit in place of rate_hz",
+                where=self._where,
+            )
+        return number
 
     def _begin(self) -> None:
         column = self._column

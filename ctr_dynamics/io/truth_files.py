@@ -15,6 +15,7 @@ from ctr_dynamics.io.atomic_files import atomic_file
 from ctr_dynamics.io.text_files import check_regular
 
 Floats = NDArray[np.float64]
+TRUTH = "give an .npz file, as `ctr-dynamics simulate --truth` writes it"
 
 
 @dataclass(frozen=True)
@@ -71,7 +72,7 @@ def read_truth(path: Path) -> Truth:
         InputError: not such a file, or its arrays have other shapes, are not finite, or their times do not rise.
     """
     where = str(path)
-    check_regular(path, "give an .npz file, as `ctr-dynamics simulate --truth` writes it")
+    check_regular(path, TRUTH)
     try:
         with np.load(path, allow_pickle=False) as data:
             t = np.asarray(data["t"], dtype=float)
@@ -79,8 +80,10 @@ def read_truth(path: Path) -> Truth:
                 key: np.asarray(data[name], dtype=float) for key, (name, _) in _ARRAYS.items() if name in data
             }
             start_ns = int(data["start_ns"]) if "start_ns" in data else None
-    except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
-        raise InputError(f"cannot be read as a truth file ({error})", where=where) from None
+    except KeyError as error:
+        raise InputError(f"is no truth file ({error.args[0]})", do=TRUTH, where=where) from None
+    except (OSError, ValueError, TypeError, EOFError, zipfile.BadZipFile):
+        raise InputError("is no truth file, or a damaged one", do=TRUTH, where=where) from None
     if t.ndim != 1 or len(t) < 2 or not np.isfinite(t).all() or (np.diff(t) <= 0.0).any():
         raise InputError("t holds no rising times", do="give at least two times in s", where=where)
     if "position" not in found:

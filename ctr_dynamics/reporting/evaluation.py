@@ -34,10 +34,11 @@ def evaluate(outputs: Path, truth_file: Path) -> dict[str, Any]:
         truth_file: see :func:`ctr_dynamics.io.truth_files.read_truth`.
 
     Returns:
-        ``steps`` compared; ``position_m`` (fused) and ``predicted_m`` (open loop), ``tracker_position_m`` (fused against what an ideal tracker
-        reports, where the truth has it), ``orientation_rad`` and ``velocity_m_s``: each with ``rms``, ``mean`` and ``max`` of the length of the
-        error. ``nees`` of ``position``, ``orientation`` and ``velocity``: mean per degree of freedom (1 for right covariances), and
-        ``beyond_3_sigma``, the share of the steps beyond three deviations (0.03 in three dimensions for a normal error).
+        ``steps`` compared, and those ``outside`` the time of the truth; ``position_m`` (fused) and ``predicted_m`` (open loop),
+        ``tracker_position_m`` (fused against what an ideal tracker reports, where the truth has it), ``orientation_rad`` and ``velocity_m_s``: each
+        with ``rms``, ``mean`` and ``max`` of the length of the error. ``nees`` of ``position``, ``orientation`` and ``velocity``: mean per degree of
+        freedom (1 for right covariances), and ``beyond_3_sigma``, the share of the steps beyond three deviations (0.03 in three dimensions for a
+        normal error).
 
     Raises:
         InputError: no outputs, or none in the time of the truth.
@@ -64,7 +65,7 @@ def evaluate(outputs: Path, truth_file: Path) -> dict[str, Any]:
         )
     stamps, numbers = poses.stamps[inside], poses.numbers[inside]
     covariance = numbers[:, 7:].reshape(-1, 6, 6)
-    result["steps"] = len(stamps)
+    result["steps"], result["outside"] = len(stamps), int((~inside).sum())
     error = numbers[:, :3] - at(truth.position, stamps)
     result["position_m"] = _sizes(error)
     nees = {"position": _nees(error, covariance[:, :3, :3])}

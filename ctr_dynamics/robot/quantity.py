@@ -9,7 +9,15 @@ from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, BeforeValidator, ConfigDict, WrapValidator, field_validator, model_validator
+from pydantic import (
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    ValidationError,
+    WrapValidator,
+    field_validator,
+    model_validator,
+)
 from pydantic_core import PydanticCustomError
 
 from ctr_dynamics.units import FACTORS
@@ -20,6 +28,28 @@ Floats = NDArray[np.float64]
 def problem(text: str) -> PydanticCustomError:
     """A validation error whose text is shown as it is."""
     return PydanticCustomError("robot", "{text}", {"text": text})
+
+
+def problem_line(error: ValidationError) -> str:
+    """The first problem of a file with its key path and value, and how many more there are."""
+    errors = error.errors(include_url=False, include_context=True)
+    first = errors[0]
+    path = ""
+    for part in first["loc"]:
+        # pydantic puts validator names of unions into the path; keys and indices are what the file has.
+        if isinstance(part, int):
+            path += f"[{part}]"
+        elif "[" not in str(part):
+            path += f".{part}" if path else str(part)
+    text = first["msg"]
+    if first["type"] != "robot":
+        text = text.removeprefix("Value error, ")
+        text = f"{text[0].lower()}{text[1:]}"
+        value = first.get("input")
+        if isinstance(value, (str, int, float, type(None))):
+            text += f", got {value!r}"
+    line = f"{path}: {text}" if path else text
+    return line + (f" (and {len(errors) - 1} more)" if len(errors) > 1 else "")
 
 
 def number(x: Any) -> float:
@@ -43,7 +73,7 @@ Number = Annotated[float, BeforeValidator(number)]
 
 
 class Block(BaseModel):
-    """A mapping of a robot file whose keys are all known."""
+    """A mapping of a file whose keys are all known."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 

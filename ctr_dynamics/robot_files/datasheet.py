@@ -137,7 +137,7 @@ def tube_from_text(text: str, number: int) -> tuple[str, dict[str, Measured]]:
     Raises:
         InputError: not KEY=VALUE, an unknown key, or a value that cannot be read.
     """
-    where, name = f"tube {number}", f"tube{number}"
+    where, name, given = f"tube {number}", f"tube{number}", set[str]()
     found: dict[str, Measured] = {}
     for part in text.split(","):
         key, equals, value = (piece.strip() for piece in part.partition("="))
@@ -145,6 +145,9 @@ def tube_from_text(text: str, number: int) -> tuple[str, dict[str, Measured]]:
             raise InputError(
                 f"'{part.strip()}' is not KEY=VALUE", do="write for example od=1.2mm", where=where
             )
+        if key in given:
+            raise InputError(f"{key} is given twice", do="leave one of them out", where=where)
+        given.add(key)
         if key == "name":
             name = value
         elif key in TUBE_KEYS or key in INSTEAD:
@@ -181,6 +184,10 @@ def robot_from_sheet(sheet: Sheet) -> Robot:
         InputError: data that no robot can have; the key, the value and the limit are named.
     """
     tubes = [_tube(name, data, number) for number, (name, data) in enumerate(sheet.tubes, 1)]
+    if sheet.tip_diameter.value and not sheet.tip_mass.value:
+        raise InputError(
+            "a diameter is given and no mass", do="give the mass, or leave both out", where="body at the tip"
+        )
     if sheet.tip_mass.value:
         r = sheet.tip_diameter.value / 2
         inertia = _short(0.4 * sheet.tip_mass.value * r * r)
@@ -321,9 +328,15 @@ def _curvature(data: Mapping[str, Measured], where: str) -> Measured:
     """Curvature of the precurved part in 1/m, from itself or from the bend radius."""
     if "curvature" in data:
         return data["curvature"]
-    radius = data.get("radius", Measured(0.0))
-    if not radius.value:
+    if "radius" not in data:
         raise InputError("curved is given and radius is not", do="give the bend radius", where=where)
+    radius = data["radius"]
+    if not radius.value:
+        raise InputError(
+            "radius 0 mm is none",
+            do="give that of the centre line; leave curved out for a straight tube",
+            where=where,
+        )
     return Measured(1 / radius.value, abs(radius.relative / radius.value))
 
 
@@ -337,6 +350,7 @@ def robot_file_text(robot: Robot, said: Sequence[str]) -> str:
     return "".join(f"# {line}\n" for line in head) + robot_to_yaml(robot)
 
 
+REST_ASSUMED = "Rest position: bases 10 mm apart and angles zero, as none was given."
 ASSUMED = (
     "Assumed, not measured: friction (Till et al. 2020, Table III, 50 %), drift of the tracker (a quarter of its noise over 2 s),",
     "direction of gravity within 0.2 deg. Deviations of the diameters are contained in those of the moduli and of density.",

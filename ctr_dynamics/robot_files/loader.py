@@ -18,7 +18,7 @@ from ctr_dynamics.effects.extension_check import check_extensions
 from ctr_dynamics.errors import InputError
 from ctr_dynamics.io.text_files import decode_text, read_bytes
 from ctr_dynamics.io.yaml_files import read_yaml
-from ctr_dynamics.robot.quantity import Quantity, VectorQuantity
+from ctr_dynamics.robot.quantity import Quantity, VectorQuantity, problem_line
 from ctr_dynamics.robot.schema import Robot
 
 
@@ -83,32 +83,12 @@ def robot_from_dict(data: Any, where: str = "robot") -> Robot:
     try:
         robot = Robot.model_validate(data)
     except ValidationError as error:
-        raise InputError(_one_line(error), where=where) from None
+        raise InputError(problem_line(error), where=where) from None
     try:
         check_extensions(robot.extensions, robot)
     except InputError as error:
         raise InputError(str(error), where=where) from None
     return robot
-
-
-def _one_line(error: ValidationError) -> str:
-    errors = error.errors(include_url=False, include_context=True)
-    first = errors[0]
-    path = ""
-    for part in first["loc"]:
-        # pydantic puts validator names of unions into the path; keys and indices are what the file has.
-        if isinstance(part, int):
-            path += f"[{part}]"
-        elif "[" not in str(part):
-            path += f".{part}" if path else str(part)
-    text = first["msg"]
-    if first["type"] != "robot":
-        text = f"{text[0].lower()}{text[1:]}"
-        value = first.get("input")
-        if isinstance(value, (str, int, float, type(None))):
-            text += f", got {value!r}"
-    line = f"{path}: {text}" if path else text
-    return line + (f" (and {len(errors) - 1} more)" if len(errors) > 1 else "")
 
 
 def robot_quantities(robot: Robot) -> dict[str, Quantity | VectorQuantity]:

@@ -126,7 +126,7 @@ def no_step(bag: Bag, robot: Robot, names: set[str], problems: dict[str, Any]) -
     """The error that explains why a replay took no step, from the joint ``names`` of the bag and the estimator's ``problems`` with them."""
     expected = ", ".join(f"tube{i}_rotation, tube{i}_translation" for i in range(1, robot.n_tubes + 1))
     found = ", ".join(sorted(names)[:12]) or "none"
-    odd = "".join(f"; {note}" for note in input_notes({"joints": problems}))
+    odd = "".join(f"; {note}" for note in (*input_notes({"joints": problems}), *bag.notes[:2]))
     return InputError(
         f"no step was possible: no usable joint state of robot '{robot.name}' on {JOINT_STATES} (joints "
         f"found: {found}; needed: {expected}; readable messages: {_readable(bag)}{odd})",

@@ -12,13 +12,15 @@ from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, model_validator
+from pydantic import ConfigDict, Field, FiniteFloat, model_validator
+
+from ctr_dynamics.robot import quantity
 
 Floats = NDArray[np.float64]
 Seconds = Annotated[FiniteFloat, Field(gt=0, le=3600)]
 
 
-class Block(BaseModel):
+class Block(quantity.Block):
     """Part of a scenario file: no unknown keys, no conversion of text to numbers."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True)

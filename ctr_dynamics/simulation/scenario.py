@@ -14,6 +14,7 @@ from pydantic import Field, FiniteFloat, PrivateAttr, ValidationError, model_val
 from ctr_dynamics.errors import InputError
 from ctr_dynamics.io.text_files import decode_text, read_bytes
 from ctr_dynamics.io.yaml_files import read_yaml
+from ctr_dynamics.robot.quantity import problem_line
 from ctr_dynamics.simulation.motion_primitives import AnyPrimitive, Axis, Block, Seconds
 
 Floats = NDArray[np.float64]
@@ -196,19 +197,7 @@ def load_scenario(name_or_path: str | Path) -> Scenario:
     try:
         scenario = Scenario.model_validate(content)
     except ValidationError as error:
-        raise InputError(_one_line(error), do="see config/scenarios for examples", where=name) from None
+        raise InputError(problem_line(error), do="see config/scenarios for examples", where=name) from None
     scenario._sha256 = hashlib.sha256(data).hexdigest()
     scenario._source = name
     return scenario
-
-
-def _one_line(error: ValidationError) -> str:
-    """The first problem with its key path, and how many more there are."""
-    errors = error.errors(include_url=False)
-    first = errors[0]
-    path = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in first["loc"]).lstrip(".")
-    text = first["msg"].removeprefix("Value error, ")
-    value = first.get("input")
-    shown = f", got {value!r}" if isinstance(value, (str, int, float, type(None))) else ""
-    more = f" (and {len(errors) - 1} more)" if len(errors) > 1 else ""
-    return f"{path}: {text[0].lower()}{text[1:]}{shown}{more}"

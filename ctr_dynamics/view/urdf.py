@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from xml.etree import ElementTree as ET
 
+from ctr_dynamics.errors import InputError
 from ctr_dynamics.robot import Robot
 from ctr_dynamics.runtime.transform_encoder import tip_frame
 from ctr_dynamics.view.markers import COLOURS
@@ -26,7 +27,14 @@ def robot_urdf(robot: Robot, frame_id: str = "ctr_base") -> str:
 
     Joints ``tubeN_translation`` (m) and ``tubeN_rotation`` (rad) of every tube N are those of the joint states: the first is zero or negative, the
     second about +z. SI units.
+
+    Raises:
+        InputError: ``frame_id`` is empty or holds white space.
     """
+    if not frame_id or frame_id.split() != [frame_id]:
+        raise InputError(
+            f"name of the base link '{frame_id}'", do="give a name without blanks", where="--frame"
+        )
     root = ET.Element("robot", name=robot.name)
     _link(root, frame_id, [(0.0, _cylinder(PLATE_RADIUS, PLATE_THICKNESS), (0.6, 0.6, 0.6))])
     actuators = robot.actuators

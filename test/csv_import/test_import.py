@@ -140,7 +140,8 @@ def test_frame_must_be_stated(logs, tmp_path, capsys):
         ("time [ms]", "time [s]", "outside 0 to 2147483647 s"),
         ("time [ms]", "time", "holds numbers of no stated unit"),
         ("tube1_rotation [deg]", "tube1_rotation [mm]", "unit 'mm' is none of rad"),
-        ("tube1_rotation [deg]", "tube1_rotation", "unit 'none' is none of rad"),
+        ("tube1_rotation [deg]", "tube1_rotation", "has no unit; write one of rad"),
+        ("tube2_rotation_deg", "tube1_rotation [deg]", "column 'tube1_rotation [deg]' is there 2 times"),
         ("tube1_translation (mm)", "tube1_translation (m)", "millimetres? Give metres"),
         ("tube1_translation (mm)", "carriage", "no column for tube1_translation"),
         ("tube2_rotation_deg", "tube1_rotation [rad]", "no column for tube2_rotation"),
@@ -341,3 +342,69 @@ def test_faults_that_a_replay_would_mend_are_said(logs, tmp_path, capsys):
     assert run(logs, tmp_path / "out.mcap", "--robot", ROBOT) == 0
     lines = [line for line in capsys.readouterr().err.splitlines() if "/ctr/tracker/tip" in line]
     assert any("equal" in line or "repeat" in line or "frozen" in line for line in lines), lines
+
+
+@pytest.mark.parametrize(("digits", "rows"), [(0, 0), (1, 0), (2, 40)])
+def test_times_with_too_few_digits_are_rejected(tmp_path, capsys, digits, rows):
+    """Joints at 50 Hz, stamped in s since 1970."""
+    data = [[f"{1.7e9 + 0.02 * k:.{digits}f}", 0.1 * k, -100.0] for k in range(40)]
+    joints = write(tmp_path / "j.csv", ["time [s]", "tube1_rotation [deg]", "tube1_translation [mm]"], data)
+    assert run({"--joints": joints}, tmp_path / "out.mcap") == (0 if rows else 2)
+    error = capsys.readouterr().err
+    assert rows or "of 40 rows have the time of the row before" in error
+
+
+def test_cells_without_a_column_are_named(tmp_path, capsys):
+    """Decimal commas between commas make two cells of one; an empty cell at the end is that of a separator there."""
+    rows = [[0.02 * k, 0.5, "-100"] for k in range(40)]
+    header = ["time [s]", "tube1_rotation [deg]", "tube1_translation [mm]"]
+    joints = write(tmp_path / "j.csv", header, [[*row, ""] for row in rows])
+    assert run({"--joints": joints}, tmp_path / "out.mcap") == 0
+    joints = write(tmp_path / "k.csv", header, [*rows, [0.8, 0.5, "-100", "5"]])
+    assert run({"--joints": joints}, tmp_path / "out.mcap") == 1
+    assert "line 42: 4 cells for 3 columns (decimal commas" in capsys.readouterr().err
+
+
+def test_rows_that_are_left_out_are_all_counted(tmp_path, capsys):
+    rows = [[0.02 * k, "?" if k % 4 == 3 else 0.5, -100] for k in range(40)]
+    joints = write(tmp_path / "j.csv", ["time [s]", "tube1_rotation [deg]", "tube1_translation [mm]"], rows)
+    assert run({"--joints": joints}, tmp_path / "out.mcap") == 1
+    error = capsys.readouterr().err
+    assert "10 rows left out" in error
+    assert error.rstrip().endswith("and 5 more")
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("column: b", "column: a", "column 'a' is that of tube1_rotation and of tube1_translation"),
+        ("unit: mm", "unit: mm, scale: 0", "0 makes every value the offset"),
+        ("time:", "tiem:", "unknown key 'tiem'; did you mean 'time'?"),
+        ("unit: s", "rate_hz: 40", "holds 0.02, and frames have whole numbers"),
+        ("joints:", "tracker: {frame: x}\njoints:", "key 'time' is missing"),
+    ],
+)
+def test_layouts_that_cannot_be_are_rejected(tmp_path, capsys, old, new, message):
+    joints = write(tmp_path / "j.csv", ["t", "a", "b"], [[0.02 * k, 0.5, -100] for k in range(40)])
+    layout = tmp_path / "layout.yaml"
+    text = (
+        "joints:\n  time: {column: t, unit: s}\n  values:\n"
+        "    tube1_rotation: {column: a, unit: deg}\n    tube1_translation: {column: b, unit: mm}\n"
+    )
+    layout.write_text(text)
+    assert run({"--joints": joints}, tmp_path / "out.mcap", "--layout", str(layout)) == 0
+    layout.write_text(text.replace(old, new, 1))
+    assert run({"--joints": joints}, tmp_path / "out.mcap", "--layout", str(layout)) == 2
+    assert message in capsys.readouterr().err
+
+
+def test_a_frame_that_the_layout_contradicts_is_rejected(logs, tmp_path, capsys):
+    layout = tmp_path / "layout.yaml"
+    layout.write_text(
+        "tracker:\n  time: {column: t, unit: s}\n  frame: ctr_base\n  values:\n"
+        "    x: {column: x, unit: m}\n    y: {column: y, unit: m}\n    z: {column: z, unit: m}\n"
+    )
+    poses = write(tmp_path / "p.csv", ["t", "x", "y", "z"], [[0.02 * k, 0.0, 0.0, 0.1] for k in range(40)])
+    given = {"--joints": logs["--joints"], "--tracker": poses}
+    assert run(given, tmp_path / "out.mcap", "--layout", str(layout), frame="ndi") == 2
+    assert "--frame says 'ndi' and the layout 'ctr_base'" in capsys.readouterr().err

@@ -77,7 +77,7 @@ def test_a_truth_of_another_time_and_bags_without_outputs_are_said(tmp_path):
 @pytest.mark.parametrize(
     ("arrays", "text"),
     [
-        ({"p": np.zeros((3, 3))}, "cannot be read as a truth file"),
+        ({"p": np.zeros((3, 3))}, r"is no truth file \(t is not"),
         ({"t": [0.0, 1.0, 1.0], "p": np.zeros((3, 3))}, "no rising times"),
         ({"t": [0.0, 1.0], "q": np.zeros((2, 4))}, "p is missing"),
         ({"t": [0.0, 1.0], "p": np.zeros((3, 3))}, "expected \\(2, 3\\)"),
