@@ -271,7 +271,7 @@ class Estimator:
             history.restore(here)
 
     def reset(self) -> None:
-        """Forget everything but the last known load, and wait for the next complete joint state. Counters stay."""
+        """Wait for the next complete joint state. Counters, last known load, and what was found of the tracker's timing and model's error stay."""
         self._clear()
         self.inputs.clear()
         self.runs.clear()

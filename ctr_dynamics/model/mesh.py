@@ -3,7 +3,7 @@
 Every section keeps its own reference coordinate in [0, 1] with a fixed number of cells, so that fields are never interpolated across a
 jump of curvature while the actuators move; only the section lengths follow the translations. When a breakpoint passes another one
 or the base plate, or a section has grown or shrunk so far that its cells no longer suit it, the set of sections changes and
-:func:`ctr_dynamics.model.simulator.remap_fields` carries the fields over once.
+:func:`ctr_dynamics.model.remeshing.remap_fields` carries the fields over once.
 """
 
 from __future__ import annotations

@@ -80,13 +80,6 @@ class InputGate:
         stamp_ns = message.stamp_ns if verdict.stamp_ns is None else verdict.stamp_ns
         return message._replace(stamp_ns=stamp_ns, positions=tuple(positions))
 
-    def pose(self, message: PoseIn, arrival_ns: int) -> PoseIn | None:
-        """The pose to use, with its time as the checks want it; None where it is left out. ``arrival_ns``: see :meth:`joint_state`."""
-        verdict = self._pose_verdict(message, arrival_ns)
-        if verdict is None or verdict.stamp_ns is None:
-            return None if verdict is None else message
-        return message._replace(stamp_ns=verdict.stamp_ns)
-
     def give_pose(self, message: PoseIn, arrival_ns: int) -> None:
         """Give the estimator the pose to use, if there is one. ``arrival_ns``: see :meth:`joint_state`."""
         verdict = self._pose_verdict(message, arrival_ns)

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 from ctr_dynamics.estimation.step_output import ERROR, OK, WARN, Status
 from ctr_dynamics.runtime.clock_offset import LIMIT_NS, ClockOffset
-from ctr_dynamics.runtime.step_loop import INBOX_LIMIT
+from ctr_dynamics.runtime.step_loop import INBOX_BYTES, INBOX_LIMIT
 from ctr_dynamics.runtime.timing import LATE_NS, VERY_LATE_NS, StepTiming
 
 
@@ -105,7 +105,8 @@ def topics_status(
         return Status(
             "topics",
             ERROR,
-            f"{rejected} messages were rejected: {INBOX_LIMIT} were waiting already; send fewer, or give the node more of a core",
+            f"{rejected} messages were rejected: {INBOX_LIMIT} of them or {INBOX_BYTES / 2**20:g} MB were waiting already; "
+            "send fewer, or give the node more of a core",
             values,
         )
     if undecodable:

@@ -17,10 +17,10 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, NamedTuple, Protocol
 
+from ctr_dynamics.io.messages.topics import STEP_NS
 from ctr_dynamics.runtime.clock_offset import ClockOffset
 from ctr_dynamics.runtime.timing import StepTiming
 
-STEP_NS = 3_000_000
 CATCH_UP_NS = 5_000_000_000
 """A backlog longer than this is given up: the estimator reinitialises."""
 SLICE_STEPS = 8

@@ -89,13 +89,16 @@ def assert_as_good_as(estimator, outputs, reference, worse=1.15):
     assert health.nis_summary()["mean"] < worse * other.nis_summary()["mean"]
 
 
-def test_clean_inputs_pass_as_they_are(clean, reference):
+def test_clean_inputs_pass_as_they_are(clean, reference, monkeypatch):
     estimator, _ = reference
     assert estimator.health.input_problems() == {"joints": {}, "tracker": {}, "load": {}}
-    gate = InputGate(estimator)
+    gate, taken = InputGate(estimator), []
+    monkeypatch.setattr(estimator, "add_tracker_pose", lambda *pose: taken.append(pose))
     for item in clean[:200]:
         if is_pose(item):
-            assert gate.pose(item.message, item.log_ns) is item.message
+            gate.give_pose(item.message, item.log_ns)
+            pose = item.message
+            assert taken.pop() == (pose.stamp_ns, pose.position, pose.quaternion_xyzw, pose.frame_id)
         elif isinstance(item.message, JointStateIn):
             assert gate.joint_state(item.message, item.log_ns) is item.message
 

@@ -363,15 +363,6 @@ def test_numbers_that_are_missing_in_motion_make_a_gap(checks):
     assert kinds(checks) == {Kind.NOT_FINITE: 60, Kind.GAP_IN_MOTION: 1}
 
 
-def test_silence_is_said_while_it_lasts(checks):
-    rows = joint_rows(100)
-    feed_joints(checks, rows)
-    assert checks.silence(rows[-1][0] + 50_000_000) is None
-    silence = checks.silence(rows[-1][0] + 300_000_000)
-    assert silence is not None
-    assert silence.kind is Kind.GAP_IN_MOTION
-
-
 def test_the_same_joint_state_twice_counts_once(checks):
     row = joint_rows(1)[0]
     assert checks.check(*row).use == "accept"

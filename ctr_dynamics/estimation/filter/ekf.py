@@ -53,7 +53,7 @@ Floats = NDArray[np.float64]
 class RodEkf:
     """Filter of one simulated robot.
 
-    The owner steps the simulator with ``record=True`` and hands the result to :meth:`propagate`. The filter writes into the simulator's state and
+    The owner steps the simulator with records and hands the result to :meth:`propagate`. The filter writes into the simulator's state and
     parameters when it corrects.
 
     Args:

@@ -49,7 +49,7 @@ class InterpolatedInputs:
         )
 
     def rows(self, times: Floats) -> tuple[Floats, Floats]:
-        """(stages, inputs) rows as :func:`ctr_dynamics.model.simulator.stage_inputs` orders them at ``times`` (stages,) s from t0, and beta's
+        """(stages, inputs) rows as :func:`ctr_dynamics.model.state.stage_inputs` orders them at ``times`` (stages,) s from t0, and beta's
         rate (N,) m/s at the last."""
         key = times.tobytes()
         if key not in self._known:
@@ -109,7 +109,7 @@ class RunInputs:
         return self.stages(np.array([t]))[1]
 
     def stages(self, times: Floats) -> tuple[Floats, Inputs]:
-        """Inputs at all stages of a step; see :func:`ctr_dynamics.model.simulator.stage_inputs`."""
+        """Inputs at all stages of a step; see :func:`ctr_dynamics.model.state.stage_inputs`."""
         rows, beta_rate = self.interpolated.rows(times)
         corrected = np.empty_like(rows)
         corrected_rows(rows, self.load, self.effect, self.theta, corrected)

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctr_dynamics.estimation.filter.adapted_variances import AdaptationOptions
-from ctr_dynamics.estimation.monitoring.densities import density_of_filter
+from ctr_dynamics.estimation.monitoring.densities import density_of_filter, log_changed
 from ctr_dynamics.estimation.monitoring.moved_tracker import Moved, MovedTracker
 from ctr_dynamics.estimation.monitoring.taken_again import drop_from
 from ctr_dynamics.kernels.delay_evidence import compare_delays, weigh_changes, weigh_delays
@@ -238,7 +238,7 @@ class DelaySearch:
         right_before = decay * max(last.filter, float(last.delays[present]))
         changed, began_ns, changed_level = last.changed, last.began_ns, last.changed_level
         if options.changes:
-            now = right_before + math.log(-math.expm1(-elapsed / options.sound_s))
+            now = right_before + log_changed(elapsed, options.sound_s)
             changed, began_ns = np.empty_like(delays), np.empty_like(began_ns)
             changed_level = np.empty_like(level)
             weigh_changes(

@@ -15,6 +15,11 @@ def log_density(square: Any, variance: Any, noise: float) -> Any:
     return -0.5 * (square / variance + 3.0 * np.log(variance / noise))
 
 
+def log_changed(elapsed_s: float, every_s: float) -> float:
+    """Logarithm of the probability that what changes every ``every_s`` seconds in the mean has changed in ``elapsed_s``."""
+    return math.log(-math.expm1(-elapsed_s / every_s))
+
+
 def student_peak(freedom: float) -> float:
     """Logarithm of Student's density of ``freedom`` degrees in three dimensions at zero, by that of a normal one of the same scale."""
     half = 0.5 * freedom

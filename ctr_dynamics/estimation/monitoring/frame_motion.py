@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctr_dynamics.estimation.filter.adapted_variances import AdaptationOptions
-from ctr_dynamics.estimation.monitoring.densities import log_density
+from ctr_dynamics.estimation.monitoring.densities import log_changed, log_density
 from ctr_dynamics.estimation.monitoring.taken_again import drop_from
 from ctr_dynamics.kernels.motion_regression import correct_motions
 
@@ -121,13 +121,13 @@ class FrameMotion:
         # by Cayley's formula, a rotation moves a point by the cross product of a vector with the middle between its places
         middle = position - 0.5 * residual
         if not known:
-            evidence = np.full(rows, now + math.log(1e-3 / options.sound_s))
+            evidence = np.full(rows, now + log_changed(AdaptationOptions.shortest_interval, options.sound_s))
             start = np.full(rows, stamp_ns), np.tile(middle, (rows, 1)), _at_rest(residual, rows)
             known.append(Motion(stamp_ns, *start, self._prior, evidence))
             return
         last = known[-1]
         elapsed = (stamp_ns - last.stamp_ns) * 1e-9
-        begins = math.log(-math.expm1(-elapsed / options.sound_s))
+        begins = log_changed(elapsed, options.sound_s)
         # 1. It has moved or stood still since before; the open-loop run goes astray slowly.
         past = self._with_end(last, elapsed)
         past.covariance[:, range(3), range(3)] += noise * elapsed / options.drift_s
@@ -163,7 +163,7 @@ class FrameMotion:
         began, place = last.began_ns.copy(), last.place.copy()
         mean, covariance = last.mean.copy(), last.covariance.copy()
         best = int(evidence[:STILL].argmax())
-        ended = evidence[best] + math.log(-math.expm1(-elapsed / options.fault_s))
+        ended = evidence[best] + log_changed(elapsed, options.fault_s)
         if ended > evidence[STILL]:
             since = (last.stamp_ns - last.began_ns[best]) * 1e-9
             stops = np.zeros((9, 9))

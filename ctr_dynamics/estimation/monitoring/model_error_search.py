@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from ctr_dynamics.estimation.filter.adapted_variances import AdaptationOptions
 from ctr_dynamics.estimation.filter.filter_records import ModelErrorSize
-from ctr_dynamics.estimation.monitoring.densities import density_of_filter, log_density
+from ctr_dynamics.estimation.monitoring.densities import density_of_filter, log_changed, log_density
 from ctr_dynamics.estimation.monitoring.frame_motion import FrameMotion
 from ctr_dynamics.estimation.monitoring.moved_tracker import Moved, MovedTracker
 from ctr_dynamics.estimation.monitoring.noisy_tracker import NoisyTracker
@@ -196,7 +196,7 @@ class ModelErrorSearch:
         density = log_density((change**2).sum(axis=1), total, noise)
         # of what is constant and what has jumped to anywhere, the likelier goes on
         anywhere = self._reach**2 + noise
-        jumps = math.log(-math.expm1(-elapsed / options.sound_s))
+        jumps = log_changed(elapsed, options.sound_s)
         for row in (CONSTANT, REST):
             moved = jumps + log_density(observed[row] @ observed[row], anywhere, noise)
             if moved > density[row]:

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctr_dynamics.estimation.filter.adapted_variances import AdaptationOptions
-from ctr_dynamics.estimation.monitoring.densities import log_density
+from ctr_dynamics.estimation.monitoring.densities import log_changed, log_density
 
 Floats = NDArray[np.float64]
 
@@ -83,7 +83,7 @@ class MovedTracker:
         stays = residual - last.level
         on = decay * last.evidence + log_density(stays @ stays, walked + self._noise, self._noise)
         # 2. Or since the last one; or it is where it was, and a fault that is over has led the filter astray.
-        moves = math.log(-math.expm1(-elapsed / self.options.sound_s))
+        moves = log_changed(elapsed, self.options.sound_s)
         there = [log_density(residual @ residual, square, self._noise) for square in self._places]
         begins = moves + max(before + float(np.logaddexp(*there)) - math.log(len(there)), now)
         if begins > on:
@@ -96,5 +96,5 @@ class MovedTracker:
 
         ``filter_before``: up to the last one; ``fault``: likewise, of the fault of the tracker.
         """
-        over = math.log(-math.expm1(-elapsed / self.options.found_s))
+        over = log_changed(elapsed, self.options.found_s)
         return float(np.logaddexp(decay * filter_before, decay * fault + over))

@@ -135,13 +135,6 @@ class JointChecks:
             return self._late(train, state, stamped)
         return self._of_train(state, stamped)
 
-    def silence(self, now_ns: int) -> Verdict | None:
-        """What is to be said at a time on the stamps' clock where joint states are missing by then; None where none is."""
-        if self._train is None or now_ns - self._train.stamp_ns <= self.limits.gap_s * 1e9:
-            return None
-        silent_s = (now_ns - self._train.stamp_ns) * 1e-9
-        return Verdict("drop", *self.motion.gap(silent_s, self.motion.still, self.rates))
-
     # -- the usual way --
 
     def _start(self, state: _JointState) -> Verdict:

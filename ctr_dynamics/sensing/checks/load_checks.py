@@ -30,10 +30,7 @@ def tip_compliance(robot: Robot, translations: Sequence[float]) -> TipCompliance
     are there share the moment.
     """
     ends = [max(tube.length + beta, 0.0) for tube, beta in zip(robot.tubes, translations, strict=True)]
-    stiffness = [
-        tube.youngs_modulus.value * 0.25 * math.pi * (tube.outer_radius.value**4 - tube.inner_radius.value**4)
-        for tube in robot.tubes
-    ]
+    stiffness = [tube.bending_stiffness for tube in robot.tubes]
     length = max(ends)
     force = moment = 0.0
     for start, end in pairwise(sorted({0.0, *ends})):
