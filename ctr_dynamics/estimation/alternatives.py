@@ -137,11 +137,11 @@ class Alternatives:
         expected = self._ekf.expected
         for stamp_ns, time_s, quaternion, motion, tips, update, delay, stamp_error_s in self._compared:
             self._stamp_error_s = stamp_error_s
-            assert update.foretold is not None
+            assert update.predictive is not None
             seen = motion.position + motion.residual
-            self.end_of_jitter.add(stamp_ns, update.steadier)
+            self.end_of_jitter.add(stamp_ns, update.half_jitter_gain)
             newest_s = time_s - expected.model.delay
-            self.timing.add(stamp_ns, newest_s, seen, tips, update.foretold, expected, delay)
+            self.timing.add(stamp_ns, newest_s, seen, tips, update.predictive, expected, delay)
             if expected.slower:
                 expected.refine(*self.timing.response.refined(expected.response))
             self.model_error.add(
@@ -151,7 +151,7 @@ class Alternatives:
                 motion.velocity,
                 motion.acceleration,
                 self._turn(quaternion, motion.quaternion),
-                update.foretold,
+                update.predictive,
             )
         self._compared.clear()
         self._news = True

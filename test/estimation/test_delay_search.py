@@ -16,16 +16,18 @@ from ctr_dynamics.kernels.parabolas import fill_between
 NOISE, LENGTH, REGISTERED = 2.5e-4, 0.25, 1e-3
 
 
-def search(path, delay, beside=(0.0, 0.0, 0.0), foretold=(-20.0, -2.0), seen=None, seconds=1.0, options=None):
-    """Positions at 40 Hz of a tip on ``path``, measured ``delay`` late by a tracker that sees ``seen``, or the same, beside a filter that has
-    ``foretold`` every one like that, or that of a time (s): as if a force had changed."""
+def search(
+    path, delay, beside=(0.0, 0.0, 0.0), predictive=(-20.0, -2.0), seen=None, seconds=1.0, options=None
+):
+    """Positions at 40 Hz of a tip on ``path``, measured ``delay`` late by a tracker that sees ``seen``, or the same, beside a filter of these
+    ``predictive`` densities, or those of a time (s): as if a force had changed."""
     rng, found = np.random.default_rng(3), DelaySearch(NOISE, 20.0, LENGTH, REGISTERED, options)
     times = np.arange(0.0, 0.9 + seconds + 0.1, 0.003)
     for k in range(round(40 * seconds)):
         t = 0.9 + 0.025 * k
         z = (seen or path)(np.array([t - delay]))[0] + np.array(beside) + NOISE * rng.standard_normal(3)
         known = times <= t
-        told = foretold(t) if callable(foretold) else foretold
+        told = predictive(t) if callable(predictive) else predictive
         found.add(round(t * 1e9), t, z, times[known], path(times[known]), told)
     return found
 
@@ -55,8 +57,8 @@ def test_a_delay_is_found_beside_a_wrong_registration(delay):
 def test_nothing_is_found_where_nothing_is_wrong():
     assert search(moving, 0.0).found(0.0) is None
     assert search(moving, 0.08).found(0.08) is None
-    assert search(moving, 0.08, foretold=WELL).belief(0.0).late < 1e-2, "the filter has foretold it"
-    still = search(lambda t: np.zeros((len(t), 3)), 0.08, foretold=WELL)
+    assert search(moving, 0.08, predictive=WELL).belief(0.0).late < 1e-2, "the filter has foretold it"
+    still = search(lambda t: np.zeros((len(t), 3)), 0.08, predictive=WELL)
     assert still.belief(0.0).late < 0.05, "a robot at rest tells nothing"
 
 
@@ -66,10 +68,10 @@ def test_a_delay_that_changes_is_found_after_a_long_time_without():
     def seen(t):
         return moving(np.where(t < 10.0, t, t - 0.06))
 
-    found = search(moving, 0.0, foretold=WELL, seen=seen, seconds=9.0)
+    found = search(moving, 0.0, predictive=WELL, seen=seen, seconds=9.0)
     assert found.found(0.0) is None
     later = search(
-        moving, 0.0, foretold=lambda t: WELL if t < 10.0 else (-20.0, -8.0), seen=seen, seconds=9.8
+        moving, 0.0, predictive=lambda t: WELL if t < 10.0 else (-20.0, -8.0), seen=seen, seconds=9.8
     ).found(0.0)
     assert later is not None
     assert later[0] == pytest.approx(0.06, abs=3.0 * later[1])
@@ -107,7 +109,7 @@ def test_a_latency_that_grows_is_not_believed_to_have_jumped(seconds):
         return moving(t - 0.3 * np.maximum(t - 10.0, 0.0))
 
     told = lambda t: WELL if t < 10.0 else (-20.0, -8.0)  # noqa: E731
-    assert search(moving, 0.0, foretold=told, seen=seen, seconds=seconds).found(0.0) is None
+    assert search(moving, 0.0, predictive=told, seen=seen, seconds=seconds).found(0.0) is None
 
 
 def test_a_free_vibration_whose_phase_is_wrong_is_no_delay():
@@ -115,7 +117,7 @@ def test_a_free_vibration_whose_phase_is_wrong_is_no_delay():
 
 
 def test_a_vibration_that_gets_out_of_phase_is_no_delay():
-    slower = search(vibrating(5.6), 0.0, seen=vibrating(5.3), foretold=(-2.5, -2.5), seconds=3.0)
+    slower = search(vibrating(5.6), 0.0, seen=vibrating(5.3), predictive=(-2.5, -2.5), seconds=3.0)
     assert slower.belief(0.0).late < 1e-3
 
 
@@ -201,7 +203,7 @@ def test_a_tracker_that_comes_back_is_not_late():
         return straight(t) + np.where(t < back, 0.2, 0.0)[:, None] * along
 
     told = lambda t: (-200.0, -14.0) if back <= t < back + 0.15 else WELL  # noqa: E731
-    found = search(straight, 0.0, foretold=told, seen=seen, seconds=9.6)
+    found = search(straight, 0.0, predictive=told, seen=seen, seconds=9.6)
     assert found.belief(0.0).late < 0.5
     assert found.found(0.0) is None
 

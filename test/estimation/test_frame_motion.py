@@ -30,7 +30,7 @@ def told(k):
 
 def fed(departures):
     """A search that has met all of them."""
-    found = search(departures[:BEGIN], foretold=(WELL, WELL))
+    found = search(departures[:BEGIN], predictive=(WELL, WELL))
     rng = np.random.default_rng(7)
     for k in range(BEGIN, len(departures)):
         residual = departures[k] + 3e-4 * rng.standard_normal(3)
@@ -79,7 +79,7 @@ def test_a_frame_that_stands_still_again_does_not_move():
 ])  # fmt: skip
 def test_what_does_not_grow_steadily_is_no_moving_frame(departures):
     rng = np.random.default_rng(5)
-    found = search(departures[:BEGIN], foretold=(WELL, WELL))
+    found = search(departures[:BEGIN], predictive=(WELL, WELL))
     for k in range(BEGIN, len(departures)):
         residual = departures[k] + 3e-4 * rng.standard_normal(3)
         found.add(25_000_000 * k, moving(k) + residual, residual, *AT_REST, np.zeros(3), (-4.0, -4.0))

@@ -20,8 +20,8 @@ def moving(k):
     return 0.05 * np.array([np.cos(0.05 * k), np.sin(0.05 * k), 0.0])
 
 
-def search(departures, turn=0.0, foretold=(-20.0, -4.0), seed=1, tip=moving):
-    """Positions at 40 Hz that lie ``departures`` (k, 3) m from the open-loop ``tip``, beside a filter that has ``foretold`` every one like that."""
+def search(departures, turn=0.0, predictive=(-20.0, -4.0), seed=1, tip=moving):
+    """Positions at 40 Hz that lie ``departures`` (k, 3) m from the open-loop ``tip``, beside a filter of these ``predictive`` densities."""
     rng, found = (
         np.random.default_rng(seed),
         ModelErrorSearch(NOISE, ROTATION_NOISE, LENGTH, REGISTERED, 20.0),
@@ -29,7 +29,7 @@ def search(departures, turn=0.0, foretold=(-20.0, -4.0), seed=1, tip=moving):
     for k, departure_m in enumerate(departures):
         turned = np.array([turn, turn, turn]) + ROTATION_NOISE * rng.standard_normal(3)
         residual = departure_m + NOISE * rng.standard_normal(3)
-        found.add(25_000_000 * k, tip(k) + residual, residual, *AT_REST, turned, foretold)
+        found.add(25_000_000 * k, tip(k) + residual, residual, *AT_REST, turned, predictive)
     return found
 
 
@@ -54,14 +54,14 @@ def test_a_departure_is_found_with_its_size_and_rotation(size, time):
 
 
 def test_nothing_is_found_beside_a_filter_that_foretells_well():
-    assert search(np.zeros((400, 3)), foretold=(WELL, WELL)).probability(NONE) < 1e-3
-    assert search(wandering(2e-3, 1.0, 400), foretold=(WELL, WELL)).found(NONE) is None
+    assert search(np.zeros((400, 3)), predictive=(WELL, WELL)).probability(NONE) < 1e-3
+    assert search(wandering(2e-3, 1.0, 400), predictive=(WELL, WELL)).found(NONE) is None
 
 
 @pytest.mark.parametrize("departure_m", [0.0, 1e-3])
 def test_a_robot_that_is_better_than_its_tolerances_has_no_model_error(departure_m):
     """The open-loop run foretells better than a filter that counts on the tolerances, beside a constant error of the registration too."""
-    beyond = search(np.full((400, 3), departure_m), foretold=(-4.0, -4.0))
+    beyond = search(np.full((400, 3), departure_m), predictive=(-4.0, -4.0))
     assert beyond.found(NONE) is None
     assert beyond.probability(NONE) < 0.01
 
@@ -89,7 +89,7 @@ def test_a_vibration_is_no_slow_departure():
     """That of a wrong stiffness: the filter that knows the motion foretells it, though not to the noise."""
     t = 0.025 * np.arange(400)
     vibration = 3e-3 * np.stack([np.sin(35.0 * t), np.cos(35.0 * t), 0.0 * t], axis=1)
-    assert search(vibration, foretold=(-4.0, -4.0)).found(NONE) is None
+    assert search(vibration, predictive=(-4.0, -4.0)).found(NONE) is None
 
 
 def test_a_departure_is_believed_after_seconds_only_and_likely_before():
@@ -102,7 +102,7 @@ def test_a_departure_is_believed_after_seconds_only_and_likely_before():
 
 def test_what_the_filter_foretells_while_it_learns_does_not_count():
     departures = np.full((200, 3), 2e-3)
-    found = search(departures[:16], foretold=(-50.0, -30.0))
+    found = search(departures[:16], predictive=(-50.0, -30.0))
     assert found.probability(NONE) < 0.02
     rng = np.random.default_rng(4)
     for k in range(16, 200):
@@ -140,7 +140,7 @@ def test_a_robot_that_departs_from_its_file_is_followed():
 def test_a_filter_that_has_lost_the_robot_is_astray_within_a_second_whatever_was_before():
     """Ten measurements of the time in which it foretells badly tell it from one that foretells well."""
     departures = wandering(1e-3, 1.0, 440)
-    found, rng = search(departures[:400], foretold=(WELL, WELL)), np.random.default_rng(5)
+    found, rng = search(departures[:400], predictive=(WELL, WELL)), np.random.default_rng(5)
     assert not found.astray
     taken = 0
     while not found.astray and taken < 40:
@@ -155,10 +155,10 @@ def test_a_filter_that_has_lost_the_robot_is_astray_within_a_second_whatever_was
 
 def test_a_filter_that_foretells_as_it_says_is_never_astray():
     """Beside a model that departs as far as tolerances have it, for ten minutes."""
-    assert not search(wandering(1e-3, 1.0, 24_000), foretold=(WELL, WELL)).astray
+    assert not search(wandering(1e-3, 1.0, 24_000), predictive=(WELL, WELL)).astray
 
 
 def test_a_robot_at_rest_says_nothing_of_the_filter():
     """Wherever the open-loop run is: a constant departure foretells a robot that rests, as the position before does."""
-    resting = search(np.full((4000, 3), 6e-3), foretold=(-8.0, -8.0), tip=lambda k: np.zeros(3))
+    resting = search(np.full((4000, 3), 6e-3), predictive=(-8.0, -8.0), tip=lambda k: np.zeros(3))
     assert not resting.astray

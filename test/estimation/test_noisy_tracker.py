@@ -24,7 +24,7 @@ def noise(size, tails, count=240):
 @pytest.mark.parametrize("size", [1e-3, 3e-3])
 def test_noise_of_any_size_is_no_departure_of_the_robot(size, tails):
     """However badly a filter foretells it that counts on the stated noise."""
-    found = search(noise(size, tails), foretold=(-9.0, -9.0))
+    found = search(noise(size, tails), predictive=(-9.0, -9.0))
     assert found.found(NONE) is None
     assert found.probability(NONE) < 0.05
 
@@ -32,7 +32,7 @@ def test_noise_of_any_size_is_no_departure_of_the_robot(size, tails):
 @pytest.mark.parametrize("time", [0.3, 3.0])
 def test_a_robot_that_departs_from_its_model_is_not_noise(time):
     departures = wandering(3e-3, time, 400)
-    assert search(departures, foretold=(-20.0, -4.0)).found(NONE) is not None
+    assert search(departures, predictive=(-20.0, -4.0)).found(NONE) is not None
 
 
 def test_the_size_is_that_of_the_noise():

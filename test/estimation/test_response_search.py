@@ -31,8 +31,8 @@ def seen_through(path, response, t):
     return (weights / weights.sum()) @ path(t - ages)
 
 
-def timing(response=0.0, delay=0.0, foretold=(-20.0, -2.0), seconds=1.0, expected=None):
-    """Positions at 40 Hz of a tracker of that response and delay, beside a filter that has `foretold` every one like that."""
+def timing(response=0.0, delay=0.0, predictive=(-20.0, -2.0), seconds=1.0, expected=None):
+    """Positions at 40 Hz of a tracker of that response and delay, beside a filter of these `predictive` densities."""
     rng, found = np.random.default_rng(3), TrackerTiming(NOISE, 20.0, LENGTH, REGISTERED, TRACKER)
     times = np.arange(-1.0, 1.5 + seconds, 0.003)
     for k in range(round(40 * (seconds + 0.5))):
@@ -40,7 +40,7 @@ def timing(response=0.0, delay=0.0, foretold=(-20.0, -2.0), seconds=1.0, expecte
         z = seen_through(swinging, response, t) if response else swinging(np.array([t - delay]))[0]
         known = times <= t
         tips = times[known], swinging(times[known])
-        told = (-1.5, -1.5) if t < 1.0 else foretold
+        told = (-1.5, -1.5) if t < 1.0 else predictive
         z = z + np.array([1e-3, 0.0, 2e-3]) + NOISE * rng.standard_normal(3)
         found.add(round(t * 1e9), t, z, tips, told, expected or ExpectedTracker(TRACKER), 0.0)
     return found
@@ -111,7 +111,7 @@ def test_delays_and_responses_are_compared_by_what_both_have_counted():
 
 
 def test_nothing_is_found_where_the_filter_foretells_well_or_the_response_is_known():
-    well = timing(0.06, foretold=(-1.5, -1.5))
+    well = timing(0.06, predictive=(-1.5, -1.5))
     assert well.found(ExpectedTracker(TRACKER), 0.0) is None
     assert well.other(ExpectedTracker(TRACKER), 0.0) < 0.5
     known = ExpectedTracker(TRACKER)

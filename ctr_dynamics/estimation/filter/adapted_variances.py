@@ -105,12 +105,12 @@ class Constants(NamedTuple):
     rows: Floats
     pi: Floats
 
-    def most(self, more: Floats) -> float:
-        """The part, up to 1, of an addition ``more`` (n, n) to the covariance that leaves every variance at ``LARGEST`` times its tolerance."""
-        now, added = (((self.rows @ m) * self.rows).sum(axis=1) for m in (self.pi, more))
+    def most(self, added: Floats) -> float:
+        """The part, up to 1, of what is ``added`` (n, n) to the covariance that leaves every variance at ``LARGEST`` times its tolerance."""
+        now, change = (((self.rows @ m) * self.rows).sum(axis=1) for m in (self.pi, added))
         room = np.maximum(LARGEST - now, 0.0)
-        excess = added > room
-        return float((room[excess] / added[excess]).min()) if excess.any() else 1.0
+        excess = change > room
+        return float((room[excess] / change[excess]).min()) if excess.any() else 1.0
 
 
 class AdaptedVariances:
@@ -296,11 +296,11 @@ class AdaptedVariances:
         larger = S + (change @ parts.reshape(3, -1)).reshape(S.shape)
         fraction = force * largest_variance_fraction(parts[FORCE_PART], larger)
         self.fraction = min(max(fraction, 0.0), 1.0)
-        more = self._grown(change, np.array([force, shift, noise]), constants)
+        growth = self._grown(change, np.array([force, shift, noise]), constants)
         self.sigma *= math.sqrt(force)
         self.shift *= math.sqrt(shift)
         self.noise *= noise
-        return more
+        return growth
 
     def _grown(self, change: Floats, ratios: Floats, constants: Constants | None) -> Floats:
         """The change (n, n) of Pi by the ``change`` (3,) of the parts, which become ``ratios`` (3,) times what they are.
@@ -319,9 +319,9 @@ class AdaptedVariances:
                 limited = fault > 0.0
                 self.parts[limited] *= fault[limited, None, None] * np.multiply.outer(deviations, deviations)
                 change, ratios = np.where(limited, 1.0, change), np.where(limited, 1.0, ratios)
-        more: Floats = (change @ self.parts.reshape(3, -1)).reshape(n, n)
+        growth: Floats = (change @ self.parts.reshape(3, -1)).reshape(n, n)
         self.parts *= ratios[:, None, None]
-        return more
+        return growth
 
     @property
     def headroom(self) -> float:

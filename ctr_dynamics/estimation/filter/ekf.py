@@ -271,7 +271,7 @@ class RodEkf:
         compared = self._comparison(stamp, position, quaternion, stamp_error_s)
         if isinstance(compared, Update):
             return compared
-        nu, H, S, more, record = compared
+        nu, H, S, extra_noise, record = compared
         dof, R = record.dof, self.tracker.noise
         # 2. What the innovation says of the sizes of tip force, tracker shift and tracker noise.
         if not self.adapted.noisy:
@@ -279,9 +279,9 @@ class RodEkf:
         constants = Constants(self._tolerances.rows(self.factor.theta), self.pi)
         self.pi += self.adapted.adapt(stamp, nu, H, S, R, constants)
         if self._sees_position:
-            changed = H @ self.pi @ H.T + self.adapted.noise * R + more
-            foretold = position_density(nu, S, R), position_density(nu, changed, R)
-            record = record._replace(foretold=foretold)
+            changed = H @ self.pi @ H.T + self.adapted.noise * R + extra_noise
+            predictive = position_density(nu, S, R), position_density(nu, changed, R)
+            record = record._replace(predictive=predictive)
         # 3. Gate: a single measurement outside is rejected, and so are all that the tracker's state explains.
         outside = self.gate.outside(record.nis, dof)
         self.gate.count(outside and self.adapted.sound)
@@ -289,7 +289,9 @@ class RodEkf:
             if not (self.adapted.sound and self.gate.recovers):
                 return record._replace(reason="outside the gate")
             # 4. After several rejections in a row, inflation until the measurement is plausible.
-            inflated = self.gate.inflate(nu, H, R + more, self.pi, self.factor.theta.shape[1], self.adapted)
+            inflated = self.gate.inflate(
+                nu, H, R + extra_noise, self.pi, self.factor.theta.shape[1], self.adapted
+            )
             if inflated is None:
                 return record._replace(reason="outside the gate, farther than any covariance reaches")
             self.pi = inflated
@@ -298,16 +300,16 @@ class RodEkf:
             )
         # 5. Gain and covariance, then what is left of a shift that is over; correction by both.
         x = self._judge_tolerances(nu, H)
-        x += self._fuse(nu, H, R, more)
+        x += self._fuse(nu, H, R, extra_noise)
         self._end_shift(x)
         self._correct(state, x)
         self.schedule.since_correction = 0
         return record._replace(accepted=True)
 
-    def _fuse(self, nu: Floats, H: Floats, R: Floats, more: Floats) -> Floats:
-        """The correction (r + 22,) by an innovation ``nu`` (k,) of derivative ``H`` (k, r + 22), noise ``R`` as stated and ``more``, (k, k)
+    def _fuse(self, nu: Floats, H: Floats, R: Floats, extra_noise: Floats) -> Floats:
+        """The correction (r + 22,) by an innovation ``nu`` (k,) of derivative ``H`` (k, r + 22), noise ``R`` as stated and ``extra_noise``, (k, k)
         each, and the covariance after it: Joseph form."""
-        noise = self.adapted.noise * R + more
+        noise = self.adapted.noise * R + extra_noise
         if self.refuted:
             K, self.pi = gain_beside(len(self.pi) - STATES + DELAY, self.pi, H, noise)
             self.adapted.correct(K, H, R)
@@ -378,8 +380,8 @@ class RodEkf:
         nu, _, S, _, record = compared
         outside = self.gate.outside(record.nis, record.dof)
         if self._sees_position:
-            foretold = position_density(nu, S, self.tracker.noise)
-            record = record._replace(foretold=(foretold, foretold))
+            predictive = position_density(nu, S, self.tracker.noise)
+            record = record._replace(predictive=(predictive, predictive))
         return record._replace(reason="outside the gate" if outside else FUSION_OFF)
 
     def _tip_at(self, time: float) -> Tip | None:

@@ -61,9 +61,9 @@ class Update(NamedTuple):
         variance: (6,) its predicted variance. nis, dof: normalised innovation squared and its degrees of freedom.
         accepted: whether it was fused. reason: why not, or how.
         white: (6,) residual by the inverse root of its covariance. NaN on axes that are not measured, here and in the others.
-        foretold: logarithm of the density of the measured position by what was known before it, and by the variances that it led to; 0 is that of
+        predictive: logarithm of the density of the measured position by what was known before it, and by the variances that it led to; 0 is that of
             the stated noise at its middle. None where it was not compared.
-        steadier: logarithm of that density with half the jitter that is counted on, less that with all of it.
+        half_jitter_gain: logarithm of that density with half the jitter that is counted on, less that with all of it.
     """
 
     residual: Floats
@@ -73,8 +73,8 @@ class Update(NamedTuple):
     accepted: bool
     reason: str
     white: Floats
-    foretold: tuple[float, float] | None = None
-    steadier: float = 0.0
+    predictive: tuple[float, float] | None = None
+    half_jitter_gain: float = 0.0
 
     @classmethod
     def impossible(cls, reason: str) -> Update:
@@ -84,13 +84,18 @@ class Update(NamedTuple):
 
 
 class Comparison(NamedTuple):
-    """A measurement against the tip of its time: innovation ``nu`` (k,), ``H`` (k, r + 22), ``S`` (k, k), what of it is ``more`` by jitter and an
-    uncertain response, and the record of it."""
+    """A measurement against the tip of its time.
+
+    Attributes:
+        nu: (k,) innovation. H: (k, r + 22) its derivative. S: (k, k) its covariance. extra_noise: (k, k), what of that is by jitter and by an
+            uncertain response.
+        record: of the measurement.
+    """
 
     nu: Floats
     H: Floats
     S: Floats
-    more: Floats
+    extra_noise: Floats
     record: Update
 
 

@@ -16,13 +16,13 @@ Floats = NDArray[np.float64]
 
 
 class Jittered(NamedTuple):
-    """An innovation (k,) and its covariance ``S`` (k, k) with jitter, which makes ``more`` (k, k) of it; ``steadier`` as in
+    """An innovation (k,) and its covariance ``S`` (k, k) with jitter, which makes ``extra_noise`` (k, k) of it; ``half_jitter_gain`` as in
     :class:`~ctr_dynamics.estimation.filter.filter_records.Update`."""
 
     nu: Floats
     S: Floats
-    more: Floats
-    steadier: float
+    extra_noise: Floats
+    half_jitter_gain: float
 
 
 def with_jitter(
@@ -34,10 +34,10 @@ def with_jitter(
     """
     acceleration = (velocity - earlier) / dt
     half, part = jitter_noise(0.5 * deviation, velocity, acceleration)
-    mean, more = jitter_noise(deviation, velocity, acceleration)
-    late, total = nu - mean, S + more
-    steadier = position_density(nu - half, S + part, R) - position_density(late, total, R)
-    return Jittered(late, total, more, steadier)
+    mean, extra_noise = jitter_noise(deviation, velocity, acceleration)
+    late, total = nu - mean, S + extra_noise
+    half_jitter_gain = position_density(nu - half, S + part, R) - position_density(late, total, R)
+    return Jittered(late, total, extra_noise, half_jitter_gain)
 
 
 def jitter_noise(deviation: float, velocity: Floats, acceleration: Floats) -> tuple[Floats, Floats]:

@@ -62,11 +62,11 @@ def compare_with_tip(
     nu, H, S, whitened = tracker.innovation(bias, tip, pi, position, quaternion)
     if not math.isfinite(nu.sum() + S.sum() + whitened.sum()):
         return Update.impossible("the innovation is not finite")
-    more, steadier, noise = np.zeros_like(S), 0.0, tracker.noise
+    extra_noise, half_jitter_gain, noise = np.zeros_like(S), 0.0, tracker.noise
     bent = second_order(S.diagonal() - noise.diagonal(), tracker.axes, adapted.reach)
     if (bent > NEGLIGIBLE * noise.diagonal()).any():
-        more += np.diag(bent)
-        S += more
+        extra_noise += np.diag(bent)
+        S += extra_noise
     scatter = expected.scatter(stamp_error_s)
     if adapted.noisy or scatter or expected.slower:
         S += (adapted.noise - 1.0 if adapted.noisy else 0.0) * noise
@@ -74,17 +74,17 @@ def compare_with_tip(
         if slower is not None:
             change = tracker.innovation(bias, slower, pi, position, quaternion)[0] - nu
             added = np.multiply.outer(change, change)
-            more += added
+            extra_noise += added
             S += added
         if scatter:
             before, at = tracker.observed_tip(tip_at, time - dt) or tip, len(pi) - STATES + DELAY
             earlier = tracker.innovation(bias, before, pi, position, quaternion)[1]
             scattered = with_jitter(nu, S, noise, scatter, -H[:, at], -earlier[:, at], dt)
-            nu, S, steadier = scattered.nu, scattered.S, scattered.steadier
-            more += scattered.more
+            nu, S, half_jitter_gain = scattered.nu, scattered.S, scattered.half_jitter_gain
+            extra_noise += scattered.extra_noise
         whitened = np.linalg.solve(np.linalg.cholesky(S), nu)
     axes, (residual, variance, white) = tracker.axes, np.full((3, 6), np.nan)
     residual[axes], variance[axes], white[axes] = nu, S.diagonal(), whitened
     nis = float(whitened @ whitened)
-    record = Update(residual, variance, nis, len(nu), False, "", white, steadier=steadier)
-    return Comparison(nu, H, S, more, record)
+    record = Update(residual, variance, nis, len(nu), False, "", white, half_jitter_gain=half_jitter_gain)
+    return Comparison(nu, H, S, extra_noise, record)

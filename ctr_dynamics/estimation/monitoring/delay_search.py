@@ -72,7 +72,7 @@ class Waiting(NamedTuple):
     stamp_ns: int
     time_s: float
     position: Floats
-    foretold: tuple[float, float]
+    predictive: tuple[float, float]
     present_s: float
 
 
@@ -176,7 +176,7 @@ class DelaySearch:
         position: Floats,
         stamps: Floats,
         tips: Floats,
-        foretold: tuple[float, float],
+        predictive: tuple[float, float],
         present_s: float = 0.0,
     ) -> None:
         """Take in a measured tip that the filter has met; one of a stamp that is known takes its place.
@@ -187,12 +187,12 @@ class DelaySearch:
             stamp_ns: of its header. time_s: its own time with the nominal delay, s from the first step.
             position: (3,) m, base axes.
             stamps, tips: (k,) s and (k, 3) m of the open-loop run.
-            foretold: what the filter foretold; see :class:`~ctr_dynamics.estimation.filter.filter_records.Update`.
+            predictive: logarithms of the densities that the filter predicted; see :class:`~ctr_dynamics.estimation.filter.filter_records.Update`.
             present_s: s beyond the nominal delay, with which the filter has met it.
         """
         drop_from(self._evidence, stamp_ns)
         drop_from(self._waiting, stamp_ns)
-        self._waiting.append(Waiting(stamp_ns, time_s, position, foretold, present_s))
+        self._waiting.append(Waiting(stamp_ns, time_s, position, predictive, present_s))
         while len(stamps) and self._waiting and self.newest(self._waiting[0].time_s) <= stamps[-1]:
             self._take(self._waiting.popleft(), stamps, tips)
 
@@ -209,7 +209,7 @@ class DelaySearch:
 
     def _take(self, measured: Waiting, stamps: Floats, tips: Floats) -> None:
         """Have a measurement count that all tips (k, 3) m of the open-loop run are known for; ``stamps`` (k,) s."""
-        stamp_ns, time_s, position, foretold, present_s = measured
+        stamp_ns, time_s, position, predictive, present_s = measured
         shown = self.shown(time_s, stamps, tips)
         if shown is None:
             return
@@ -246,7 +246,7 @@ class DelaySearch:
                 changed_level, changed, began_ns,
             )  # fmt: skip
         # 4. Or the tracker has been moved just now.
-        own = density_of_filter(foretold, elapsed / self._change_s)
+        own = density_of_filter(predictive, elapsed / self._change_s)
         of_filter = own + self._moved.filter_goes_on(last.filter, last.moved.evidence, elapsed, decay)
         moved = self._moved.add(last.moved, residual[present], elapsed, decay, right_before, of_filter)
         variance = before * (1.0 - gain)

@@ -1,4 +1,4 @@
-"""How well positions are foretold: logarithms of densities, by that of the tracker's stated noise at zero."""
+"""How well positions are predicted: logarithms of densities, by that of the tracker's stated noise at zero."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ def student_peak(freedom: float) -> float:
     return math.lgamma(half + 1.5) - math.lgamma(half) - 1.5 * math.log(half)
 
 
-def density_of_filter(foretold: tuple[float, float], changes: float) -> float:
-    """Logarithm of the density that a filter gave to a measured position, of which it ``foretold`` one for either case.
+def density_of_filter(predictive: tuple[float, float], changes: float) -> float:
+    """Logarithm of the density that a filter gave to a measured position; ``predictive``: the one with the force that it had, and with another.
 
     The unknown force may have met a change since the measurement before: ``changes`` are expected in that time.
     """
-    known, changed = foretold
+    known, changed = predictive
     likely = -math.expm1(-changes)
     return float(np.logaddexp(known + math.log1p(-likely), changed + math.log(likely)))
 

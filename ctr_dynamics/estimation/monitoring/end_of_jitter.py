@@ -29,11 +29,11 @@ class EndOfJitter:
         """Forget all measurements."""
         self._sums: deque[Sum] = deque(maxlen=REMEMBERED)
 
-    def add(self, stamp_ns: int, steadier: float) -> None:
-        """Take in a measurement that half the jitter would foretell better, by the logarithm ``steadier`` of a ratio of densities."""
+    def add(self, stamp_ns: int, half_jitter_gain: float) -> None:
+        """Take in a measurement that half the jitter would foretell better, by the logarithm ``half_jitter_gain`` of a ratio of densities."""
         drop_from(self._sums, stamp_ns)
         before = self._sums[-1].value if self._sums else 0.0
-        self._sums.append(Sum(stamp_ns, max(before + steadier, 0.0)))
+        self._sums.append(Sum(stamp_ns, max(before + half_jitter_gain, 0.0)))
 
     @property
     def less(self) -> bool:

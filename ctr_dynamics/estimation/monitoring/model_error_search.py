@@ -158,7 +158,7 @@ class ModelErrorSearch:
         velocity: Floats,
         acceleration: Floats,
         turn: Floats,
-        foretold: tuple[float, float],
+        predictive: tuple[float, float],
     ) -> None:
         """Take in a measured tip that the filter has met; one of a stamp that is known takes its place.
 
@@ -166,7 +166,7 @@ class ModelErrorSearch:
             stamp_ns: of its header.
             position: (3,) m, measured. residual: (3,) m, measured minus open-loop tip, whose ``velocity`` (3,) m/s that was.
             turn: (a,) rad, rotation between them about the measured axes.
-            foretold: what the filter foretold; see :class:`~ctr_dynamics.estimation.filter.filter_records.Update`.
+            predictive: logarithms of the densities that the filter predicted; see :class:`~ctr_dynamics.estimation.filter.filter_records.Update`.
         """
         drop_from(self._evidence, stamp_ns)
         self._compared = self._scatter = None
@@ -202,7 +202,7 @@ class ModelErrorSearch:
             if moved > density[row]:
                 density[row], before[row], total[row] = moved, self._reach**2, anywhere
                 level[row], change[row] = 0.0, observed[row]
-        own = density_of_filter(foretold, elapsed / self._change_s)
+        own = density_of_filter(predictive, elapsed / self._change_s)
         # 3. What is known of the past counts less and less, and what the filter foretold while it learned does not count.
         decay, gain = math.exp(-elapsed / options.memory_s), before / total
         if self._span(stamp_ns) < options.learning_s:

@@ -73,7 +73,7 @@ class MovingStart(DelaySearch):
 
     def _take(self, measured: Waiting, stamps: Floats, tips: Floats) -> None:
         """Have a measurement count that all tips (k, 3) m of the open-loop run are known for; ``stamps`` (k,) s."""
-        stamp_ns, time_s, position, foretold, _ = measured
+        stamp_ns, time_s, position, predictive, _ = measured
         shown = self.shown(time_s, stamps, tips)
         if shown is None:
             return
@@ -93,7 +93,7 @@ class MovingStart(DelaySearch):
         decay = math.exp(-elapsed / self.options.memory_s)
         known = self._go_on(last.vibrations, residual, elapsed, decay, (stamp_ns - self._first_ns) * 1e-9)
         delays = np.logaddexp.reduce(known.evidence, axis=0) - math.log(len(known.evidence))
-        of_filter = density_of_filter(foretold, elapsed / self._change_s) + decay * last.filter
+        of_filter = density_of_filter(predictive, elapsed / self._change_s) + decay * last.filter
         level = np.ascontiguousarray(known.states[int(known.evidence.max(axis=1).argmax()), :, :, 0])
         self._evidence.append(
             Evidence(stamp_ns, level, noise, delays, of_filter, none, began, level, nothing, known)

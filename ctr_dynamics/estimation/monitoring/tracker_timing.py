@@ -88,7 +88,7 @@ class TrackerTiming:
         return self.moving.vibrates_m if self.moving else 0.0
 
     def add(
-        self, stamp_ns: int, time_s: float, position: Floats, tips: tuple[Floats, Floats], foretold: tuple[float, float],
+        self, stamp_ns: int, time_s: float, position: Floats, tips: tuple[Floats, Floats], predictive: tuple[float, float],
         expected: ExpectedTracker, delay: float,
     ) -> None:  # fmt: skip
         """Take in a measured tip that the filter has met.
@@ -97,20 +97,22 @@ class TrackerTiming:
             stamp_ns: of its header. time_s: the newest time that it shows with the nominal delay, s from the first step.
             position: (3,) m, base axes.
             tips: stamps (k,) s and positions (k, 3) m of the open-loop run.
-            foretold: what the filter foretold; see :class:`~ctr_dynamics.estimation.filter.filter_records.Update`.
+            predictive: logarithms of the densities that the filter predicted; see :class:`~ctr_dynamics.estimation.filter.filter_records.Update`.
             expected, delay: the tracker and its delay beyond the nominal one (s), with which the filter has met it.
         """
         if self.moving:
-            self.moving.add(stamp_ns, time_s, position, *through(expected.model, *tips), foretold, delay)
+            self.moving.add(stamp_ns, time_s, position, *through(expected.model, *tips), predictive, delay)
             if not self.moving.vibrates_m:
                 self.moving = None
             return
-        self.response.add(stamp_ns, time_s, position, *tips, foretold, expected.response)
+        self.response.add(stamp_ns, time_s, position, *tips, predictive, expected.response)
         if self.instead:
-            self.instead.add(stamp_ns, time_s, position, *through(self._file, *tips), foretold, NONE_OF_THEM)
+            self.instead.add(
+                stamp_ns, time_s, position, *through(self._file, *tips), predictive, NONE_OF_THEM
+            )
         seen = through(expected.model, *tips)
         for search in (self.late, self.behind):
-            search.add(stamp_ns, time_s, position, *seen, foretold, delay)
+            search.add(stamp_ns, time_s, position, *seen, predictive, delay)
 
     def other(self, expected: ExpectedTracker, delay: float) -> float:
         """Probability of something else than the filter counts on."""
