@@ -42,12 +42,10 @@ def output_folder(path: Path) -> Path:
     """The folder ``path``, made where it does not exist.
 
     Raises:
-        InputError: it is a file, its own folder does not exist, or it cannot be made or written to.
+        InputError: it is a file, or cannot be made or written to.
     """
-    if not path.absolute().parent.is_dir():
-        raise InputError(f"the folder {path.parent} does not exist", where=str(path), do="create it first")
     try:
-        path.mkdir(exist_ok=True)
+        path.mkdir(parents=True, exist_ok=True)
     except FileExistsError:
         raise InputError("is a file, a folder is expected", where=str(path), do="name another") from None
     except OSError as error:
