@@ -19,7 +19,9 @@ from ctr_dynamics.estimation.inputs.input_buffer import InputBuffer
 from ctr_dynamics.estimation.monitoring.end_of_jitter import EndOfJitter
 from ctr_dynamics.estimation.monitoring.health import Health
 from ctr_dynamics.estimation.monitoring.model_error_search import ModelErrorSearch
+from ctr_dynamics.estimation.monitoring.moving_start import MovingStart
 from ctr_dynamics.estimation.monitoring.response_search import in_words
+from ctr_dynamics.estimation.monitoring.timing_in_motion import TimingInMotion
 from ctr_dynamics.estimation.monitoring.tracker_timing import TrackerTiming
 from ctr_dynamics.estimation.open_loop import OpenLoopRun
 from ctr_dynamics.estimation.step_output import MOVING_FRAME, UNKNOWN_DELAY, MotionPoint
@@ -60,7 +62,7 @@ class Alternatives:
         health: where it is noted.
 
     Attributes:
-        timing, model_error, end_of_jitter: the searches.
+        timing, model_error, end_of_jitter: the searches. usual_timing: that of timing where the open-loop run moves as the robot does.
         probability: that anything else is right than the filter counts on. reason_not_to_fuse: that of what measurements are not fused for.
         late: whether the tracker is late by a time that is not known yet. doubted: whether its latency has probably changed, and has to last before
             it is followed. moving: whether its frame moves. Measurements are then compared and not fused.
@@ -72,7 +74,9 @@ class Alternatives:
         noise, length, file = robot.tracker.noise, float(robot.lengths[0]), ekf.tracker.state_sigma
         registered = math.hypot(file[TRANSLATION].max(), length * file[ROTATION].max())
         change_s = ekf.options.force_change
-        self.timing = TrackerTiming(noise.position.value, change_s, length, registered, ekf.tracker)
+        self._moves = noise.position.value, change_s, length, registered
+        self.usual_timing = TrackerTiming(*self._moves, ekf.tracker)
+        self.timing: TrackerTiming | TimingInMotion = self.usual_timing
         self.model_error = ModelErrorSearch(
             noise.position.value, noise.rotation.value, length, registered, change_s
         )
@@ -81,7 +85,8 @@ class Alternatives:
 
     def clear(self) -> None:
         """Forget all measurements."""
-        self.timing.clear()
+        self.usual_timing.clear()
+        self.timing = self.usual_timing
         self.model_error.clear()
         self.end_of_jitter.clear()
         self.late = self.doubted = self.moving = False
@@ -93,19 +98,14 @@ class Alternatives:
         # step, since when the latency has probably changed; None where it has not
         self._doubted_since: int | None = None
 
-    def clear_timing(self) -> None:
-        """Forget what measurements told of the tracker's timing."""
-        self.count()
-        self.timing.clear()
-        self._weigh()
-
     def starts_in_motion(self, modes: VibrationErrors) -> None:
         """The open-loop run lacks the vibration that the robot has, in its ``modes``; the filter begins again with one of any phase."""
         self.count()
-        if self.timing.moving:
-            self.timing.begin_again(self._ekf.expected, self._ekf.delay)
+        if self.timing is self.usual_timing:
+            self.usual_timing.clear()
+            self.timing = TimingInMotion(MovingStart(*self._moves, modes))
         else:
-            self.timing.starts_in_motion(modes)
+            self.timing.begin_again(self._ekf.expected, self._ekf.delay)
         self._weigh()
 
     def clear_model_error(self) -> None:
@@ -142,8 +142,10 @@ class Alternatives:
             self.end_of_jitter.add(stamp_ns, update.half_jitter_gain)
             newest_s = time_s - expected.model.delay
             self.timing.add(stamp_ns, newest_s, seen, tips, update.predictive, expected, delay)
+            if not self.timing.lacking_m:
+                self.timing = self.usual_timing
             if expected.slower:
-                expected.refine(*self.timing.response.refined(expected.response))
+                expected.refine(*self.usual_timing.response.refined(expected.response))
             self.model_error.add(
                 stamp_ns,
                 seen,
@@ -244,7 +246,7 @@ class Alternatives:
 
     def _doubt(self, k: int) -> None:
         """Doubt a latency that has probably changed for as long as the longest delay needs to show, also where no measurement comes."""
-        since, longest_s = self._doubted_since, self.timing.late.options.longest_s
+        since, longest_s = self._doubted_since, self.usual_timing.late.options.longest_s
         self.doubted = since is not None and seconds(k - since) <= longest_s
 
     def _follow_jitter(self, k: int) -> bool:

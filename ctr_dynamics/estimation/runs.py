@@ -62,7 +62,7 @@ class Runs:
         self.open_loop = OpenLoopRun(
             nominal,
             RunInputs(self._interpolated, load, no_effect, np.zeros(0)),
-            ekf.tips.size + math.ceil(self.fused.alternatives.timing.reach_s / DT),
+            ekf.tips.size + math.ceil(self.fused.alternatives.usual_timing.reach_s / DT),
         )
         self.clear()
 

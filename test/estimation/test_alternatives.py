@@ -100,7 +100,7 @@ def test_while_the_latency_is_doubted_the_open_loop_run_is_published_with_room_f
         if 2.02e9 <= message.stamp < 2.5e9:
             message.give(made)
     outputs = made.advance()
-    until = 2.0 + alternatives.timing.late.options.longest_s
+    until = 2.0 + alternatives.usual_timing.late.options.longest_s
     for out in outputs[:: len(outputs) // 8]:
         same = out.tip_position.tolist() == out.predicted_position.tolist()
         assert same == ((out.stamp_ns - START_NS) * 1e-9 < until)

@@ -12,10 +12,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ctr_dynamics.estimation.discretisation import VibrationErrors
 from ctr_dynamics.estimation.filter.expected_tracker import ExpectedTracker, response_of
 from ctr_dynamics.estimation.monitoring.delay_search import CLOCK_BEHIND, DelaySearch
-from ctr_dynamics.estimation.monitoring.moving_start import MovingStart
 from ctr_dynamics.estimation.monitoring.response_search import ResponseSearch, through
 from ctr_dynamics.sensing import TrackerModel
 
@@ -46,7 +44,6 @@ class TrackerTiming:
     Attributes:
         late, behind: delays beside the response that the filter counts on. response: responses without a delay.
         instead: delays in place of a response that was found; None where none is.
-        moving: delays beside vibrations that the open-loop run lacks, in place of all others; None where it lacks none.
     """
 
     def __init__(
@@ -54,7 +51,6 @@ class TrackerTiming:
     ) -> None:
         self._moves, self._file = (noise, change_s, length, registered), file
         self.instead: DelaySearch | None = None
-        self.moving: MovingStart | None = None
         self.late, self.behind = DelaySearch(*self._moves), DelaySearch(*self._moves, CLOCK_BEHIND)
         self.response = ResponseSearch(*self._moves)
 
@@ -69,23 +65,8 @@ class TrackerTiming:
 
     def clear(self) -> None:
         """Forget all measurements."""
-        self.moving = None
         for search in self._all:
             search.clear()
-
-    def starts_in_motion(self, modes: VibrationErrors) -> None:
-        """The open-loop run has started at rest, and the robot has not: it may vibrate in its ``modes``."""
-        self.clear()
-        self.moving = MovingStart(*self._moves, modes)
-
-    def on_time(self, delay: float) -> bool:
-        """Whether measurements show that the tracker has that ``delay`` (s); also where nothing makes that doubtful."""
-        return self.moving is None or self.moving.shows(delay)
-
-    @property
-    def lacking_m(self) -> float:
-        """m, deviation of the tip by vibrations that the open-loop run lacks."""
-        return self.moving.vibrates_m if self.moving else 0.0
 
     def add(
         self, stamp_ns: int, time_s: float, position: Floats, tips: tuple[Floats, Floats], predictive: tuple[float, float],
@@ -100,11 +81,6 @@ class TrackerTiming:
             predictive: logarithms of the densities that the filter predicted; see :class:`~ctr_dynamics.estimation.filter.filter_records.Update`.
             expected, delay: the tracker and its delay beyond the nominal one (s), with which the filter has met it.
         """
-        if self.moving:
-            self.moving.add(stamp_ns, time_s, position, *through(expected.model, *tips), predictive, delay)
-            if not self.moving.vibrates_m:
-                self.moving = None
-            return
         self.response.add(stamp_ns, time_s, position, *tips, predictive, expected.response)
         if self.instead:
             self.instead.add(
@@ -116,23 +92,16 @@ class TrackerTiming:
 
     def other(self, expected: ExpectedTracker, delay: float) -> float:
         """Probability of something else than the filter counts on."""
-        if self.moving:
-            return self.moving.belief(delay).late
         instead = self.instead.belief(NONE_OF_THEM).late if self.instead else 0.0
         response = self.response.belief(expected.response)
         return max(self.late.belief(delay).late, self.behind.belief(delay).late, response.late, instead)
 
     def changed(self, delay: float) -> float:
         """Probability of another delay than ``delay`` (s), beside the response that the filter counts on."""
-        if self.moving:
-            return self.moving.belief(delay).late
         return max(self.late.belief(delay).late, self.behind.belief(delay).late)
 
     def found(self, expected: ExpectedTracker, delay: float) -> Found | None:
         """What is believed instead of the ``expected`` tracker with the estimated ``delay`` (s); None where nothing is."""
-        if self.moving:
-            late = self.moving.always(delay)
-            return late and Found(late[0], None, late[1])
         if self.instead and not self.response.explains_better(self.instead):
             late = self.instead.always(NONE_OF_THEM)
             if late is not None:
@@ -152,20 +121,14 @@ class TrackerTiming:
     @property
     def apart(self) -> float:
         """m between the measurements and the open-loop run with the delay or response that brings them together most."""
-        searches = (self.moving,) if self.moving else (self.late, self.response)
-        return min((search.apart for search in searches if search.knows), default=0.0)
+        return min((search.apart for search in (self.late, self.response) if search.knows), default=0.0)
 
     def undecided(self, expected: ExpectedTracker, delay: float) -> bool:
         """Whether the tracker has been late since the start, nobody knows yet in which way; to be asked where nothing is :meth:`found`."""
-        if self.moving:
-            return self.moving.undecided(delay)
         return self.late.undecided(delay) or self.response.undecided(expected.response)
 
     def followed(self, found: Found) -> None:
         """The filter goes on from the open-loop run with what was ``found``."""
-        if self.moving and found.delay is not None:
-            self.moving.begin_again(found.delay)
-            return
         if found.delay is None:
             assert found.response is not None
             gain = self.response.begin_again(found.response)
@@ -186,11 +149,17 @@ class TrackerTiming:
 
     def begin_again(self, expected: ExpectedTracker, delay: float) -> None:
         """The filter goes on from the open-loop run with the delay and response that it has."""
-        if self.moving:
-            self.moving.begin_again(delay)
-            return
         for search in (self.late, self.behind):
             search.begin_again(delay)
         gain = self.response.begin_again(expected.response)
         if self.instead:
             self.instead.foretells_better(gain)
+
+    def on_time(self, delay: float) -> bool:
+        """Whether measurements have shown that the tracker has that ``delay`` (s): nothing makes it doubtful."""
+        return True
+
+    @property
+    def lacking_m(self) -> float:
+        """m, deviation of the tip by vibrations that the open-loop run lacks."""
+        return 0.0
