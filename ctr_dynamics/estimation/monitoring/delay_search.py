@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from ctr_dynamics.estimation.filter.adapted_variances import AdaptationOptions
 from ctr_dynamics.estimation.monitoring.densities import density_of_filter, log_changed
 from ctr_dynamics.estimation.monitoring.moved_tracker import Moved, MovedTracker
-from ctr_dynamics.estimation.monitoring.taken_again import drop_from
+from ctr_dynamics.estimation.monitoring.taken_again import REMEMBERED, drop_from
 from ctr_dynamics.kernels.delay_evidence import compare_delays, weigh_changes, weigh_delays
 from ctr_dynamics.kernels.parabolas import fill_between
 
@@ -60,7 +60,7 @@ class DelaySearchOptions:
     sound_s: float = AdaptationOptions.sound_s
     lasts_s: float = 0.2
     settles_s: float = 0.0
-    remembered: int = 200
+    remembered: int = REMEMBERED
 
 
 CLOCK_BEHIND = DelaySearchOptions(earliest_s=0.1)

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctr_dynamics import chi_square
-from ctr_dynamics.estimation.monitoring.taken_again import drop_from
+from ctr_dynamics.estimation.monitoring.taken_again import REMEMBERED, drop_from
 
 Floats = NDArray[np.float64]
 LAST = 8  # residuals that are looked at, 0.2 s at 40 Hz: an error of 0.1 s shows in them
@@ -22,7 +22,6 @@ LAGS = 1, 2, 3  # of their correlations: a vibration of a fourth of the tracker'
 CHANCE = 1e-3  # probability with which noise alone seems to be correlated
 DEVIATIONS = 3.0  # of the noise of a change, beyond which it is a jump
 TIMES = 2.0  # as far as the model, by which measurements jump where the tracker does
-REMEMBERED = 200  # measurements that may be taken again
 
 
 class Measured(NamedTuple):

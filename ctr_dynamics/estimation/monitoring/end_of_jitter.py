@@ -6,10 +6,9 @@ import math
 from collections import deque
 from typing import NamedTuple
 
-from ctr_dynamics.estimation.monitoring.taken_again import drop_from
+from ctr_dynamics.estimation.monitoring.taken_again import REMEMBERED, drop_from
 
 ODDS = 1e4  # measurements between two false alarms at least (Lorden 1971): four minutes at 40 Hz; jitter that is still there is found again
-REMEMBERED = 200  # measurements that may be taken again
 
 
 class Sum(NamedTuple):

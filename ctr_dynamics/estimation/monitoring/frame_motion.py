@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from ctr_dynamics.estimation.filter.adapted_variances import AdaptationOptions
 from ctr_dynamics.estimation.monitoring.densities import log_changed, log_density
-from ctr_dynamics.estimation.monitoring.taken_again import drop_from
+from ctr_dynamics.estimation.monitoring.taken_again import REMEMBERED, drop_from
 from ctr_dynamics.kernels.motion_regression import correct_motions
 
 Floats = NDArray[np.float64]
@@ -41,7 +41,6 @@ class FrameMotionOptions:
         believed: probability from which on it is: that of even odds, since measurements that are not fused for a while cost as much as those that
             lead the estimate astray. doubted: probability below which it is not believed any more; in between, nothing changes.
         lasts_s: s, for which it has been that likely before it is believed. A vibration looks like a motion for less than half a period.
-        remembered: measurements that may be taken again.
     """
 
     slowest: float = 1.0
@@ -54,7 +53,6 @@ class FrameMotionOptions:
     believed: float = 0.5
     doubted: float = 0.1
     lasts_s: float = 1.0
-    remembered: int = 200
 
 
 class Motion(NamedTuple):
@@ -101,7 +99,7 @@ class FrameMotion:
 
     def clear(self) -> None:
         """Forget all measurements."""
-        self._known: deque[Motion] = deque(maxlen=self.options.remembered)
+        self._known: deque[Motion] = deque(maxlen=REMEMBERED)
 
     def add(
         self, stamp_ns: int, position: Floats, residual: Floats, before: float, now: float, other: float

@@ -30,7 +30,7 @@ from ctr_dynamics.estimation.monitoring.moved_tracker import Moved, MovedTracker
 from ctr_dynamics.estimation.monitoring.noisy_tracker import NoisyTracker
 from ctr_dynamics.estimation.monitoring.smooth_departure import SmoothDeparture
 from ctr_dynamics.estimation.monitoring.stamp_jitter import StampJitter
-from ctr_dynamics.estimation.monitoring.taken_again import drop_from
+from ctr_dynamics.estimation.monitoring.taken_again import REMEMBERED, drop_from
 
 Floats = NDArray[np.float64]
 CONSTANT, REST = -2, -1  # rows beyond those of the departures
@@ -52,7 +52,6 @@ class ModelErrorSearchOptions:
             begin of a vibration is no slow departure yet.
         sound_s: s, mean time after which a tracker or its sensor is moved.
         memory_s: s, for which evidence counts.
-        remembered: measurements that may be taken again.
     """
 
     smallest: float = 2.0
@@ -65,7 +64,6 @@ class ModelErrorSearchOptions:
     least_s: float = 3.0
     sound_s: float = AdaptationOptions.sound_s
     memory_s: float = 10.0
-    remembered: int = 200
 
 
 class Evidence(NamedTuple):
@@ -141,7 +139,7 @@ class ModelErrorSearch:
 
     def clear(self) -> None:
         """Forget all measurements."""
-        self._evidence: deque[Evidence] = deque(maxlen=self.options.remembered)
+        self._evidence: deque[Evidence] = deque(maxlen=REMEMBERED)
         self._begin_ns = 0
         self._compared: tuple[ModelErrorSize, Floats] | None = None
         self._scatter: tuple[float, tuple[float, float]] | None = None

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctr_dynamics.estimation.monitoring.densities import student_peak
-from ctr_dynamics.estimation.monitoring.taken_again import drop_from
+from ctr_dynamics.estimation.monitoring.taken_again import REMEMBERED, drop_from
 
 Floats = NDArray[np.float64]
 
@@ -30,7 +30,6 @@ class NoisyTrackerOptions:
         freedom: degrees of Student's distribution; 3 have the least tails for which the variance exists.
         prior: probability of a tracker that is noisier than its file says.
         memory_s: s, for which evidence counts.
-        remembered: measurements that may be taken again.
     """
 
     smallest: float = 2.0
@@ -38,7 +37,6 @@ class NoisyTrackerOptions:
     freedom: float = 3.0
     prior: float = 0.01
     memory_s: float = 10.0
-    remembered: int = 200
 
 
 class Noise(NamedTuple):
@@ -76,7 +74,7 @@ class NoisyTracker:
 
     def clear(self) -> None:
         """Forget all measurements."""
-        self._known: deque[Noise] = deque(maxlen=self.options.remembered)
+        self._known: deque[Noise] = deque(maxlen=REMEMBERED)
 
     def add(self, stamp_ns: int, residual: Floats) -> float:
         """Take in a measurement that lies ``residual`` (3,) m from the open-loop tip; one of a stamp that is known takes its place.

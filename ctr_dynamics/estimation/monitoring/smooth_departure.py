@@ -14,10 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctr_dynamics.estimation.monitoring.densities import log_density
-from ctr_dynamics.estimation.monitoring.taken_again import drop_from
+from ctr_dynamics.estimation.monitoring.taken_again import REMEMBERED, drop_from
 
 Floats = NDArray[np.float64]
-REMEMBERED = 200  # measurements that may be taken again
 
 
 class Smooth(NamedTuple):

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctr_dynamics.estimation.monitoring.densities import student_peak
-from ctr_dynamics.estimation.monitoring.taken_again import drop_from
+from ctr_dynamics.estimation.monitoring.taken_again import REMEMBERED, drop_from
 from ctr_dynamics.kernels.jitter_update import correct_departures
 
 Floats = NDArray[np.float64]
@@ -33,7 +33,6 @@ class StampJitterOptions:
         freedom: degrees of Student's distribution; outliers do not speak for or against jitter.
         lasts_s: s, for which it has been likely before it is believed. Outliers look like it for a moment.
         memory_s: s, for which evidence counts.
-        remembered: measurements that may be taken again.
     """
 
     smallest_s: float = 0.001
@@ -44,7 +43,6 @@ class StampJitterOptions:
     freedom: float = 3.0
     lasts_s: float = 0.2
     memory_s: float = 10.0
-    remembered: int = 200
 
 
 class Jitter(NamedTuple):
@@ -85,7 +83,7 @@ class StampJitter:
 
     def clear(self) -> None:
         """Forget all measurements."""
-        self._known: deque[Jitter] = deque(maxlen=self.options.remembered)
+        self._known: deque[Jitter] = deque(maxlen=REMEMBERED)
 
     def add(self, stamp_ns: int, residual: Floats, velocity: Floats, acceleration: Floats) -> float:
         """Take in a measurement that lies ``residual`` (3,) m from the open-loop tip of ``velocity`` (3,) m/s; one of a stamp that is known takes its

@@ -5,6 +5,10 @@ from __future__ import annotations
 from collections import deque
 from typing import Protocol, TypeVar
 
+REMEMBERED = (
+    200  # measurements; corrections reach back over a window of 0.2 s by default and 2 s at most: 80 at 40 Hz
+)
+
 
 class Stamped(Protocol):
     """What is known up to a measurement."""
