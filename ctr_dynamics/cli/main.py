@@ -189,6 +189,22 @@ def _unwritable(error: OSError) -> int:
     return BAD_INPUT
 
 
+def _misused(error: Exception) -> int:
+    """One line on arguments that are no command's; other errors go on.
+
+    The parser's errors have no class of one name over the versions of typer.
+    """
+    if not hasattr(error, "format_message"):
+        raise error
+    context = getattr(error, "ctx", None)
+    if type(error).__name__ == "NoArgsIsHelpError":
+        print(context.get_help() if context else error.format_message())
+        return BAD_INPUT
+    path = context.command_path if context else "ctr-dynamics"
+    fail(f"{error.format_message().rstrip('.')}; see `{path} --help`")
+    return BAD_INPUT
+
+
 def _warn(
     message: Warning | str,
     category: type[Warning],
@@ -226,16 +242,17 @@ def main(argv: list[str] | None = None) -> int:
     try:
         with warnings.catch_warnings():
             warnings.showwarning = _warn
-            build_app(requested)(args=arguments, prog_name="ctr-dynamics")
+            returned = build_app(requested)(args=arguments, prog_name="ctr-dynamics", standalone_mode=False)
+        code = returned if isinstance(returned, int) else FINISHED
     except SystemExit as end:
         code = end.code if isinstance(end.code, int) else (FINISHED if end.code is None else BAD_INPUT)
-    except KeyboardInterrupt:
+    except (KeyboardInterrupt, typer.Abort):
         fail("interrupted")
         return INTERRUPTED
     except OSError as error:
         return _unwritable(error)
-    else:
-        code = FINISHED
+    except Exception as error:
+        code = _misused(error)
     try:
         sys.stdout.flush()
     except BrokenPipeError:

@@ -184,3 +184,29 @@ def test_termination_leaves_no_parts_of_files(tmp_path):
     assert process.returncode == 130, error
     assert error.endswith("ctr-dynamics: error: terminated\n")
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (["replay", "a.mcap", "--robbot", "x"], "No such option: --robbot"),
+        (["replay"], "Missing argument"),
+        (["align", "a.mcap"], "Missing option"),
+        (["diagnose", "a.mcap", "--workers", "0"], "'--workers'"),
+        (["relpay"], "No such command 'relpay'"),
+        (["robot", "chek"], "No such command 'chek'"),
+    ],
+)
+def test_misused_arguments_are_one_line(capsys, arguments, says):
+    assert cli.main(arguments) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("ctr-dynamics: error: ")
+    assert error.count("\n") == 1
+    assert says in error
+    assert "--help`" in error
+
+
+@pytest.mark.parametrize("arguments", [[], ["robot"]])
+def test_without_a_command_the_help_is_shown(capsys, arguments):
+    assert cli.main(arguments) == 2
+    assert "Usage: ctr-dynamics" in capsys.readouterr().out
