@@ -125,7 +125,11 @@ def read_poses(path: Path, model: Model, measured: bool = False) -> tuple[list[P
             reader = csv.reader(stream, strict=True)
             lines = [(reader.line_num, cells) for cells in reader if any(cell.strip() for cell in cells)]
     except UnicodeDecodeError as error:
-        raise InputError(f"not UTF-8 at byte {error.start}", do="save as UTF-8 text", where=where) from None
+        raise InputError(
+            f"not UTF-8 at byte {error.start}",
+            do="save as UTF-8 text; the tips of a bag are compared with --measured",
+            where=where,
+        ) from None
     except csv.Error as error:
         raise InputError(f"not a CSV file: {error}", do="separate columns by commas", where=where) from None
     except OSError as error:
