@@ -264,3 +264,13 @@ def test_messages_lost_from_even_stamps_are_no_coarse_stamps(stamps):
     messages = [(T0 + k * 10_000_000, None) for k in range(600) if rng.random() > 0.3]
     feed(stamps, messages)
     assert not list(stamps.findings)
+
+
+@pytest.mark.parametrize("before", range(1, 15))
+def test_a_pause_soon_after_the_start_is_got_over(stamps, before):
+    """As where a node is stopped for a moment: the rhythm is taken from the stretch behind it."""
+    pause = 4_000_000_000
+    messages = even(before + 40)
+    later = [(s + pause, a + pause) for s, a in messages[before:]]
+    assert {v.use for v in feed(stamps, messages[:before] + later)} == {"accept"}
+    assert stamps.rhythm_s == pytest.approx(0.025)

@@ -155,8 +155,8 @@ class StampChecks:
         self._arrival_ns = arrival_ns
         hurried = not self.mode and 0 < step < self.limits.short_interval * self._steady_ns
         if hurried and self._even:  # the rhythm is over: look at what follows by itself
-            self._steps.clear()
-            self._total, self._even = 0, False
+            self._forget_steps()
+            self._even = False
         self._step(stamp_ns, step, pause, at)
         self.newest_ns = stamp_ns
         if self._taken % LOOK_EVERY == 0 or hurried or (self.mode and step > 0):
@@ -265,8 +265,8 @@ class StampChecks:
         """Note the step from the newest stamp."""
         if step > max(LEAP_S * 1e9, 20.0 * self._period_ns) and self._standing < STANDING:
             self._before_leap_ns, self._since_leap, self._resumes = self.newest_ns, 1, True
-            self._steps.clear()
-            self._total = self._standing = 0
+            self._forget_steps()
+            self._standing = 0
             return
         if step > max(2.0 * self.limits.gap_s * 1e9, 5.0 * self._period_ns):
             self._before_leap_ns, self._since_leap = self.newest_ns, 0
@@ -285,6 +285,13 @@ class StampChecks:
             self._standing, self._moving = self._standing + 1, 0
         if len(self._steps) >= 8 and not self.mode:
             self._period_ns = max(self._total / len(self._steps), 1.0)
+
+    def _forget_steps(self) -> None:
+        """What follows is another stretch; a rhythm that is not known yet is its own."""
+        self._steps.clear()
+        self._total = 0
+        if self._follow <= RHYTHM_FROM:
+            self._follow = 0
 
     def _look(self) -> None:
         """Name the pattern of the last stamps."""
