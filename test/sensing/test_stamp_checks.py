@@ -274,3 +274,12 @@ def test_a_pause_soon_after_the_start_is_got_over(stamps, before):
     later = [(s + pause, a + pause) for s, a in messages[before:]]
     assert {v.use for v in feed(stamps, messages[:before] + later)} == {"accept"}
     assert stamps.rhythm_s == pytest.approx(0.025)
+
+
+@pytest.mark.parametrize("before", range(6, 60))
+def test_a_pause_amid_bursts_is_got_over(stamps, before):
+    """Also where they have just been recognised, and the place of the last message in its burst was not known."""
+    stamped = [stamp + 4_000_000_000 * (k >= before) for k, (_, stamp) in enumerate(bursts(before + 60))]
+    verdicts = feed(stamps, [(stamp, stamp) for stamp in stamped])
+    assert verdicts[-1].kind is Kind.BURSTS
+    assert verdicts[-1].use == "correct"

@@ -375,7 +375,7 @@ class StampChecks:
             )
             self.findings.add(Kind.BURSTS, at, size, "", text)
             if self.retiming is None:
-                if not begins_burst(self._steps[-1][0], self._burst_ns):
+                if self._steps and not begins_burst(self._steps[-1][0], self._burst_ns):
                     # its place in its burst is not known
                     return Verdict("drop", Kind.BURSTS, text)
                 self.retiming = Retiming(stamp_ns - round(self._burst_ns))
