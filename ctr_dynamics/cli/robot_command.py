@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -134,12 +135,13 @@ def new(options: NewOptions) -> int:
         sheets.Sheet(options.name or file.stem, tuple(tubes), options.gravity, axes=options.axes), **values
     )
     robot = sheets.robot_from_sheet(sheet)
-    said = sheets.ASSUMED if sheet.beta and sheet.alpha else (*sheets.ASSUMED, sheets.REST_ASSUMED)
+    assumed = sheets.rest_assumed(sheet)
     with atomic_file(file) as temporary:
-        temporary.write_text(sheets.robot_file_text(robot, said), encoding="utf-8")
+        text = sheets.robot_file_text(robot, [*sheets.ASSUMED, *assumed])
+        temporary.write_text(text, encoding="utf-8")
     _show(robot)
-    if not (sheet.beta and sheet.alpha):
-        print(f"ctr-dynamics: note: {sheets.REST_ASSUMED}", file=sys.stderr)
+    for line in assumed:
+        print(f"ctr-dynamics: note: {line}", file=sys.stderr)
     print(f"output  {file}")
     return 0
 
@@ -209,10 +211,8 @@ def _rest(robot: Robot) -> bool:
         print("ctr-dynamics: warning: no static equilibrium was found at rest", file=sys.stderr)
         return False
     x, y, z = 1e3 * found.tip_position
-    beta, alpha = (
-        ", ".join(f"{factor * value:.2f}" for value in values.value)
-        for factor, values in ((1e3, robot.rest.beta), (57.29577951308232, robot.rest.alpha))
-    )
+    beta = ", ".join(f"{1e3 * x:.2f}" for x in robot.rest.beta.value)
+    alpha = ", ".join(f"{math.degrees(x):.2f}" for x in robot.rest.alpha.value)
     print(f"rest         beta {beta} mm, alpha {alpha} deg")
     print(f"tip at rest  {x:.2f}, {y:.2f}, {z:.2f} mm in ctr_base")
     return True

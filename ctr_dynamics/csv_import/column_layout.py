@@ -154,16 +154,14 @@ def layout_of_header(kind: Kind, header: list[str], where: str) -> Source:
     time: TimeColumn | None = None
     values: dict[str, Column] = {}
     for cell in header:
-        name, unit = _split(cell)
-        if again := _AGAIN.fullmatch(cell):
-            name, unit = _split(again[1])
-            if known(kind, name) or name in _TIME:
-                raise InputError(
-                    f"column '{again[1]}' is there {again[2]} times",
-                    do="leave one of them, or give --layout",
-                    where=where,
-                )
-            continue
+        again = _AGAIN.fullmatch(cell)
+        name, unit = _split(again[1] if again else cell)
+        if again and (known(kind, name) or name in _TIME):
+            raise InputError(
+                f"column '{again[1]}' is there {again[2]} times",
+                do="leave one of them, or give --layout",
+                where=where,
+            )
         if name in _TIME:
             if unit:
                 factor(unit, "s", f"{where}: column '{cell}'")

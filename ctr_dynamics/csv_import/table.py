@@ -110,12 +110,11 @@ class CsvTable:
                 except (csv.Error, ValueError):
                     faults.add(number, "is not a row of a CSV file")
                     continue
-                if len(cells) < len(self.header):
-                    faults.add(number, f"{len(cells)} cells for {len(self.header)} columns")
-                    continue
-                if any(cells[len(self.header) :]):  # an empty one is what a separator at the end leaves
-                    comma = " (decimal commas need another separator)" if self.delimiter == "," else ""
-                    faults.add(number, f"{len(cells)} cells for {len(self.header)} columns{comma}")
+                spare = any(cells[len(self.header) :])  # an empty one is what a separator at the end leaves
+                if spare or len(cells) < len(self.header):
+                    commas = spare and self.delimiter == ","
+                    hint = " (decimal commas need another separator)" if commas else ""
+                    faults.add(number, f"{len(cells)} cells for {len(self.header)} columns{hint}")
                     continue
                 chosen = [cells[place] for place in places]
                 if self.delimiter != ",":

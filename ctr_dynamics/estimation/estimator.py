@@ -406,7 +406,7 @@ class Estimator:
         innovations = self.innovations.take()
         self._settling.take(innovations, fused.ekf.tracker_fault()[0] > 0.0)
         health.refutation = fused.ekf.refutation()
-        unsettled = self._settling.problem(stamp, fused.alternatives.timing.on_time(fused.ekf.delay))
+        unsettled = self._settling.problem(stamp, fused.on_time)
         if self._settling.begun:
             return self._begin_vibrating(k, unsettled, innovations)
         confirmed = fused.agreed or bool(unsettled) or not health.fusing

@@ -93,6 +93,10 @@ class FusedRun:
         """Whether measurements have agreed since the start."""
         return self.confirmed >= CONFIRMED
 
+    def on_time(self) -> bool:
+        """Whether measurements show that the tracker has the delay that the filter counts on."""
+        return self.alternatives.timing.on_time(self.ekf.delay)
+
     @property
     def pose_period_s(self) -> float:
         """s between two measurements that are fused, at least the time since the last one; infinite while none are."""

@@ -152,7 +152,7 @@ class Runs:
     def conclude(self, moves_as_modelled: bool) -> bool:
         """Whether measurements show that something else is right than the filter counts on: the fused run is to go on from the open-loop run.
 
-        ``moves_as_modelled``: whether the open-loop run moves as the robot does, but for faults. Else how measurements follow it says nothing.
+        ``moves_as_modelled``: whether the open-loop run moves as the robot does, but for faults. Else nothing but the timing is concluded.
         """
         return self.fused.alternatives.conclude(self.open_loop, self.k, moves_as_modelled)
 

@@ -340,6 +340,12 @@ def _curvature(data: Mapping[str, Measured], where: str) -> Measured:
     return Measured(1 / radius.value, abs(radius.relative / radius.value))
 
 
+def rest_assumed(sheet: Sheet) -> list[str]:
+    """What of the rest position is assumed, as the ``sheet`` does not say it."""
+    said = {"Rest position: bases 10 mm apart": sheet.beta, "Rest angles: zero": sheet.alpha}
+    return [f"{text}, as none was given." for text, given in said.items() if not given]
+
+
 def robot_file_text(robot: Robot, said: Sequence[str]) -> str:
     """Text of the robot file, with `said` (what was assumed) as comments at its head."""
     head = [
@@ -350,7 +356,6 @@ def robot_file_text(robot: Robot, said: Sequence[str]) -> str:
     return "".join(f"# {line}\n" for line in head) + robot_to_yaml(robot)
 
 
-REST_ASSUMED = "Rest position: bases 10 mm apart and angles zero, as none was given."
 ASSUMED = (
     "Assumed, not measured: friction (Till et al. 2020, Table III, 50 %), drift of the tracker (a quarter of its noise over 2 s),",
     "direction of gravity within 0.2 deg. Deviations of the diameters are contained in those of the moduli and of density.",

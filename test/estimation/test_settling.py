@@ -29,7 +29,7 @@ def test_outputs_count_again_after_measurements_in_a_row():
         settling.take([innovation(1101 + i)])
     assert settling.problem(1200 * MS)
     settling.take([innovation(1201)])
-    assert settling.problem(1202 * MS, on_time=False), "a late tracker agrees as well"
+    assert settling.problem(1202 * MS, on_time=lambda: False), "a late tracker agrees as well"
     assert not settling.problem(1202 * MS)
     settling.begin(2000 * MS, "again")
     assert settling.problem(1999 * MS + round(options.longest_s * 1e9))

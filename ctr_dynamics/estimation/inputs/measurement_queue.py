@@ -167,16 +167,13 @@ class MeasurementQueue:
         assert t0_ns is not None
         due = []
         for measurement in self.measurements:
+            if measurement.fused_k is not None:
+                continue
             if self._shown_s(measurement) > t + 1e-9:
                 break  # so are all behind it
-            if measurement.fused_k is None:
-                stamp_s = (measurement.stamp_ns - t0_ns) * 1e-9
-                due.append(
-                    DueMeasurement(
-                        measurement,
-                        *tracker.undistorted(stamp_s, measurement.position, measurement.quaternion),
-                    )
-                )
+            stamp_s = (measurement.stamp_ns - t0_ns) * 1e-9
+            undistorted = tracker.undistorted(stamp_s, measurement.position, measurement.quaternion)
+            due.append(DueMeasurement(measurement, *undistorted))
         return due
 
     def first_fusion(self, k: int) -> float:

@@ -209,15 +209,17 @@ class DelaySearch:
 
     def _take(self, measured: Waiting, stamps: Floats, tips: Floats) -> None:
         """Have a measurement count that all tips (k, 3) m of the open-loop run are known for; ``stamps`` (k,) s."""
-        stamp_ns, time_s, position, predictive, present_s = measured
-        shown = self.shown(time_s, stamps, tips)
-        if shown is None:
-            return
-        self._belief = None
-        residual = position - shown
+        shown = self.shown(measured.time_s, stamps, tips)
+        if shown is not None:
+            self._belief = None
+            self._count(measured, measured.position - shown)
+
+    def _count(self, measured: Waiting, residual: Floats) -> None:
+        """Evidence with a measurement that lies ``residual`` (d, 3) m from the open-loop run with every delay."""
+        stamp_ns, predictive, present_s = measured.stamp_ns, measured.predictive, measured.present_s
         noise = self._noise**2
         if not self._evidence:
-            none, began = np.zeros(len(shown)), np.full(len(shown), stamp_ns)
+            none, began = np.zeros(len(residual)), np.full(len(residual), stamp_ns)
             moved = self._moved.begin(residual[int(np.argmin(np.abs(self.delays - present_s)))])
             self._evidence.append(
                 Evidence(stamp_ns, residual, noise, none, 0.0, none, began, residual, moved)

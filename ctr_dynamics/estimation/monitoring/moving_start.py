@@ -71,32 +71,24 @@ class MovingStart(DelaySearch):
             transition[i : i + 2, i : i + 2] = [[z.real, -z.imag], [z.imag, z.real]]
         return transition, np.repeat(-np.expm1(-2.0 * self._astray * elapsed), 2)
 
-    def _take(self, measured: Waiting, stamps: Floats, tips: Floats) -> None:
-        """Have a measurement count that all tips (k, 3) m of the open-loop run are known for; ``stamps`` (k,) s."""
-        stamp_ns, time_s, position, predictive, _ = measured
-        shown = self.shown(time_s, stamps, tips)
-        if shown is None:
-            return
-        self._belief = None
-        residual, noise = position - shown, self._noise**2
-        none, nothing = np.zeros(len(shown)), Moved(np.zeros(3), 0.0, -math.inf)
-        began = np.full(len(shown), stamp_ns)
-        last = self._evidence[-1] if self._evidence else None
+    def _count(self, measured: Waiting, residual: Floats) -> None:
+        """Evidence with a measurement that lies ``residual`` (d, 3) m from the open-loop run with every delay."""
+        stamp_ns, last = measured.stamp_ns, self._evidence[-1] if self._evidence else None
+        none, of_filter = np.zeros(len(residual)), 0.0
         if last is None or last.vibrations is None:
             self._first_ns = stamp_ns
-            known = self._begin(residual)
-            self._evidence.append(
-                Evidence(stamp_ns, residual, noise, none, 0.0, none, began, residual, nothing, known)
-            )
-            return
-        elapsed = (stamp_ns - last.stamp_ns) * 1e-9
-        decay = math.exp(-elapsed / self.options.memory_s)
-        known = self._go_on(last.vibrations, residual, elapsed, decay, (stamp_ns - self._first_ns) * 1e-9)
-        delays = np.logaddexp.reduce(known.evidence, axis=0) - math.log(len(known.evidence))
-        of_filter = density_of_filter(predictive, elapsed / self._change_s) + decay * last.filter
-        level = np.ascontiguousarray(known.states[int(known.evidence.max(axis=1).argmax()), :, :, 0])
+            known, level, delays = self._begin(residual), residual, none
+        else:
+            elapsed = (stamp_ns - last.stamp_ns) * 1e-9
+            decay, since = math.exp(-elapsed / self.options.memory_s), (stamp_ns - self._first_ns) * 1e-9
+            known = self._go_on(last.vibrations, residual, elapsed, decay, since)
+            delays = np.logaddexp.reduce(known.evidence, axis=0) - math.log(len(known.evidence))
+            of_filter = density_of_filter(measured.predictive, elapsed / self._change_s) + decay * last.filter
+            level = np.ascontiguousarray(known.states[int(known.evidence.max(axis=1).argmax()), :, :, 0])
+        # neither a latency that changes nor a tracker that is moved is looked for
+        began, nothing = np.full(len(residual), stamp_ns), Moved(np.zeros(3), 0.0, -math.inf)
         self._evidence.append(
-            Evidence(stamp_ns, level, noise, delays, of_filter, none, began, level, nothing, known)
+            Evidence(stamp_ns, level, self._noise**2, delays, of_filter, none, began, level, nothing, known)
         )
 
     def _begin(self, residual: Floats) -> Vibrations:

@@ -8,7 +8,7 @@ down. Where measurements come and do not agree until then, they have led the est
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -166,7 +166,8 @@ class Settling:
             self.begin(innovation.stamp_ns, STARTED_IN_MOTION)
 
     def lacks_vibration(self, stamp_ns: int) -> bool:
-        """Whether the open-loop run lacks a vibration at ``stamp_ns`` that the robot has: how measurements follow it tells nothing of the tracker."""
+        """Whether the open-loop run lacks a vibration at ``stamp_ns`` that the robot has: how measurements follow it tells little of anything but the
+        tracker's delay."""
         return self._moving_ns is not None and stamp_ns <= self._moving_ns + self.options.longest_s * 1e9
 
     def unseen(self, stamp_ns: int) -> float | None:
@@ -179,13 +180,13 @@ class Settling:
             return None
         return self.apart
 
-    def problem(self, stamp_ns: int, on_time: bool = True) -> str:
-        """Why the output of ``stamp_ns`` does not count yet; empty where it does. ``on_time``: whether the tracker is seen not to be late."""
+    def problem(self, stamp_ns: int, on_time: Callable[[], bool] = lambda: True) -> str:
+        """Why the output of ``stamp_ns`` does not count yet; empty where it does. ``on_time`` tells whether the tracker is seen not to be late."""
         if self._since_ns is None or (self._why == DISAGREED and not self._measured):
             return ""
         options = self.options
         waited = (stamp_ns - self._since_ns) * 1e-9
-        if (self._agreed >= options.agreeing and on_time) or waited > options.longest_s:
+        if (self._agreed >= options.agreeing and on_time()) or waited > options.longest_s:
             astray = self._measured and self._agreed < options.agreeing and self._why != DISAGREED
             self._since_ns = None
             if not astray:

@@ -25,7 +25,7 @@ def all_statuses(health: Health) -> list[Status]:
 
 
 def snap_ahead(health: Health) -> bool:
-    """Whether the equilibrium is lost or unstable, or its loss is predictive: news that cannot wait."""
+    """Whether the equilibrium is lost or unstable, or its loss is foretold: news that cannot wait."""
     return stability(health).level > OK
 
 
