@@ -3,10 +3,11 @@
     python -m studies.designed_experiments --output designed.jsonl --ties 10 --robots tissue,random1,random2
     python -m studies.designed_experiments --output designed.jsonl --table
 
-A case is a true robot drawn from the tolerances of its file, with one effect of the catalogue of 1 to 3 plausible sizes, and a short bag that shows
-little: either all tubes turn, or a small weight is cut and nothing else moves. Where the diagnosis of that bag is `ambiguous`, it is a tie. Then the
-proposed experiment is recorded too, and both bags are diagnosed. The shipped motions are compared by the separation that each would give in addition.
-Those that a robot cannot make without a snap are left out.
+A case is a true robot drawn from the tolerances of its file, and a short bag that shows little: either all tubes turn, or a small weight is cut and
+nothing else moves. Derivatives at the file's values tell which effects of the catalogue, of up to 3 plausible sizes, such a bag would show and
+not tell from another. One of them is drawn, and the bag is recorded with it. Where the diagnosis of that bag is `ambiguous`, it is a tie. Then the
+proposed experiment is recorded too, and both bags are diagnosed. The shipped motions are compared by the separation that each would give in
+addition. Those that a robot cannot make without a snap are left out.
 
 Each outcome is one line of the output; a run that is stopped goes on where it was.
 """
@@ -16,6 +17,7 @@ from __future__ import annotations
 import argparse
 import itertools
 import json
+import math
 import tempfile
 import time
 from pathlib import Path
@@ -25,20 +27,32 @@ import numpy as np
 
 from ctr_dynamics.benchmarks.fleet import record, scenario_for
 from ctr_dynamics.benchmarks.fleet_robots import Draw, drawn, fleet_robot, seed_of
+from ctr_dynamics.diagnosis.diagnosis_options import DiagnosisOptions
 from ctr_dynamics.diagnosis.diagnosis_result import Diagnosis
+from ctr_dynamics.diagnosis.inference.calibration import nuisances_of
+from ctr_dynamics.diagnosis.inference.candidates import Candidate, candidates
+from ctr_dynamics.diagnosis.inference.discretisation_error import choose_nodes
+from ctr_dynamics.diagnosis.inference.fit_problem import choose_steps, make_problem
+from ctr_dynamics.diagnosis.inference.sensitivities import sensitivities_at
+from ctr_dynamics.diagnosis.inference.separation import left_over
 from ctr_dynamics.diagnosis.next_experiment import Contrast, contrast_of, next_experiment
 from ctr_dynamics.diagnosis.pipeline import diagnose_recordings
-from ctr_dynamics.diagnosis.recording import read_recording
+from ctr_dynamics.diagnosis.recording import Recording, measured_axes, read_recording
 from ctr_dynamics.diagnosis.run_context import RunContext
+from ctr_dynamics.effects import effect_quantities
 from ctr_dynamics.robot import Robot
 from ctr_dynamics.robot_files import robot_from_dict, robot_to_dict
 from ctr_dynamics.simulation.motion_primitives import Sine
 from ctr_dynamics.simulation.scenario import Scenario, Solver, TubeMotion, load_scenario
-from studies.fleet_diagnosis import hidden_effect
+from studies.fleet_diagnosis import NOT_SHOWN, SIZES, extension
 
 LIBRARY = ("release", "light_release", "sweep", "reversals")  # `turns` takes robots through a snap
 FIRST_S = 4.0  # length of the first bag
 TURN_HZ, TURN_RAD = (0.5, 1.0), 0.8  # of the first bag
+SHOWN, TIED = (
+    8.0,
+    2.0,
+)  # deviations of the noise by which a bag shows an effect, and by which it may tell it from its nearest rival at most
 
 
 def first_scenario(robot: Robot, seed: int) -> Scenario:
@@ -59,6 +73,35 @@ def first_scenario(robot: Robot, seed: int) -> Scenario:
     ]
     tubes = [TubeMotion(rotation=[turn]) for turn in turns]
     return Scenario(duration_s=FIRST_S, seed=seed, tubes=tubes, solver=Solver(nodes=30))
+
+
+def ties(robot: Robot, recording: Recording, rng: np.random.Generator) -> list[tuple[Candidate, np.ndarray]]:
+    """Effects that ``recording``, of a robot without one, would show and not tell from another: with departures by their scales (quantities,)."""
+    context, pool = RunContext(workers=1), candidates(effect_quantities(robot), recording.position)
+    mask = measured_axes([recording], [])
+    problem = make_problem(robot, [recording], nuisances_of(robot), mask, DiagnosisOptions())
+    choose_nodes(problem, {}, context)
+    choose_steps(problem, {}, context)
+    here = sensitivities_at(problem, {}, pool, context)
+    if here is None:
+        return []
+    columns = [here.columns[q.key] * q.tolerance for q in problem.nuisances]
+    nuisances = np.hstack([np.stack(columns, axis=1), problem.numerics])
+    scaled = {c: S * [q.scale for q in c.quantities] for c, S in here.by_candidate.items()}
+    found = []
+    for c, own in scaled.items():
+        direction = rng.standard_normal(len(c.quantities))
+        direction /= np.linalg.norm(direction)
+        direction = np.where([q.one_sided for q in c.quantities], np.abs(direction), direction)
+        effect = (own @ direction)[:, None]
+        shown = left_over(nuisances, effect)[0]
+        size = max(SIZES[0], SHOWN / shown) if shown else math.inf
+        if c.effect in NOT_SHOWN or c in here.trials or size > SIZES[1]:
+            continue
+        against = [np.hstack([nuisances, S]) for k, S in scaled.items() if k.effect != c.effect]
+        if size * min(left_over(J, effect)[0] for J in against) < TIED:
+            found.append((c, size * direction))
+    return found
 
 
 def best_shipped(contrast: Contrast, robot: Robot) -> tuple[str, float]:
@@ -88,12 +131,21 @@ def run_case(name: str, number: int) -> dict[str, Any]:
     """Make a case and diagnose it; where it is a tie, also with the designed experiment."""
     robot = fleet_robot(name, True)
     rng = np.random.default_rng([number, seed_of(name), 77])
-    draw, hidden = drawn(robot, rng), hidden_effect(robot, rng)
-    true = Draw(robot_from_dict({**robot_to_dict(draw.robot), "extensions": hidden}), draw.offsets)
-    row: dict[str, Any] = {"robot": name, "number": number, "hidden": sorted(hidden)}
+    draw = drawn(robot, rng)
+    row: dict[str, Any] = {"robot": name, "number": number}
     context, begin = RunContext(workers=1), time.process_time()
     with tempfile.TemporaryDirectory() as folder:
         bag = Path(folder) / "first.mcap"
+        record(robot, draw, first_scenario(robot, number), bag)
+        tied = ties(robot, read_recording(bag, robot), rng)
+        effects = sorted({c.effect for c, _ in tied})
+        if not effects:
+            return {**row, "hidden": [], "cpu_s": time.process_time() - begin}
+        effect = effects[int(rng.integers(len(effects)))]  # every kind as often, whatever its number of forms
+        forms = [form for form in tied if form[0].effect == effect]
+        hidden = extension(*forms[int(rng.integers(len(forms)))])
+        row["hidden"], row["values"] = [effect], hidden[effect]
+        true = Draw(robot_from_dict({**robot_to_dict(draw.robot), "extensions": hidden}), draw.offsets)
         record(robot, true, first_scenario(robot, number), bag)
         first = read_recording(bag, robot)
         diagnosis = diagnose_recordings(robot, [first], [], context=context)

@@ -30,7 +30,7 @@ import numpy as np
 
 from ctr_dynamics.benchmarks.fleet import TURN_S, record, scenario_for
 from ctr_dynamics.benchmarks.fleet_robots import FLEET, Draw, drawn, fleet_robot, seed_of
-from ctr_dynamics.diagnosis.inference.candidates import candidates
+from ctr_dynamics.diagnosis.inference.candidates import Candidate, candidates
 from ctr_dynamics.diagnosis.output.findings import findings
 from ctr_dynamics.diagnosis.pipeline import diagnose_recordings
 from ctr_dynamics.diagnosis.recording import read_recording
@@ -82,12 +82,18 @@ def hidden_effect(
     size = SIZES[0] * (SIZES[1] / SIZES[0]) ** rng.uniform()
     direction = rng.standard_normal(len(chosen.quantities))
     direction /= np.linalg.norm(direction)
-    values = {key[1]: value for key, value in chosen.start if key[0] == name}
-    for q, share in zip(chosen.quantities, direction, strict=True):
-        departure = size * q.scale * (abs(share) if q.one_sided else share)
-        coordinate = float(np.clip(q.off + departure, q.low, q.high))
+    return extension(
+        chosen, size * np.where([q.one_sided for q in chosen.quantities], np.abs(direction), direction)
+    )
+
+
+def extension(candidate: Candidate, departures: np.ndarray) -> dict[str, dict[str, float]]:
+    """The effect of ``candidate`` as an extension of a robot file, off its nominal values by ``departures`` (quantities,), in scales."""
+    values = {key[1]: value for key, value in candidate.start if key[0] == candidate.effect}
+    for q, departure in zip(candidate.quantities, departures.tolist(), strict=True):
+        coordinate = float(np.clip(q.off + q.scale * departure, q.low, q.high))
         values[q.name] = q.parameter.value(coordinate)
-    return {name: {key: float(value) for key, value in values.items() if math.isfinite(value)}}
+    return {candidate.effect: {key: float(value) for key, value in values.items() if math.isfinite(value)}}
 
 
 def pushed(scenario: Scenario, robot: Robot, rng: np.random.Generator) -> Scenario:
