@@ -14,7 +14,7 @@ from ctr_dynamics.kernels.rotations import conjugate, from_vector, matrix, multi
 from ctr_dynamics.kernels.tip_kinematics import tip_from_node
 from ctr_dynamics.kernels.tracker_measurement import fused_tip
 from ctr_dynamics.sensing import Tip
-from ctr_dynamics.sensing.tracker import DELAY, DRIFT, SHIFT, STATES, TrackerModel
+from ctr_dynamics.sensing.tracker import DELAY, DRIFT, LEVER, SHIFT, STATES, TrackerModel
 
 RNG = np.random.default_rng(11)
 COLUMNS, STEP = 5, 1e-6
@@ -135,8 +135,12 @@ def test_residual_of_a_masked_rotation_leaves_the_arbitrary_turn_out():
         assert np.allclose(nu[3:5], tilt[:2], atol=1e-5)
 
 
-def test_registered_pose_and_covariance_equal_finite_differences():
+@pytest.mark.parametrize("state", ["every state a little off", "only the lever arm, by much"])
+def test_registered_pose_and_covariance_equal_finite_differences(state):
     tip, tracker, bias = random_tip(), random_tracker(), bias_of(1e-4)
+    if state == "only the lever arm, by much":
+        bias[:] = 0.0
+        bias[LEVER] = 0.3, -0.2, 0.5  # m
 
     def pose_of(a, b):
         at = moved(tip, a)
