@@ -149,10 +149,19 @@ def layout_of_header(kind: Kind, header: list[str], where: str) -> Source:
     """Columns by their names: `tube1_rotation [deg]` or `tube1_rotation_deg`, `x [mm]`, `time [s]`, `qw`, ...
 
     Raises:
-        InputError: no column of time, or a column that needs a unit and names none.
+        InputError: no column of time, two columns for one value, or a column that needs a unit and names none.
     """
     time: TimeColumn | None = None
     values: dict[str, Column] = {}
+
+    def only(cell: str, before: TimeColumn | Column | None, what: str) -> None:
+        if before is not None:
+            raise InputError(
+                f"columns '{before.column}' and '{cell}' are both {what}",
+                do="leave one of them, or give --layout",
+                where=where,
+            )
+
     for cell in header:
         again = _AGAIN.fullmatch(cell)
         name, unit = _split(again[1] if again else cell)
@@ -165,11 +174,13 @@ def layout_of_header(kind: Kind, header: list[str], where: str) -> Source:
         if name in _TIME:
             if unit:
                 factor(unit, "s", f"{where}: column '{cell}'")
-            time = time or TimeColumn(column=cell, unit=unit)
+            only(cell, time, "the time")
+            time = TimeColumn(column=cell, unit=unit)
         elif known(kind, name):
             if si_unit(name) != "1":
                 _check_unit(unit, name, f"{where}: column '{cell}'")
-            values.setdefault(name, Column(column=cell, unit=unit))
+            only(cell, values.get(name), name)
+            values[name] = Column(column=cell, unit=unit)
     if time is None:
         raise InputError(f"no column of time among {_some(header)}", do=_time_cure(header), where=where)
     return Source(time=time, values=values)

@@ -87,36 +87,33 @@ def weigh_changes(residual, before, told, begun, level, evidence, began_ns):
 
 
 @compiled
-def compare_delays(delays, inside, ways, present, least, prior, now):
+def compare_delays(delays, ways, present, least, prior, now):
     """Delays that are farther than ``least`` from the ``present`` one, against it and whatever else has the evidence ``now``.
 
-    ``delays``, ``inside`` (d, f): dense delays, and which are tried. ``ways`` (w, d, f): logarithm of their evidence in every way; minus infinity
-    where it does not count. ``prior``: logarithm, of each. Returns the logarithm of the odds of all, the mean and the deviation of those near the
-    likeliest, and the part of the probability that these have.
+    ``delays`` (d,); ``ways`` (w, d): logarithm of their evidence in every way. ``prior``: logarithm, of each. Returns the logarithm of the odds of
+    all, the mean and the deviation of those near the likeliest, and the part of the probability that these have.
     """
     top, likeliest = -math.inf, present
     for way in range(len(ways)):
-        for i in range(delays.shape[0]):
-            for k in range(delays.shape[1]):
-                if inside[i, k] and abs(delays[i, k] - present) <= least:
-                    now = max(now, ways[way, i, k])
-                elif inside[i, k] and ways[way, i, k] > top:
-                    top, likeliest = ways[way, i, k], delays[i, k]
+        for i in range(len(delays)):
+            if abs(delays[i] - present) <= least:
+                now = max(now, ways[way, i])
+            elif ways[way, i] > top:
+                top, likeliest = ways[way, i], delays[i]
     if top == -math.inf:
         return -math.inf, present, 0.0, 0.0
     total = near = mean = square = 0.0
     for way in range(len(ways)):
-        for i in range(delays.shape[0]):
-            for k in range(delays.shape[1]):
-                below = ways[way, i, k] - top
-                if not inside[i, k] or abs(delays[i, k] - present) <= least or below < NEGLIGIBLE:
-                    continue
-                weight, away = math.exp(below), delays[i, k] - likeliest
-                total += weight
-                if abs(away) <= 2.0 * least:
-                    near += weight
-                    mean += weight * away
-                    square += weight * away * away
+        for i in range(len(delays)):
+            below = ways[way, i] - top
+            if abs(delays[i] - present) <= least or below < NEGLIGIBLE:
+                continue
+            weight, away = math.exp(below), delays[i] - likeliest
+            total += weight
+            if abs(away) <= 2.0 * least:
+                near += weight
+                mean += weight * away
+                square += weight * away * away
     mean /= near
     spread = math.sqrt(max(square / near - mean * mean, 0.0))
     return top + prior + math.log(total) - now, likeliest + mean, spread, near / total

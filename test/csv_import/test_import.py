@@ -144,7 +144,13 @@ def test_frame_must_be_stated(logs, tmp_path, capsys):
         ("tube2_rotation_deg", "tube1_rotation [deg]", "column 'tube1_rotation [deg]' is there 2 times"),
         ("tube1_translation (mm)", "tube1_translation (m)", "millimetres? Give metres"),
         ("tube1_translation (mm)", "carriage", "no column for tube1_translation"),
-        ("tube2_rotation_deg", "tube1_rotation [rad]", "no column for tube2_rotation"),
+        (
+            "tube2_rotation_deg",
+            "tube1_rotation [rad]",
+            "columns 'tube1_rotation [deg]' and 'tube1_rotation [rad]' are both tube1_rotation",
+        ),
+        ("tube2_rotation_deg", "t [s]", "columns 'time [ms]' and 't [s]' are both the time; leave one"),
+        ("tube2_rotation_deg", "tube3_rotation [rad]", "no column for tube2_rotation"),
     ],
 )
 def test_units_and_columns_are_checked(logs, tmp_path, capsys, old, new, message):

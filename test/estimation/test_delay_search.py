@@ -6,12 +6,10 @@ from estimation_cases import bag_messages, play, truth_error
 
 from ctr_dynamics.estimation.monitoring.delay_search import (
     CLOCK_BEHIND,
-    FINER,
     DelaySearch,
     DelaySearchOptions,
 )
 from ctr_dynamics.estimation.monitoring.densities import allowance
-from ctr_dynamics.kernels.parabolas import fill_between
 
 NOISE, LENGTH, REGISTERED = 2.5e-4, 0.25, 1e-3
 
@@ -77,28 +75,23 @@ def test_a_delay_that_changes_is_found_after_a_long_time_without():
     assert later[0] == pytest.approx(0.06, abs=3.0 * later[1])
 
 
-def test_delays_between_two_points_rise_above_them_only_at_a_smooth_peak():
-    found = DelaySearch(NOISE, 20.0, LENGTH, REGISTERED)
-    smooth = -0.5 * ((found.delays - 0.06125) / 0.003) ** 2  # its peak lies halfway
-    dense = found._between([smooth], -np.inf)[0]
-    np.testing.assert_allclose(dense, -0.5 * ((found._dense - 0.06125) / 0.003) ** 2, atol=1e-9)
-    bent = np.where(np.abs(found.delays - 0.06) < 0.011, -3.0, -500.0)
-    assert found._between([bent], -np.inf).max() < -2.9
+@pytest.mark.parametrize("hertz", [16.0, 58.0])
+def test_a_strong_vibration_that_the_filter_follows_is_no_delay_at_any_time(hertz):
+    """It passes every place again and again: some delay fits each pose by chance."""
 
+    def shaken(hertz):
+        return lambda t: 0.45 / hertz * vibrating(hertz)(t) / 0.01 + 0.001 * vibrating(3.7 * hertz)(t) / 0.01
 
-def test_the_kernel_takes_the_lower_of_two_parabolas():
-    """Against polynomials through three points each."""
-    values = np.random.default_rng(5).standard_normal(9)
-    dense = np.empty((9, len(FINER)))
-    fill_between(values, FINER, -np.inf, dense)
-    for i in range(9):
-        for k, offset in enumerate(FINER):
-            sides = (i, i + (1 if offset > 0.0 else -1))
-            through = [np.clip(c, 1, 7) + np.arange(-1, 2) for c in sides]
-            curves = [np.polyval(np.polyfit(at, values[at], 2), i + offset) for at in through]
-            assert dense[i, k] == pytest.approx(min(curves))
-    fill_between(values, FINER, 1e3, dense)
-    assert np.all(dense == -np.inf)
+    found, rng = DelaySearch(NOISE, 20.0, LENGTH, REGISTERED), np.random.default_rng(4)
+    times = np.arange(0.0, 4.0, 0.003)
+    tips, seen, likely = shaken(hertz)(times), shaken(0.985 * hertz), []
+    for k in range(100):
+        t = 0.9 + 0.025 * k
+        known = times <= t
+        z = seen(np.array([t]))[0] + NOISE * rng.standard_normal(3)
+        found.add(round(t * 1e9), t, z, times[known], tips[known], WELL)
+        likely.append(found.belief(0.0).late)
+    assert max(likely) < 0.05
 
 
 @pytest.mark.parametrize("seconds", [9.2, 9.3, 9.4])

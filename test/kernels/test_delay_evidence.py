@@ -75,9 +75,9 @@ def test_delays_beside_vibrations_are_weighed_as_by_numpy(rng):
         np.testing.assert_allclose(found[g], expected, rtol=1e-11)
 
 
-def compared(delays, inside, ways, present, least, prior, now):
+def compared(delays, ways, present, least, prior, now):
     """The NumPy twin: all delays of all ways in one row."""
-    kept = np.isfinite(ways) & inside
+    kept = np.isfinite(ways)
     at, evidence = np.broadcast_to(delays, ways.shape)[kept], ways[kept]
     other = np.abs(at - present) > least
     now = max(now, evidence[~other].max(initial=-np.inf))
@@ -92,16 +92,13 @@ def compared(delays, inside, ways, present, least, prior, now):
 @pytest.mark.parametrize("present", [0.0, 0.031])
 @pytest.mark.parametrize("now", [-200.0, 10.0])
 def test_delays_are_compared_as_by_numpy(rng, present, now):
-    grid = 0.0025 * np.arange(24)
-    delays = grid[:, None] + 0.00025 * np.arange(-4.5, 5.0)
-    inside = (delays >= 0.0) & (delays <= grid[-1])
-    ways = rng.normal(0.0, 6.0, (2, 24, 10)) - 0.5 * ((delays - 0.04) / 0.004) ** 2
+    delays = 0.00025 * np.arange(240)
+    ways = rng.normal(0.0, 6.0, (2, 240)) - 0.5 * ((delays - 0.04) / 0.004) ** 2
     ways[0, 5] = -np.inf
-    given = delays, inside, ways, present, 0.005, -7.0, now
+    given = delays, ways, present, 0.005, -7.0, now
     np.testing.assert_allclose(compare_delays(*given), compared(*given), rtol=1e-10)
 
 
 def test_where_no_other_delay_counts_nothing_is_likely():
-    delays, ways = np.zeros((3, 10)), np.zeros((1, 3, 10))
-    given = np.full((3, 10), True), ways, 0.0, 0.005, -7.0, 0.0
-    assert compare_delays(delays, *given) == (-np.inf, 0.0, 0.0, 0.0)
+    delays, ways = np.zeros(30), np.zeros((1, 30))
+    assert compare_delays(delays, ways, 0.0, 0.005, -7.0, 0.0) == (-np.inf, 0.0, 0.0, 0.0)

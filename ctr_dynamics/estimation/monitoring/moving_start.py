@@ -31,8 +31,9 @@ AMPLITUDES = 0.5 * 2.0 ** np.arange(7)  # by the noise, of one axis: up to 32 ti
 MISTUNED = 0.03  # relative error of a frequency, at least: poses and insertions change it by that
 UNLIKELY = math.log(0.1)  # odds of another delay, from which on measurements have shown the present one
 SETTLED_S = 0.2  # for which amplitudes are compared before any is believed to be over
-# of what is remembered, corrections reach back 2 s, 80 measurements at 40 Hz; each takes 180 kB
-MOVING_START = replace(DelaySearchOptions(), changes=False, remembered=100)
+# A vibration beside a delay makes up for what lies between two delays. Of what is remembered, corrections reach back 2 s, 80 measurements at 40 Hz;
+# each takes 450 kB.
+MOVING_START = replace(DelaySearchOptions(), spacing_s=0.001, changes=False, remembered=100)
 
 
 class MovingStart(DelaySearch):

@@ -14,14 +14,12 @@ from numpy.typing import NDArray
 
 from ctr_dynamics.estimation.filter.expected_tracker import averaging_and_smoothing, response_of
 from ctr_dynamics.estimation.monitoring.delay_search import (
-    FINER,
     Belief,
     DelaySearch,
     DelaySearchOptions,
     tips_at,
 )
 from ctr_dynamics.estimation.timeline import DT
-from ctr_dynamics.kernels.parabolas import fill_between
 from ctr_dynamics.sensing.tracker import SMOOTHED, TrackerModel
 
 Floats = NDArray[np.float64]
@@ -81,7 +79,7 @@ class ResponseSearch(DelaySearch):
         self._weights = np.stack([weights_of(u, steps) for u in np.round(self.delays, 6)])
         self._ages = DT * np.arange(steps)
         self.reach_s = float(self._ages[-1])
-        self._finest_s = float(np.ptp(self._dense[1, :2])) / math.sqrt(12.0)  # what the grid leaves open
+        self._finest_s = RESPONSES.spacing_s / math.sqrt(12.0)  # what the grid leaves open
 
     def newest(self, time_s: float) -> float:
         """The newest time (s) of the open-loop run that a measurement of ``time_s`` may show."""
@@ -112,13 +110,11 @@ class ResponseSearch(DelaySearch):
 
     def refined(self, present_s: float) -> tuple[float, float]:
         """The response around ``present_s`` and its deviation (s), by all measurements."""
-        dense = np.full(self._dense.shape, -np.inf)
-        if self._evidence:
-            fill_between(self._evidence[-1].delays, FINER, -np.inf, dense)
-        near = self._inside & np.isfinite(dense) & (np.abs(self._dense - present_s) <= self.options.least_s)
-        if not near.any():
+        near = np.abs(self.delays - present_s) <= self.options.least_s
+        if not (self._evidence and near.any()):
             return present_s, self.options.least_s
-        values, weights = self._dense[near], np.exp(dense[near] - dense[near].max())
+        values, evidence = self.delays[near], self._evidence[-1].delays[near]
+        weights = np.exp(evidence - evidence.max())
         weights /= weights.sum()
         mean = float(weights @ values)
         return mean, max(math.sqrt(float(weights @ (values - mean) ** 2)), self._finest_s)
