@@ -96,12 +96,18 @@ def ties(robot: Robot, recording: Recording, rng: np.random.Generator) -> list[t
         effect = (own @ direction)[:, None]
         shown = left_over(nuisances, effect)[0]
         size = max(SIZES[0], SHOWN / shown) if shown else math.inf
-        if c.effect in NOT_SHOWN or c in here.trials or size > SIZES[1]:
+        if c.effect in NOT_SHOWN or c in here.trials or size > SIZES[1] or not _can_be(c, size * direction):
             continue
         against = [np.hstack([nuisances, S]) for k, S in scaled.items() if k.effect != c.effect]
         if size * min(left_over(J, effect)[0] for J in against) < TIED:
             found.append((c, size * direction))
     return found
+
+
+def _can_be(candidate: Candidate, departures: np.ndarray) -> bool:
+    """Whether values that are off by ``departures`` (quantities,), in scales, lie within their limits."""
+    each = zip(candidate.quantities, departures.tolist(), strict=True)
+    return all(q.low <= q.off + q.scale * departure <= q.high for q, departure in each)
 
 
 def best_shipped(contrast: Contrast, robot: Robot) -> tuple[str, float]:
