@@ -68,5 +68,5 @@ class JacobianTracker:
         if self._found is None:
             return NO_JACOBIAN
         alpha, jacobian = self._found
-        turn = float((state.inputs.alpha - alpha).sum()) / self.model.n
+        turn = float(np.add.reduce(state.inputs.alpha - alpha)) / self.model.n
         return turned(jacobian, turn) if turn else jacobian

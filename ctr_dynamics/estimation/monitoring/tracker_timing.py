@@ -106,16 +106,16 @@ class TrackerTiming:
             late = self.instead.always(NONE_OF_THEM)
             if late is not None:
                 return Found(late[0], response_of(self._file), late[1])
-        delays = [search for search in (self.late, self.behind) if not self.response.explains_better(search)]
-        for search in delays:
+        for search in (self.late, self.behind):
             late = search.found(delay)
-            if late is not None:
+            if late is not None and not self.response.explains_better(search):
                 return Found(late[0], None, late[1])
-        if not delays:
-            slow = self.response.found(expected.response)
-            if slow is not None:
-                responds_at_once = abs(slow[0]) <= self.response.options.least_s
-                return Found(None, 0.0, 0.0) if responds_at_once else Found(None, *slow)
+        slow = self.response.found(expected.response)
+        if slow is not None and all(
+            self.response.explains_better(search) for search in (self.late, self.behind)
+        ):
+            responds_at_once = abs(slow[0]) <= self.response.options.least_s
+            return Found(None, 0.0, 0.0) if responds_at_once else Found(None, *slow)
         return None
 
     @property
