@@ -13,7 +13,7 @@ import typer
 
 from ctr_dynamics import __version__
 from ctr_dynamics.errors import InputError
-from ctr_dynamics.io.atomic_files import output_folder
+from ctr_dynamics.io.atomic_files import check_folder, output_folder
 from ctr_dynamics.robot import Robot
 from ctr_dynamics.robot_files import load_robot
 
@@ -206,7 +206,7 @@ def snap(options: SnapOptions) -> int:
         "equations": options.equations,
     }
     Plan(options.start or 0.0, adaptive=adaptive, **numerics).check()  # type: ignore[arg-type]
-    output_folder(output)
+    check_folder(output)
     curve = s_curve(of, np.array(of.rest.beta.value), of.rest.alpha.value[1], options.points)
     start = _start(of, options.start, "beta1" in given, curve)
     plan = Plan(start, adaptive=adaptive, **numerics)  # type: ignore[arg-type]
@@ -220,6 +220,7 @@ def snap(options: SnapOptions) -> int:
         "parameters": str({**numerics, "start": plan.start, "adaptive": adaptive, "set": given}),
     }
     summary = _figures(plan, trajectory, curve, found, crossed)
+    output_folder(output)
     files.write_trajectory(output / "trajectory.csv", trajectory)
     files.write_scurve(output / "scurve.csv", curve)
     files.write_peaks(output / "peaks.csv", found)

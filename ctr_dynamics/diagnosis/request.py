@@ -16,7 +16,7 @@ from ctr_dynamics.diagnosis.pipeline import diagnose_recordings
 from ctr_dynamics.diagnosis.recording import Recording, read_recording
 from ctr_dynamics.diagnosis.run_context import RunContext
 from ctr_dynamics.errors import InputError
-from ctr_dynamics.io.atomic_files import atomic_file, output_folder, replaced_files
+from ctr_dynamics.io.atomic_files import atomic_file, check_folder, replaced_files
 from ctr_dynamics.parameters import Settings
 from ctr_dynamics.robot import Robot
 from ctr_dynamics.sensing.tracker_parameters import with_tracker_parameters
@@ -50,7 +50,7 @@ def run(request: Request, context: RunContext | None = None) -> dict[str, Any]:
         InputError: a bag that cannot be used, or that is given twice; a folder that cannot be written to.
     """
     context = context or RunContext(workers=request.workers)
-    directory = output_folder(Path(request.output))
+    directory = check_folder(Path(request.output))
     context.report("reading")
     robot = with_tracker_parameters(request.robot, request.settings)
     recordings, others = (

@@ -38,6 +38,20 @@ def check_target(path: Path, what: str = "") -> None:
         raise InputError("cannot be written (no permission)", where=where, do="name another file")
 
 
+def check_folder(path: Path) -> Path:
+    """The folder ``path``, which can be made or written to when there is something to write: said before the work, and nothing is left of none.
+
+    Raises:
+        InputError: it or a folder above it is a file, or there is no permission.
+    """
+    above = next(folder for folder in (path.absolute(), *path.absolute().parents) if folder.exists())
+    if not above.is_dir():
+        raise InputError("is a file, a folder is expected", where=str(above), do="name another")
+    if not os.access(above, os.W_OK):
+        raise InputError("cannot be written to (no permission)", where=str(above), do="name another folder")
+    return path
+
+
 def output_folder(path: Path) -> Path:
     """The folder ``path``, made where it does not exist.
 

@@ -78,6 +78,7 @@ def test_bad_input_is_one_line_and_code_2(resting, tmp_path, capsys, arguments, 
     lines = [line for line in capsys.readouterr().err.splitlines() if line.startswith("ctr-dynamics: error")]
     assert len(lines) == 1
     assert words in lines[0]
+    assert not (tmp_path / "out").exists()
 
 
 def test_a_folder_that_cannot_be_is_said_before_the_work(resting, tmp_path, capsys):
