@@ -179,8 +179,10 @@ class Alternatives:
         if not self._news:
             return False
         self._news = False
+        # poses of a frame that moves say nothing of their timing: a turn looks like a latency that grows
         again = self._health.fusing and (
-            self._follow_timing(k) or (moves_as_modelled and self._follow_other(open_loop, k))
+            (not self.moving and self._follow_timing(k))
+            or (moves_as_modelled and self._follow_other(open_loop, k))
         )
         self._weigh()
         return again

@@ -132,6 +132,25 @@ def test_the_estimate_does_not_follow_a_frame_that_moves():
     assert error[run.t[steps] > 5.5].max() < 2e-3
 
 
+def test_a_frame_that_turns_is_no_latency():
+    """Fast enough that the filter cannot follow: a turn looks like a latency that grows, and its poses must not be fused with one."""
+    axis, messages = np.array([-0.130, -0.398, -0.908]), []
+    for m in bag_messages("clean_sweep", 8.0):
+        if m.kind == "pose" and (since := m.stamp * 1e-9 - 3.8) > 0.0:
+            position, *rest = m.content
+            turned = Rotation.from_rotvec(0.2 * since * axis).apply(position)
+            m = replace(m, content=(tuple(turned), *rest))
+        messages.append(m)
+    run = play(messages)
+    assert "moving frame" in run.estimator.health.tracker
+    assert "latency" not in run.estimator.health.tracker
+    left, steps = truth_error(run, "clean_sweep", "p_trk", since=0.5)
+    covariance = run.column("tip_covariance")[steps, :3, :3]
+    error, deviation = np.linalg.norm(left, axis=1), np.sqrt(np.trace(covariance, axis1=1, axis2=2))
+    valid = np.array([out.valid for out in run.outputs])[steps]
+    assert np.all((error < 3e-3) | (error < 3.0 * deviation) | ~valid)
+
+
 def test_the_kernel_is_the_update_of_a_kalman_filter():
     """Against NumPy, in the words of the textbook."""
     rng = np.random.default_rng(3)
