@@ -49,10 +49,8 @@ from studies.fleet_diagnosis import NOT_SHOWN, SIZES, extension
 LIBRARY = ("release", "light_release", "sweep", "reversals")  # `turns` takes robots through a snap
 FIRST_S = 4.0  # length of the first bag
 TURN_HZ, TURN_RAD = (0.5, 1.0), 0.8  # of the first bag
-SHOWN, TIED = (
-    8.0,
-    2.0,
-)  # deviations of the noise by which a bag shows an effect, and by which it may tell it from its nearest rival at most
+SHOWN = 8.0  # deviations of the noise, by which a bag at least shows an effect
+TIED = 2.0  # the same, by which it at most tells the effect from its nearest rival
 
 
 def first_scenario(robot: Robot, seed: int) -> Scenario:
