@@ -202,6 +202,33 @@ def test_bursts_amid_an_even_rhythm_are_left_out_until_they_are_known(stamps):
     assert stamps.findings.count(Kind.BURSTS) > 150
 
 
+def rounded(stamp: int, grid: int = 20_000_000) -> int:
+    return T0 + (stamp - T0) // grid * grid
+
+
+@pytest.mark.parametrize("size", [3, 4, 6])
+def test_bursts_are_seen_where_rounding_parts_their_stamps(stamps, size):
+    """Half of every burst is stamped just before a multiple of the grid, the others just after."""
+    messages = []
+    for k in range(400):
+        arrival = T0 + (k // size) * 20_000_000 * round(1.25 * size) + (k % size - size // 2) * 100_000
+        messages.append((rounded(arrival), arrival))
+    feed(stamps, messages)
+    assert stamps.mode == "bursts"
+
+
+@pytest.mark.parametrize("size", [2, 4, 8])
+@pytest.mark.parametrize("first", range(4))
+def test_packets_of_rounded_times_of_measurement_are_no_bursts(stamps, size, first):
+    """They are handed over together, but the stamps go on within a packet."""
+    messages = []
+    for k in range(400):
+        newest = T0 + (k // size * size + size - 1 + first) * PERIOD
+        messages.append((rounded(T0 + (k + first) * PERIOD), newest + 1_000_000 + (k % size) * 100_000))
+    feed(stamps, messages)
+    assert stamps.mode != "bursts"
+
+
 def bursts_from(first, count, size):
     """Stamps and arrivals of ``count`` messages from number ``first`` on, handed over by ``size``."""
     rows = range(first, first + count)

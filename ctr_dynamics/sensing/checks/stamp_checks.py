@@ -335,9 +335,11 @@ class StampChecks:
         short = [s < limit and (s > 0 or 0 <= pause < limit) for s, pause in steps]
         ends = [i for i, (s, _) in enumerate(steps) if s > 1.2 * mean]
         if not _make_bursts(short, ends):
-            # rounding makes the steps inside a burst longer; there the arrivals tell
+            # rounding may part the stamps of a burst, once: a packet of rounded times of measurement goes on with every message
             short = [s < mean and 0 <= pause < limit for s, pause in steps]
             ends = [i for i in ends if steps[i][1] >= limit]
+            if 2 * sum(s > 0 for (s, _), is_short in zip(steps, short, strict=True) if is_short) > sum(short):
+                return False
             if not _make_bursts(short, ends):
                 return False
         whole = sum(s for s, _ in steps[ends[0] + 1 : ends[-1] + 1])
