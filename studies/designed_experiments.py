@@ -44,7 +44,7 @@ from ctr_dynamics.robot import Robot
 from ctr_dynamics.robot_files import robot_from_dict, robot_to_dict
 from ctr_dynamics.simulation.motion_primitives import Sine
 from ctr_dynamics.simulation.scenario import Scenario, Solver, TubeMotion, load_scenario
-from studies.fleet_diagnosis import NOT_SHOWN, SIZES, extension
+from studies.fleet_diagnosis import NOT_SHOWN, SIZES, direction, extension
 
 LIBRARY = ("release", "light_release", "sweep", "reversals")  # `turns` takes robots through a snap
 FIRST_S = 4.0  # length of the first bag
@@ -88,17 +88,15 @@ def ties(robot: Robot, recording: Recording, rng: np.random.Generator) -> list[t
     scaled = {c: S * [q.scale for q in c.quantities] for c, S in here.by_candidate.items()}
     found = []
     for c, own in scaled.items():
-        direction = rng.standard_normal(len(c.quantities))
-        direction /= np.linalg.norm(direction)
-        direction = np.where([q.one_sided for q in c.quantities], np.abs(direction), direction)
-        effect = (own @ direction)[:, None]
+        departures = direction(c, rng)
+        effect = (own @ departures)[:, None]
         shown = left_over(nuisances, effect)[0]
         size = max(SIZES[0], SHOWN / shown) if shown else math.inf
-        if c.effect in NOT_SHOWN or c in here.trials or size > SIZES[1] or not _can_be(c, size * direction):
+        if c.effect in NOT_SHOWN or c in here.trials or size > SIZES[1] or not _can_be(c, size * departures):
             continue
         against = [np.hstack([nuisances, S]) for k, S in scaled.items() if k.effect != c.effect]
         if size * min(left_over(J, effect)[0] for J in against) < TIED:
-            found.append((c, size * direction))
+            found.append((c, size * departures))
     return found
 
 
@@ -139,8 +137,8 @@ def run_case(name: str, number: int) -> dict[str, Any]:
     row: dict[str, Any] = {"robot": name, "number": number}
     context, begin = RunContext(workers=1), time.process_time()
     with tempfile.TemporaryDirectory() as folder:
-        bag = Path(folder) / "first.mcap"
-        record(robot, draw, first_scenario(robot, number), bag)
+        bag, scenario = Path(folder) / "first.mcap", first_scenario(robot, number)
+        record(robot, draw, scenario, bag)
         tied = ties(robot, read_recording(bag, robot), rng)
         effects = sorted({c.effect for c, _ in tied})
         if not effects:
@@ -150,7 +148,7 @@ def run_case(name: str, number: int) -> dict[str, Any]:
         hidden = extension(*forms[int(rng.integers(len(forms)))])
         row["hidden"], row["values"] = [effect], hidden[effect]
         true = Draw(robot_from_dict({**robot_to_dict(draw.robot), "extensions": hidden}), draw.offsets)
-        record(robot, true, first_scenario(robot, number), bag)
+        record(robot, true, scenario, bag)
         first = read_recording(bag, robot)
         diagnosis = diagnose_recordings(robot, [first], [], context=context)
         row["before"] = outcome(diagnosis)

@@ -80,11 +80,15 @@ def hidden_effect(
     forms = [c for c in pool if c.effect == name]
     chosen = forms[int(rng.integers(len(forms)))]
     size = SIZES[0] * (SIZES[1] / SIZES[0]) ** rng.uniform()
-    direction = rng.standard_normal(len(chosen.quantities))
-    direction /= np.linalg.norm(direction)
-    return extension(
-        chosen, size * np.where([q.one_sided for q in chosen.quantities], np.abs(direction), direction)
-    )
+    return extension(chosen, size * direction(chosen, rng))
+
+
+def direction(candidate: Candidate, rng: np.random.Generator) -> np.ndarray:
+    """A random departure (quantities,) of ``candidate`` by one scale, to the side to which each of its quantities can go."""
+    drawn_direction = rng.standard_normal(len(candidate.quantities))
+    drawn_direction /= np.linalg.norm(drawn_direction)
+    one_sided = [q.one_sided for q in candidate.quantities]
+    return np.where(one_sided, np.abs(drawn_direction), drawn_direction)
 
 
 def extension(candidate: Candidate, departures: np.ndarray) -> dict[str, dict[str, float]]:

@@ -44,7 +44,7 @@ def check_folder(path: Path) -> Path:
     Raises:
         InputError: it or a folder above it is a file, or there is no permission.
     """
-    above = next(folder for folder in (path.absolute(), *path.absolute().parents) if folder.exists())
+    above = next(folder for folder in (path, *path.parents) if folder.exists())
     if not above.is_dir():
         raise InputError("is a file, a folder is expected", where=str(above), do="name another")
     if not os.access(above, os.W_OK):
@@ -58,14 +58,11 @@ def output_folder(path: Path) -> Path:
     Raises:
         InputError: it is a file, or cannot be made or written to.
     """
+    check_folder(path)
     try:
         path.mkdir(parents=True, exist_ok=True)
-    except FileExistsError:
-        raise InputError("is a file, a folder is expected", where=str(path), do="name another") from None
     except OSError as error:
         raise InputError(f"cannot be made ({error.strerror})", where=str(path), do="name another") from None
-    if not os.access(path, os.W_OK):
-        raise InputError("cannot be written to (no permission)", where=str(path), do="name another folder")
     return path
 
 

@@ -114,6 +114,13 @@ def test_measurements_that_are_taken_again_count_once():
     assert again.frame.moving == pytest.approx(once.frame.moving, abs=1e-9)
 
 
+def against_truth(run):
+    """Errors of the fused tip and their stated deviations (k,) m, 3-D, from 0.5 s of `clean_sweep` on, and these steps."""
+    left, steps = truth_error(run, "clean_sweep", "p_trk", since=0.5)
+    covariance = run.column("tip_covariance")[steps, :3, :3]
+    return np.linalg.norm(left, axis=1), np.sqrt(np.trace(covariance, axis1=1, axis2=2)), steps
+
+
 def test_the_estimate_does_not_follow_a_frame_that_moves():
     """Slowly enough that no measurement is unlikely; the pose stays where the model has it, or the covariance says how far it is off."""
     messages = []
@@ -125,9 +132,7 @@ def test_the_estimate_does_not_follow_a_frame_that_moves():
     run = play(messages)
     check_outputs(run)
     assert "moving frame" in run.estimator.health.tracker
-    left, steps = truth_error(run, "clean_sweep", "p_trk", since=0.5)
-    covariance = run.column("tip_covariance")[steps, :3, :3]
-    error, deviation = np.linalg.norm(left, axis=1), np.sqrt(np.trace(covariance, axis1=1, axis2=2))
+    error, deviation, steps = against_truth(run)
     assert np.all((error < 3e-3) | (error < 3.0 * deviation))
     assert error[run.t[steps] > 5.5].max() < 2e-3
 
@@ -144,9 +149,7 @@ def test_a_frame_that_turns_is_no_latency():
     run = play(messages)
     assert "moving frame" in run.estimator.health.tracker
     assert "latency" not in run.estimator.health.tracker
-    left, steps = truth_error(run, "clean_sweep", "p_trk", since=0.5)
-    covariance = run.column("tip_covariance")[steps, :3, :3]
-    error, deviation = np.linalg.norm(left, axis=1), np.sqrt(np.trace(covariance, axis1=1, axis2=2))
+    error, deviation, steps = against_truth(run)
     valid = np.array([out.valid for out in run.outputs])[steps]
     assert np.all((error < 3e-3) | (error < 3.0 * deviation) | ~valid)
 
