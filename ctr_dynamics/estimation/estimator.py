@@ -20,6 +20,7 @@ from ctr_dynamics.estimation.backbone import Backbone
 from ctr_dynamics.estimation.discretisation import discretise
 from ctr_dynamics.estimation.estimator_options import EstimatorOptions
 from ctr_dynamics.estimation.filter.covariance_factor import Vibrating
+from ctr_dynamics.estimation.filter.filter_records import TipEstimate
 from ctr_dynamics.estimation.inputs.input_buffer import InputBuffer
 from ctr_dynamics.estimation.inputs.measurement_queue import tracker_of
 from ctr_dynamics.estimation.inputs.unseen_load import UnseenLoad
@@ -34,6 +35,7 @@ from ctr_dynamics.estimation.out_of_sequence import OutOfSequence
 from ctr_dynamics.estimation.published_covariance import PublishedCovariance
 from ctr_dynamics.estimation.runs import Runs
 from ctr_dynamics.estimation.step_output import Innovation, SolverStats, StepOutput
+from ctr_dynamics.estimation.step_schedule import StepSchedule
 from ctr_dynamics.estimation.timeline import seconds
 from ctr_dynamics.estimation.tip_jacobian import JacobianTracker
 from ctr_dynamics.io.messages.topics import STEP_NS
@@ -93,6 +95,7 @@ class Estimator:
         self.health.fusing = bool(settings["filter.enabled"])
         self.inputs = InputBuffer(self.model, self.tracker, settings, self.health)
         self.timeline = self.inputs.timeline
+        self._schedule = StepSchedule(self.timeline, self.inputs, self.options)
         self.innovations = InnovationLog(self.health)
         self.runs = Runs(self.model, settings, self.inputs, self.health, self.innovations)
         self.late = OutOfSequence(self.runs, self.inputs, self.health, self.innovations)
@@ -197,9 +200,9 @@ class Estimator:
             return []
         self._skip_gap(now_ns)
         outputs: list[StepOutput] = []
-        if self.correcting and not self._due(self.k + 1, now_ns):
+        if self.correcting and not self._schedule.due(self.k + 1, now_ns):
             self._correct(spare_s)  # now, while nothing waits for it
-        while self._due(self.k + 1, now_ns) and (most is None or len(outputs) < most):
+        while self._schedule.due(self.k + 1, now_ns) and (most is None or len(outputs) < most):
             begin = time.perf_counter()
             # 1. Go back, if inputs came late and the step cannot go ahead.
             if self.late.pending and (spare_s is None or not self.late.may_go_ahead):
@@ -220,22 +223,10 @@ class Estimator:
         self.do_idle_work()
         return outputs
 
-    def _due(self, k: int, now_ns: int | None) -> bool:
-        inputs = self.inputs
-        if self.t0_ns is None:
-            return False
-        stamp = self.timeline.stamp(k)
-        known = stamp <= inputs.joints.known_until
-        if now_ns is None:
-            return known
-        if known:
-            return stamp <= now_ns  # joints that are stamped ahead do not take the outputs with them
-        return stamp <= now_ns if inputs.extrapolating else stamp <= now_ns - inputs.timeout_ns
-
     @property
     def lead_ns(self) -> int:
         """How long before its stamp a step is to be begun, so that it is out when it is due; 0 where steps wait for their joints."""
-        return self.options.lead_ns if self.inputs.extrapolating else 0
+        return self._schedule.lead_ns
 
     @property
     def correcting(self) -> bool:
@@ -289,21 +280,14 @@ class Estimator:
 
     def _skip_gap(self, now_ns: int | None) -> None:
         """Reinitialise at the newest joints when more steps are due than can be caught up with."""
-        assert self.t0_ns is not None
-        stamps, largest = self.inputs.joints.stamps, self.options.largest_gap
-        newest = stamps[-1]
-        until = newest if now_ns is None or not self.inputs.extrapolating else max(now_ns, newest)
-        behind = (until - self.t0_ns) // STEP_NS - self.k
-        if behind <= largest or self.k < 0 or len(stamps) < 2:
-            return
-        if newest - stamps[-2] <= largest * STEP_NS:
-            return  # a long call without a gap: take every step
-        text = f"{seconds(behind):.1f} s without joints; the model is reinitialised at rest"
-        self.health.note("joints", "gap", text)
-        self.health.restarts += 1
-        self.timeline.k = (newest - self.t0_ns) // STEP_NS - 1
-        self.runs.stop()
-        self.late.forget()
+        missed = self._schedule.gap(now_ns)
+        if missed:
+            text = f"{seconds(missed):.1f} s without joints; the model is reinitialised at rest"
+            self.health.note("joints", "gap", text)
+            self.health.restarts += 1
+            self._schedule.skip_to_newest()
+            self.runs.stop()
+            self.late.forget()
 
     # -- steps --
 
@@ -382,53 +366,67 @@ class Estimator:
 
     def _output(self, k: int, result: StepResult, too_old: str = "") -> StepOutput:
         """The output of a step that both runs have taken; invalid where it says nothing of the robot, or is ``too_old``: the reason."""
-        fused, health, options, late = self.runs.fused, self.health, self.options, self.late
-        assert fused.state is not None
+        fused, stamp = self.runs.fused, self.timeline.stamp(k)
         tip = fused.ekf.tip_estimate()
-        predicted = self.runs.open_loop.tips.last.mean[:7].copy()
-        if not (tip.finite and math.isfinite(sum(predicted.tolist()))):
-            self.runs.stop()
-            health.failed("not finite")
-            health.restarts += 1
-            return self._invalid(k, "the estimate is not finite; the model is reinitialised at rest")
-        stamp = self.timeline.stamp(k)
-        deviation = tip.position_deviation
-        if deviation > self._length:  # a tip that is known no better than that is not estimated any more
-            fused.reinitialise(self.runs.open_loop, k)
-            health.restarts += 1
-            self.late.history.record(k)
-            health.failed("led astray")
-            return self._invalid(
-                k,
-                f"the tracker has led the estimate astray: deviation of the tip {deviation:.2g} m, limit "
-                f"{self._length:g} m; the filter is reinitialised from the open-loop run",
-            )
+        lost = self._lost(k, tip)
+        if lost:
+            self.health.restarts += 1
+            return self._invalid(k, lost)
         innovations = self.innovations.take()
         self._settling.take(innovations, fused.ekf.tracker_fault()[0] > 0.0)
-        health.refutation = fused.ekf.refutation()
+        self.health.refutation = fused.ekf.refutation()
         unsettled = self._settling.problem(stamp, fused.on_time)
         if self._settling.begun:
             return self._begin_vibrating(k, unsettled, innovations)
-        confirmed = fused.agreed or bool(unsettled) or not health.fusing
+        confirmed = fused.agreed or bool(unsettled) or not self.health.fusing
         self._covariance.take(innovations, fused.ekf.refuted, confirmed)
         if unsettled:  # measurements tell nothing of the model's error either
             fused.alternatives.clear_model_error()
             self.innovations.pass_over()
-        self._stability_due |= k % options.stability_every == 0
+        self._stability_due |= k % self.options.stability_every == 0
         if too_old:
             return self._invalid(k, too_old, innovations)
+        return self._estimate(
+            k, tip, unsettled, innovations, SolverStats(result.iterations, result.sweeps, result.reason)
+        )
+
+    def _lost(self, k: int, tip: TipEstimate) -> str:
+        """Why the filter cannot go on from ``tip`` at step ``k``, and what is done about it; empty where it can."""
+        predicted = self.runs.open_loop.tips.last.mean[:7]
+        if not (tip.finite and math.isfinite(sum(predicted.tolist()))):
+            self.runs.stop()
+            self.health.failed("not finite")
+            return "the estimate is not finite; the model is reinitialised at rest"
+        deviation = tip.position_deviation
+        if deviation <= self._length:
+            return ""
+        # a tip that is known no better than that is not estimated any more
+        self.runs.fused.reinitialise(self.runs.open_loop, k)
+        self.late.history.record(k)
+        self.health.failed("led astray")
+        return (
+            f"the tracker has led the estimate astray: deviation of the tip {deviation:.2g} m, limit "
+            f"{self._length:g} m; the filter is reinitialised from the open-loop run"
+        )
+
+    def _estimate(
+        self, k: int, tip: TipEstimate, unsettled: str, innovations: list[Innovation], solver: SolverStats
+    ) -> StepOutput:
+        """The output of step ``k``: estimate, prediction and what follows from both; invalid where it cannot be trusted."""
+        fused, stamp = self.runs.fused, self.timeline.stamp(k)
+        state, predicted = fused.state, self.runs.open_loop.tips.last.mean[:7].copy()
+        assert state is not None
         shown = fused.with_alternatives(tip, self.runs.open_loop, self._largest_deviation)
         since = fused.measured_ns if fused.measured_ns is not None else self.t0_ns
-        health.tracker_age_s = max(0.0, (stamp - (since or stamp)) * 1e-9)
-        modes = self._modes.measure(fused.state, k)
-        lag_ns = late.lag * STEP_NS
+        self.health.tracker_age_s = max(0.0, (stamp - (since or stamp)) * 1e-9)
+        modes = self._modes.measure(state, k)
+        lag_ns = self.late.lag * STEP_NS
         self._covariance.inflate(tip, stamp, self.runs, self.inputs, self._settling, modes, lag_ns)
-        problem = health.problem = self._problem(stamp, tip.position_deviation, unsettled)
+        problem = self.health.problem = self._problem(stamp, tip.position_deviation, unsettled)
         return StepOutput(
             stamp, k, not problem, problem, tip.position, tip.quaternion, tip.covariance[:6, :6], tip.twist, tip.covariance[6:, 6:],
-            predicted[:3], predicted[3:], self._backbone.rows(shown), modes, fused.ekf.force,
-            tip.force_sigma, innovations, SolverStats(result.iterations, result.sweeps, result.reason),
-            fused.state.inputs.beta.tolist(), self._jacobian.measure(fused.state),
+            predicted[:3], predicted[3:], self._backbone.rows(shown), modes, fused.ekf.force, tip.force_sigma, innovations, solver,
+            state.inputs.beta.tolist(), self._jacobian.measure(state),
         )  # fmt: skip
 
     def _begin_vibrating(self, k: int, reason: str, innovations: Sequence[Innovation]) -> StepOutput:
