@@ -38,6 +38,7 @@ from ctr_dynamics.io.messages import topics
 from ctr_dynamics.io.messages.cdr import decode_joint_state, decode_pose_stamped, decode_wrench_stamped
 from ctr_dynamics.io.messages.encode import encode_joint_state, encode_pose_stamped, encode_wrench_stamped
 from ctr_dynamics.io.messages.input_types import Decoded
+from ctr_dynamics.io.messages.unit_quaternions import WRITTEN_WITHIN
 from ctr_dynamics.kernels.rotations import conjugate, from_vector, matrix, multiply
 from ctr_dynamics.robot import Robot
 from ctr_dynamics.sensing.checks import Kind as Fault
@@ -62,7 +63,6 @@ RELATIVE_BELOW_S = 1_000_000  # a clock below is no system clock
 RELATIVE_START_S = 1_000_000_000  # stamps of such logs begin about here; a stamp must not be negative
 MAX_STAMP_S = 2**31 - 1  # what a ROS stamp holds
 RATES_HZ = {"joints": (5.0, 5000.0), "tracker": (1.0, 2000.0), "load": (0.0, 1e5)}
-QUATERNION_LIMIT = 0.05
 ALIKE = 0.1  # of the rows: times that stand still so often have been rounded. A driver that repeats itself now and then has fewer
 
 
@@ -227,10 +227,10 @@ def _orientation(log: Log, lines: list[int], where: str) -> None:
         return
     places = [log.names.index(name) for name in QUATERNION]
     norms = np.linalg.norm(log.values[:, places], axis=1)
-    good = np.abs(norms - 1.0) <= QUATERNION_LIMIT
+    good = np.abs(norms - 1.0) <= WRITTEN_WITHIN
     if not good.any():
         raise InputError(
-            f"quaternions have norms {norms.min():g} to {norms.max():g}, 1 +- {QUATERNION_LIMIT:g} is needed",
+            f"quaternions have norms {norms.min():g} to {norms.max():g}, 1 +- {WRITTEN_WITHIN:g} is needed",
             do="check which columns are qx, qy, qz, qw (ROS order; qw is the scalar)",
             where=where,
         )

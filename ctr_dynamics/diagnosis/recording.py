@@ -18,6 +18,7 @@ from ctr_dynamics.errors import InputError
 from ctr_dynamics.io.bag_reader import Bag, open_bag
 from ctr_dynamics.io.messages.cdr import JointStateIn, PoseIn
 from ctr_dynamics.io.messages.topics import JOINT_STATES, TRACKER_TIP, accepts_frame
+from ctr_dynamics.io.messages.unit_quaternions import is_unit, norm
 from ctr_dynamics.parameters import Settings, axes_mask, input_mapping, pose_frame
 from ctr_dynamics.robot import Robot
 from ctr_dynamics.sensing.checks import CheckOptions, JointChecks, Kind
@@ -285,9 +286,9 @@ def _collect(bag: Bag, robot: Robot, settings: Settings) -> tuple[Samples, Sampl
                 foreign = message.frame_id
                 continue
             x, y, z, w = message.quaternion_xyzw
-            norm = float(np.sqrt(x * x + y * y + z * z + w * w)) if finite(message.quaternion_xyzw) else 0.0
-            if finite(message.position) and 0.9 <= norm <= 1.1:
-                poses.append((message.stamp_ns, [*message.position, w / norm, x / norm, y / norm, z / norm]))
+            size = norm(message.quaternion_xyzw)
+            if finite(message.position) and is_unit(size):
+                poses.append((message.stamp_ns, [*message.position, w / size, x / size, y / size, z / size]))
             elif finite(message.position):
                 bare.append((message.stamp_ns, [*message.position, 1.0, 0.0, 0.0, 0.0]))
             else:

@@ -10,11 +10,11 @@ from typing import Any, Literal, Protocol
 
 from ctr_dynamics.io.messages import cdr
 from ctr_dynamics.io.messages.topics import JOINT_STATES, TIP_LOAD, TRACKER_TIP, accepts_frame
+from ctr_dynamics.io.messages.unit_quaternions import ROUNDED_WITHIN, is_unit, norm
 
 FRAME = "ctr_base"
 LENGTH_LIMIT_M = 1.0  # no laboratory robot is longer
 ANGLE_LIMIT_RAD = 4 * math.pi  # two turns; 12.6 read as degrees is a small angle
-NORM_LIMIT = 1e-3
 FORCE_LIMIT_N = 50.0
 _JOINT = re.compile(r"tube([1-9][0-9]?)_(rotation|translation)")
 
@@ -248,14 +248,14 @@ class PoseInspector(_Base):
         self._frame(message.frame_id)
         for axis, value in zip(self.axes, message.position, strict=True):
             axis.add(value)
-        norm = math.sqrt(sum(q * q for q in message.quaternion_xyzw if abs(q) < 1e150))
         if not all(math.isfinite(q) for q in message.quaternion_xyzw):
             self.norm.bad += 1
             return
-        self.norm.add(norm)
-        if norm == 0.0:
+        size = norm(message.quaternion_xyzw)
+        self.norm.add(size)
+        if size == 0.0:
             self.zero += 1
-        elif abs(norm - 1.0) > NORM_LIMIT:
+        elif not is_unit(size, ROUNDED_WITHIN):
             self.unnormalised += 1
 
     def values(self) -> dict[str, Any]:
@@ -281,7 +281,7 @@ class PoseInspector(_Base):
         if self.unnormalised:
             text = (
                 f"{self.unnormalised} quaternions are not of unit length (norm {self.norm.low:g} to "
-                f"{self.norm.high:g}, limit 1 +- {NORM_LIMIT:g})"
+                f"{self.norm.high:g}, limit 1 +- {ROUNDED_WITHIN:g})"
             )
             found.append(Finding("warning", self.topic, text))
         return found

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctr_dynamics.errors import InputError
+from ctr_dynamics.io.messages.unit_quaternions import WRITTEN_WITHIN, is_unit, norm
 from ctr_dynamics.io.text_files import check_regular
 from ctr_dynamics.model.model import Model
 from ctr_dynamics.model.statics import Statics
@@ -26,7 +27,6 @@ FORCE = ("Fx", "Fy", "Fz")
 TIP, QUATERNION = ("tip_x", "tip_y", "tip_z"), ("qw", "qx", "qy", "qz")
 MAX_ANGLE = 20 * math.pi  # rad; ten turns, more are degrees
 MAX_FORCE = 100.0  # N
-QUATERNION_LIMIT = 0.05  # more is another order of columns, or no quaternion
 
 
 @dataclass(frozen=True)
@@ -189,9 +189,9 @@ def _pose(model: Model, header: list[str], line: int, cells: list[str], measured
     position = group(TIP) if measured else None
     quaternion = group(QUATERNION) if measured and QUATERNION[0] in values else None
     if quaternion is not None:
-        size = float(np.linalg.norm(quaternion))
-        if not problem and abs(size - 1.0) > QUATERNION_LIMIT:
-            problem = f"the quaternion has norm {size:g}, 1 +- {QUATERNION_LIMIT:g} is needed"
+        size = norm(quaternion)
+        if not problem and not is_unit(size, WRITTEN_WITHIN):
+            problem = f"the quaternion has norm {size:g}, 1 +- {WRITTEN_WITHIN:g} is needed"
         quaternion = quaternion / max(size, 1e-12)
     return Pose(line, beta, alpha, force, end_angles, problem, position, quaternion)
 

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from ctr_dynamics import chi_square
 from ctr_dynamics.io.messages.cdr import PoseIn
+from ctr_dynamics.io.messages.unit_quaternions import is_unit, norm
 from ctr_dynamics.parameters import PARAMETERS
 from ctr_dynamics.reporting.animation import add_animation
 from ctr_dynamics.reporting.figures import Panel, figure_svg
@@ -81,7 +82,7 @@ class ReplayLog:
             if not whole:
                 t = float(self.tracker.observed_times(np.array(stamp)))
                 q = self.turned[min(int(np.searchsorted(self.t, t)), len(self.t) - 1)]
-            if np.isfinite(q).all() and np.isfinite(pose.position).all() and 0.9 < np.linalg.norm(q) < 1.1:
+            if np.isfinite(q).all() and np.isfinite(pose.position).all() and is_unit(norm(q)):
                 time, point, _ = self.tracker.inverse(stamp, np.array(pose.position), q, q)
                 times.append(time)
                 points.append(point)

@@ -15,6 +15,7 @@ from ctr_dynamics.effects import make_plant
 from ctr_dynamics.io.bag_reader import open_bag
 from ctr_dynamics.io.messages.cdr import PoseIn, decode_point_cloud, decode_pose_stamped
 from ctr_dynamics.io.messages.topics import STEP_NS
+from ctr_dynamics.io.messages.unit_quaternions import is_unit, norm
 from ctr_dynamics.io.truth_files import read_truth
 from ctr_dynamics.robot import Robot
 from ctr_dynamics.sensing import TrackerModel
@@ -94,7 +95,7 @@ def tracker_of(bag: Path, start_ns: int, tracker: TrackerModel) -> Trace:
     t, p = [], []
     for pose in sorted(poses):
         q = np.array(pose.quaternion_xyzw)[[3, 0, 1, 2]]
-        if np.isfinite(pose.position).all() and np.isfinite(q).all() and 0.9 < np.linalg.norm(q) < 1.1:
+        if np.isfinite(pose.position).all() and np.isfinite(q).all() and is_unit(norm(q)):
             time, point, _ = tracker.inverse((pose.stamp_ns - start_ns) * 1e-9, np.array(pose.position), q)
             t.append(time)
             p.append(point)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -10,10 +9,10 @@ from numpy.typing import NDArray
 
 from ctr_dynamics.effects import Plant
 from ctr_dynamics.io.messages.topics import accepts_frame
+from ctr_dynamics.io.messages.unit_quaternions import MEASURED_NORMS, is_unit, norm
 from ctr_dynamics.sensing.interpolation import finite, joint_order
 
 Floats = NDArray[np.float64]
-UNIT = 1e-3  # by which a quaternion's norm may miss one without a note: rounding of a tracker's driver
 
 
 class Unusable(Exception):
@@ -69,13 +68,13 @@ def pose_values(
             "not finite", f"pose at {stamp_ns} ns holds a value that is not finite; it was left out"
         )
     x, y, z, w = quaternion_xyzw
-    norm = math.sqrt(x * x + y * y + z * z + w * w)
-    if not 0.9 <= norm <= 1.1:
+    size = norm(quaternion_xyzw)
+    if not is_unit(size):
         raise Unusable(
             "quaternion",
-            f"norm {norm:.3g} is outside 0.9 to 1.1; send unit quaternions; the pose was left out",
+            f"norm {size:.3g} is outside {MEASURED_NORMS}; send unit quaternions; the pose was left out",
         )
-    return np.array(position, dtype=float), np.array([w, x, y, z]) / norm, norm
+    return np.array(position, dtype=float), np.array([w, x, y, z]) / size, size
 
 
 def wrench_values(

@@ -14,10 +14,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ctr_dynamics.estimation.inputs.input_validation import UNIT, Unusable, pose_values
+from ctr_dynamics.estimation.inputs.input_validation import Unusable, pose_values
 from ctr_dynamics.estimation.monitoring.health import Health
 from ctr_dynamics.estimation.timeline import DT, Timeline
 from ctr_dynamics.io.messages.topics import STEP_NS
+from ctr_dynamics.io.messages.unit_quaternions import ROUNDED_WITHIN, is_unit
 from ctr_dynamics.model.model import Model
 from ctr_dynamics.parameters import Settings, axes_mask
 from ctr_dynamics.sensing import TrackerModel
@@ -122,8 +123,8 @@ class MeasurementQueue:
         except Unusable as problem:
             self._drop(problem.kind, problem.text)
             return
-        if abs(norm - 1.0) > UNIT:
-            health.note("tracker", "quaternion normalised", f"norm {norm:.4f}, limit 1 +- 0.001")
+        if not is_unit(norm, ROUNDED_WITHIN):
+            health.note("tracker", "quaternion normalised", f"norm {norm:.4f}, limit 1 +- {ROUNDED_WITHIN:g}")
         if any(m.stamp_ns == stamp_ns for m in self.measurements[-options.compared :]):
             self._drop("duplicate stamp", f"a second pose of {stamp_ns} ns; the first one counts")
             return

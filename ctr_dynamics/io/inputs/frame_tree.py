@@ -16,6 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ctr_dynamics.io.messages.cdr import PoseIn
+from ctr_dynamics.io.messages.unit_quaternions import is_unit, norm
 from ctr_dynamics.kernels.rotations import multiply
 
 Vector = tuple[float, float, float]
@@ -26,7 +27,6 @@ MOST_SAMPLES = (
 )
 MOST_WAITING = 200  # poses
 MOST_FRAMES = 1000
-_UNIT_WITHIN = 0.1  # of one: the norm of a quaternion, as for the tracker's poses
 
 
 class Transform(NamedTuple):
@@ -81,8 +81,8 @@ def _between(a: Transform, b: Transform, share: float) -> Transform:
     mixed = [
         (1.0 - share) * p + toward * q for p, q in zip(a.quaternion_xyzw, b.quaternion_xyzw, strict=True)
     ]
-    norm = math.sqrt(sum(v * v for v in mixed))
-    i, j, k, w = (v / norm for v in mixed)
+    size = norm(mixed)
+    i, j, k, w = (v / size for v in mixed)
     return Transform((x, y, z), (i, j, k, w))
 
 
@@ -147,15 +147,15 @@ class FrameTree:
         for name, pose in transforms:
             child, parent = name.lstrip("/"), pose.frame_id.lstrip("/")
             values = (*pose.position, *pose.quaternion_xyzw)
-            norm = math.sqrt(sum(v * v for v in pose.quaternion_xyzw))
-            if child == parent or not all(map(math.isfinite, values)) or abs(norm - 1.0) > _UNIT_WITHIN:
+            size = norm(pose.quaternion_xyzw)
+            if child == parent or not all(map(math.isfinite, values)) or not is_unit(size):
                 continue
             link = self._links.get(child)
             if link is None or link.parent != parent or link.static != static:
                 if link is None and len(self._links) >= MOST_FRAMES:
                     continue
                 link = self._links[child] = _Link(parent, static)
-            x, y, z, w = (v / norm for v in pose.quaternion_xyzw)
+            x, y, z, w = (v / size for v in pose.quaternion_xyzw)
             link.add(pose.stamp_ns, Transform(pose.position, (x, y, z, w)))
 
     def take_over(self, other: FrameTree) -> None:

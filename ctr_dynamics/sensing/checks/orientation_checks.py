@@ -5,11 +5,10 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
+from ctr_dynamics.io.messages.unit_quaternions import MEASURED_NORMS, is_unit, norm
 from ctr_dynamics.sensing.checks.check_limits import CheckLimits
 from ctr_dynamics.sensing.checks.value_trains import Values
 from ctr_dynamics.sensing.checks.verdicts import ACCEPT, Findings, Kind, Verdict
-
-NORM = (0.9, 1.1)  # norms of a quaternion within which it is taken for a rounded unit quaternion
 
 
 class OrientationChecks:
@@ -42,10 +41,10 @@ class OrientationChecks:
         if unmeasured is not None:
             return unmeasured
         quaternion = pose[1]
-        norm = math.hypot(*quaternion)
-        if not NORM[0] <= norm <= NORM[1]:
-            text = f"quaternion of norm {norm:.3g} is outside {NORM[0]:g} to {NORM[1]:g}; send unit quaternions, or set tracker.axes to xyz; left out"
-            self.findings.add(Kind.QUATERNION, at, abs(norm - 1.0), "", text)
+        size = norm(quaternion)
+        if not is_unit(size):
+            text = f"quaternion of norm {size:.3g} is outside {MEASURED_NORMS}; send unit quaternions, or set tracker.axes to xyz; left out"
+            self.findings.add(Kind.QUATERNION, at, abs(size - 1.0), "", text)
             return Verdict("drop", Kind.QUATERNION, text)
         return ACCEPT if expected_wxyz is None else self._ordered(at, quaternion, expected_wxyz)
 
