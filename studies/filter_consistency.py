@@ -41,7 +41,7 @@ def consistency(bag: Path, stamps_s: np.ndarray, realised: np.ndarray) -> tuple[
     error = np.array([out.tip_position for out in outputs]) - CubicSpline(stamps_s, realised)(t)
     covariance = np.array([out.tip_covariance[:3, :3] for out in outputs])
     nees = np.einsum("ki,ki->k", error, np.linalg.solve(covariance, error[..., None])[..., 0]) / 3.0
-    nis = estimator.health.nis_sum / estimator.health.nis_dof
+    nis = estimator.health.measurements.nis_sum / estimator.health.measurements.nis_dof
     return float(nees[late].mean()), float(np.sqrt((error[late] ** 2).sum(axis=1).mean())), nis
 
 

@@ -115,7 +115,7 @@ def consistency(
     health = estimator.health
     return Consistency(
         float(nees[inside].mean()),
-        health.nis_sum / max(health.nis_dof, 1),
+        health.measurements.nis_sum / max(health.measurements.nis_dof, 1),
         float(np.sqrt((error[inside] ** 2).sum(axis=1).mean())),
     )
 

@@ -241,7 +241,7 @@ class Alternatives:
                 note = f"poses are {abs(whole_ms):.0f} ms {'older' if whole_ms > 0.0 else 'newer'} than their stamps"
             self._inputs.measurements.early_s = max(-expected.delay, 0.0)
             self.timing.followed(found)
-            self._health.distances.clear()
+            self._health.measurements.distances.clear()
         advice = "; check the tracker's clock, or set tracker.delay_s" if kind == "latency" else ""
         self._health.note("tracker", kind, note + advice)
         return True

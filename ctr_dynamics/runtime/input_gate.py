@@ -86,11 +86,10 @@ class InputGate:
         if verdict is None:
             return
         stamp_ns = message.stamp_ns if verdict.stamp_ns is None else verdict.stamp_ns
+        quaternion = verdict.quaternion_xyzw or message.quaternion_xyzw
         # an error that is zero need not be known by other estimators of the same interface
         error = {"stamp_error_s": verdict.error_s} if verdict.error_s else {}
-        self._estimator.add_tracker_pose(
-            stamp_ns, message.position, message.quaternion_xyzw, message.frame_id, **error
-        )
+        self._estimator.add_tracker_pose(stamp_ns, message.position, quaternion, message.frame_id, **error)
 
     def _pose_verdict(self, message: PoseIn, arrival_ns: int) -> Verdict | None:
         """The verdict on a pose that is used; None for one that is left out."""
@@ -105,7 +104,7 @@ class InputGate:
             expected,
         )
         if self._left_out(self.checks.poses.findings, verdict) or not verdict.orientation:
-            self._health.dropped += 1
+            self._health.measurements.dropped += 1
             return None
         return verdict
 

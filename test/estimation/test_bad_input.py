@@ -177,8 +177,8 @@ def test_bag_that_starts_again(sweep):
     assert again[0].stamp_ns < START_NS + 50_000_000
     assert again[-1].stamp_ns == START_NS + 600_000_000
     assert again[-1].valid
-    assert len(made.health.recent) > 20
-    assert 20 < made.health.accepted < 30, "no measurement counts twice"
+    assert len(made.health.measurements.recent) > 20
+    assert 20 < made.health.measurements.accepted < 30, "no measurement counts twice"
 
 
 def test_gap_in_the_joints(sweep):
@@ -259,7 +259,7 @@ def test_joints_that_are_wrong_for_a_while_beside_a_tracker_that_is_not(bag, tur
     assert np.sqrt(np.mean(np.sum(error**2, axis=1))) < limit
     health = run.estimator.health
     # a new start knows no tip of the time before: at 40 Hz, 12 poses lie in the 0.3 s that a latency may reach back
-    assert health.dropped <= 12 * health.restarts
+    assert health.measurements.dropped <= 12 * health.restarts
 
 
 def test_joints_that_stay_out_of_range():
@@ -347,8 +347,8 @@ def test_unusable_poses(sweep, plain, change, kind, words):
     assert count == 1
     assert words in last
     health = run.estimator.health
-    assert health.dropped == plain.estimator.health.dropped + 1
-    assert health.accepted == plain.estimator.health.accepted - 1
+    assert health.measurements.dropped == plain.estimator.health.measurements.dropped + 1
+    assert health.measurements.accepted == plain.estimator.health.measurements.accepted - 1
     assert all(out.valid for out in run.outputs)
 
 
@@ -364,8 +364,8 @@ def test_every_pose_in_another_frame(sweep):
         Message("pose", m.stamp, m.arrival, (*m.content[:2], "camera")) for m in sweep if m.kind == "pose"
     ]
     run = contiguous(play([m for m in sweep if m.kind != "pose"] + poses))
-    assert run.estimator.health.dropped == len(poses)
-    assert run.estimator.health.accepted == 0
+    assert run.estimator.health.measurements.dropped == len(poses)
+    assert run.estimator.health.measurements.accepted == 0
     assert np.abs(run.column("tip_position") - run.column("predicted_position")).max() < 1e-6
 
 
@@ -384,8 +384,8 @@ def test_tracker_that_starts_before_the_joints(sweep):
     ]
     run = contiguous(play([*early, *sweep]))
     health = run.estimator.health
-    assert health.dropped == 120
-    assert health.accepted + health.rejected == len(poses)
+    assert health.measurements.dropped == 120
+    assert health.measurements.accepted + health.measurements.rejected == len(poses)
     assert all(out.valid for out in run.outputs)
 
 
@@ -396,7 +396,7 @@ def test_poses_without_joints_do_not_pile_up(sweep):
         made.add_tracker_pose(START_NS + 25_000_000 * k, *pose.content)
         assert made.advance(START_NS + 25_000_000 * k) == []
     assert len(made.inputs.measurements.measurements) <= 200
-    assert made.health.dropped >= 800
+    assert made.health.measurements.dropped >= 800
     for k in range(1000):
         made.add_tip_load(START_NS + 10_000_000 * k, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
     assert len(made.inputs.load.stamps) < 100
@@ -415,7 +415,7 @@ def test_tracker_on_a_clock_that_is_ahead(sweep):
     count, last = noted(run, "tracker", "ahead of the joints")
     assert count == sum(m.kind == "pose" for m in sweep)
     assert "limit 10 s" in last
-    assert run.estimator.health.accepted == 0
+    assert run.estimator.health.measurements.accepted == 0
 
 
 def test_tracker_that_starts_after_the_joints_and_pauses():

@@ -66,7 +66,7 @@ def test_five_axis_tracker_may_report_any_roll(release, plain):
 
     told = play(release, {"tracker.axes": "xyzrp"})
     rolled = play(reshaped(release, roll), {"tracker.axes": "xyzrp"})
-    assert rolled.estimator.health.rejected == told.estimator.health.rejected
+    assert rolled.estimator.health.measurements.rejected == told.estimator.health.measurements.rejected
     difference = rolled.column("tip_position") - told.column("tip_position")
     assert rms(difference) < 0.02e-3
     assert rms(truth_error(rolled, "clean_release", "p_trk")[0]) < 0.5e-3
@@ -84,7 +84,7 @@ def test_isolated_outlier_is_rejected(release, plain):
     at = [m.stamp for m in release if m.kind == "pose"][30]
     run = play(reshaped(release, lambda p, q, m: (p + np.array([0.05 * (m.stamp == at), 0.0, 0.0]), q)))
     health = run.estimator.health
-    assert health.rejected == plain.estimator.health.rejected + 1
+    assert health.measurements.rejected == plain.estimator.health.measurements.rejected + 1
     rejected = [i for out in run.outputs for i in out.innovations if not i.accepted]
     assert len(rejected) == 1
     assert rejected[0].nis > 1000
@@ -188,7 +188,7 @@ def test_without_an_equilibrium_nothing_piles_up(release):
     assert len(inputs.joints.stamps) < 100
     assert len(inputs.measurements.measurements) < 100
     assert run.estimator.health.tracker["never compared"].count > 20
-    assert run.estimator.health.dropped > 20
+    assert run.estimator.health.measurements.dropped > 20
 
 
 def test_fusion_off_is_the_model_alone(release):
@@ -368,7 +368,7 @@ def test_registration_parameter_undoes_a_moved_tracker(release, plain):
     covariance = plain.column("tip_covariance")
     assert np.abs(run.column("tip_covariance") - covariance).max() < 1e-3 * np.abs(covariance).max()
     # without the parameter the measurements make no sense
-    assert play(moved[:60]).estimator.health.nis_sum > 1e4
+    assert play(moved[:60]).estimator.health.measurements.nis_sum > 1e4
 
 
 def test_lever_arm_parameter_undoes_a_sensor_beside_the_tip(release, plain):

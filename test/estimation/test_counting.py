@@ -8,8 +8,9 @@ import pytest
 from estimation_cases import START_NS, bag_messages, estimator
 
 from ctr_dynamics.estimation.inputs.measurement_queue import MeasurementQueue
-from ctr_dynamics.estimation.monitoring.health import FEWEST_APART, Health
+from ctr_dynamics.estimation.monitoring.health import Health
 from ctr_dynamics.estimation.monitoring.innovation_log import REMEMBERED_NS, InnovationLog
+from ctr_dynamics.estimation.monitoring.measurement_record import FEWEST_APART
 from ctr_dynamics.estimation.step_output import Innovation
 from ctr_dynamics.estimation.timeline import Timeline
 from ctr_dynamics.model.stability import Stability
@@ -40,12 +41,12 @@ def test_a_fast_tracker_is_counted_once_over_the_longest_correction():
     for i in range(1, 2001):
         log.add(innovation(i * period))
         log.take()
-    assert health.nis_count == 2000
+    assert health.measurements.nis_count == 2000
     mark = log.mark()
     for i in range(1200, 2002):
         log.add(innovation(i * period))
     log.keep_new(mark)
-    assert health.nis_count == 2001
+    assert health.measurements.nis_count == 2001
     assert [i.stamp_ns for i in log.take()] == [2001 * period]
     log.add(innovation(2 * REMEMBERED_NS))
     log.take()
@@ -56,17 +57,17 @@ def test_distances_that_are_taken_back_do_not_count():
     health = Health()
     log = InnovationLog(health)
     for i in range(FEWEST_APART):
-        assert health.apart_m == 0.0
+        assert health.measurements.apart_m == 0.0
         log.add(innovation(i * MS))
-    assert health.apart_m == pytest.approx(1e-3)
+    assert health.measurements.apart_m == pytest.approx(1e-3)
     mark = log.mark()
     for i in range(10):
         log.add(innovation((10 + i) * MS, apart=5e-3))
-    assert health.apart_m == pytest.approx(5e-3)
+    assert health.measurements.apart_m == pytest.approx(5e-3)
     log.discard(mark)
-    assert health.apart_m == pytest.approx(1e-3)
-    health.distances.clear()
-    assert health.apart_m == 0.0
+    assert health.measurements.apart_m == pytest.approx(1e-3)
+    health.measurements.distances.clear()
+    assert health.measurements.apart_m == 0.0
 
 
 @pytest.mark.parametrize("skew", [0.0, 1e-3])
@@ -125,12 +126,12 @@ def test_a_reset_leaves_no_figure_of_what_was_before():
     health.stability = Stability.__new__(Stability)
     health.refutation, health.shift_m, health.noise_ratio = "the file is refuted", 3e-3, 4.0
     health.force_sigma, health.tracker_age_s = 0.1, 5.0
-    health.rejected = 3
+    health.measurements.rejected = 3
     health.reinitialise()
     fresh = Health()
     for name in ("stability", "refutation", "shift_m", "noise_ratio", "force_sigma", "tracker_age_s"):
         assert getattr(health, name) == getattr(fresh, name), name
-    assert health.rejected == 3, "counters stay"
+    assert health.measurements.rejected == 3, "counters stay"
 
 
 def test_measurements_agree_anew_after_a_start():

@@ -33,10 +33,10 @@ def test_late_and_shuffled_poses_give_nearly_the_same(bag, delay):
     run, reference = play(late, settings), play(sweep, settings)
     check_outputs(run)
     health = run.estimator.health
-    assert health.dropped == reference.estimator.health.dropped
+    assert health.measurements.dropped == reference.estimator.health.measurements.dropped
     assert (
-        health.accepted + health.rejected
-        == reference.estimator.health.accepted + reference.estimator.health.rejected
+        health.measurements.accepted + health.measurements.rejected
+        == reference.estimator.health.measurements.accepted + reference.estimator.health.measurements.rejected
     )
     assert health.late > 20
     assert apart(run, reference) < 0.05e-3
@@ -53,8 +53,8 @@ def test_poses_later_than_the_window_are_dropped_and_counted(sweep, in_time):
     chosen = poses[10:14]
     run = play([m.late(0.21) if m in chosen else m for m in sweep])
     health = run.estimator.health
-    assert health.dropped == in_time.estimator.health.dropped + 4
-    assert health.accepted == in_time.estimator.health.accepted - 4
+    assert health.measurements.dropped == in_time.estimator.health.measurements.dropped + 4
+    assert health.measurements.accepted == in_time.estimator.health.measurements.accepted - 4
     assert health.tracker["too late"].count == 4
     assert "limit 0.2 s" in health.tracker["too late"].last
     left_out = play([m for m in sweep if m not in chosen])
@@ -84,7 +84,7 @@ def test_late_joints_under_predict_end_as_in_time_under_wait(sweep, in_time):
     assert np.abs(np.diag(run.last.tip_covariance) - variance).max() < 5e-2 * variance.max()
     assert np.abs(run.last.predicted_position - last.predicted_position).max() < 1e-6
     # measurements are counted once, however often they were fused again
-    assert run.estimator.health.accepted == in_time.estimator.health.accepted
+    assert run.estimator.health.measurements.accepted == in_time.estimator.health.measurements.accepted
 
 
 def corrected_apart(a, b):
@@ -131,7 +131,10 @@ def test_corrections_without_time_are_put_off_and_end_the_same(sweep, in_time, c
         assert open_loop < 2e-6
     # measurements are counted once, however often they were fused again
     health = run.estimator.health
-    assert health.accepted + health.rejected == in_time.estimator.health.accepted
+    assert (
+        health.measurements.accepted + health.measurements.rejected
+        == in_time.estimator.health.measurements.accepted
+    )
     stamps = [i.stamp_ns for out in run.outputs for i in out.innovations]
     assert len(stamps) == len(set(stamps))
     found, expected = nis(run), nis(straight)

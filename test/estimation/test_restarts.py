@@ -64,7 +64,7 @@ def test_measurements_of_the_same_stamps_are_fused_again_after_a_reset_and_count
             message.give(made)
             made.advance(START_NS + message.arrival)
         made.finish()
-        counted.append(made.health.nis_count)
+        counted.append(made.health.measurements.nis_count)
         fused.append(made.runs.fused.ekf.theta.copy())
         made.reset()
     assert counted[0] > 10

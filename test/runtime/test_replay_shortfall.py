@@ -75,7 +75,7 @@ def test_what_was_not_used_is_counted_apart():
 
     health = Health()
     for distance_m, accepted in ((0.001, True), (0.1, False), (0.001, True)):
-        health.measured(innovation(distance_m, accepted))
+        health.measurements.add(innovation(distance_m, accepted), fusing=True)
     summary = health.summary()
     assert summary["residual_rms_m"] == {"predicted": pytest.approx(0.001), "fused": pytest.approx(0.0005)}
     assert summary["measurements"] == {

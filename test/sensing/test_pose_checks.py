@@ -202,9 +202,11 @@ def scalar_first(source: PoseStream, off: float, swap: bool) -> list[Verdict]:
     return verdicts
 
 
-def test_scalar_first_quaternions_are_named_after_ten_poses():
+def test_scalar_first_quaternions_are_put_in_order_after_ten_poses():
     verdicts = scalar_first(PoseStream(), 0.15, swap=True)
-    assert not any(v.orientation for v in verdicts)
+    assert not any(v.orientation for v in verdicts[:9])
+    given = [quaternion for _, _, quaternion in stream(60, PoseStream())]
+    assert [v.quaternion_xyzw for v in verdicts[9:]] == given[9:]
     assert verdicts[9].kind is Kind.SCALAR_FIRST
     assert "w last" in verdicts[9].text
 

@@ -153,7 +153,7 @@ class MeasurementQueue:
             self._drop("before the joints", "poses come, but no complete joint state has")
 
     def _drop(self, kind: str, text: str) -> None:
-        self._health.dropped += 1
+        self._health.measurements.dropped += 1
         self._health.note("tracker", kind, text)
 
     def _shown_s(self, measurement: QueuedMeasurement) -> float:

@@ -31,7 +31,7 @@ class Deviations(NamedTuple):
             )
         if self.tip > self.largest:
             return f"the tip is known to no better than the limit of {1e3 * self.largest:.1f} mm (output.largest_deviation_m)"
-        apart = health.apart_m if unknown_delay is None else unknown_delay
+        apart = health.measurements.apart_m if unknown_delay is None else unknown_delay
         if health.fusing and health.tracker_alive and apart > self.largest:
             return (
                 f"tracker and model lie {1e3 * apart:.1f} mm apart, {limit}: check the tracker's frame and sensor, the joints' "

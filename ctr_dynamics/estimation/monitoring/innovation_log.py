@@ -6,17 +6,18 @@ from collections import deque
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from ctr_dynamics.estimation.monitoring.health import Health, MeasurementCounts
+from ctr_dynamics.estimation.monitoring.health import Health
+from ctr_dynamics.estimation.monitoring.measurement_record import MeasurementRecord
 from ctr_dynamics.estimation.step_output import Innovation
 
 REMEMBERED_NS = 10_000_000_000  # of reported stamps: corrections reach back over a window of 2 s and a gap of the joints of 3 s at most
 
 
 class Mark(NamedTuple):
-    """A place in the log: how many innovations waited there, and what had been counted."""
+    """A place in the log: how many innovations waited there, and the record of measurements."""
 
     waiting: int
-    counts: MeasurementCounts
+    record: MeasurementRecord
 
 
 class InnovationLog:
@@ -68,7 +69,7 @@ class InnovationLog:
 
     def mark(self) -> Mark:
         """The present place, for :meth:`discard` or :meth:`keep_new`."""
-        return Mark(len(self._waiting), self._health.measurement_counts())
+        return Mark(len(self._waiting), self._health.measurements.copy())
 
     def discard(self, mark: Mark) -> None:
         """Take back what has come since ``mark``: those measurements will be fused again."""
@@ -83,10 +84,11 @@ class InnovationLog:
 
     def _recount(self, mark: Mark, new: Sequence[Innovation]) -> None:
         del self._waiting[mark.waiting :]
-        self._health.restore_counts(mark.counts)
+        self._health.measurements = mark.record.copy()
         for innovation in new:
             self._count(innovation)
         self._waiting.extend(new)
 
     def _count(self, innovation: Innovation) -> None:
-        self._health.measured(innovation, again=innovation.stamp_ns <= self._published_ns)
+        again = innovation.stamp_ns <= self._published_ns
+        self._health.measurements.add(innovation, self._health.fusing, again)

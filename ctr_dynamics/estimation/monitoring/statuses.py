@@ -66,17 +66,17 @@ def tracker(health: Health) -> Status:
     status = inputs(health, "tracker")
     values = {
         **status.values,
-        "accepted": str(health.accepted),
-        "rejected": str(health.rejected),
+        "accepted": str(health.measurements.accepted),
+        "rejected": str(health.measurements.rejected),
         "late": str(health.late),
-        "dropped": str(health.dropped),
+        "dropped": str(health.measurements.dropped),
         "fusion": "on" if health.fusing else "off",
         "shift m": f"{health.shift_m:.4g}",
         "noise by the stated": f"{health.noise_ratio:.2f}",
     }
     if health.rejecting:
         message = (
-            f"{health.outside} of the last {len(health.recent)} samples are outside the gate (limit half): "
+            f"{health.measurements.outside} of the last {len(health.measurements.recent)} samples are outside the gate (limit half): "
             "check the tracker's frame, units, stamps and the robot file"
         )
         return Status("tracker", ERROR, message, values)
@@ -129,11 +129,11 @@ def consistency(health: Health) -> Status:
     if error is not None:
         values["model error m"] = f"{error.position:.4g}"
         values["model error rad"] = f"{error.rotation:.4g}"
-    if not health.recent:
+    if not health.measurements.recent:
         return Status("consistency", OK, "no samples yet", values)
-    mean = sum(ratio for ratio, _ in health.recent) / len(health.recent)
+    mean = sum(ratio for ratio, _ in health.measurements.recent) / len(health.measurements.recent)
     # the measurements of one second: white for a consistent filter, 6 degrees of freedom each
-    limit = 1.0 + 4.0 * math.sqrt(2.0 / (6.0 * len(health.recent)))
+    limit = 1.0 + 4.0 * math.sqrt(2.0 / (6.0 * len(health.measurements.recent)))
     values["nis per dof, last second"] = f"{mean:.2f}"
     if error is not None:
         message = (

@@ -73,7 +73,7 @@ class OrientationChecks:
         return Verdict("correct", Kind.NO_ORIENTATION, text, orientation=False)
 
     def _ordered(self, at: int, quaternion: Values, expected_wxyz: Sequence[float]) -> Verdict:
-        """Position only, where orientations fit the expected ones only with w first."""
+        """In the right order, where orientations fit the expected ones only with w first; position only until that is known."""
         x, y, z, w = quaternion
         given = _angle((w, x, y, z), expected_wxyz)
         reordered = _angle((x, y, z, w), expected_wxyz)
@@ -90,11 +90,11 @@ class OrientationChecks:
             return Verdict("correct", orientation=False)
         text = (
             f"orientations are {given:.2f} rad off the expected ones as x, y, z, w, limit {limits.fitting_rad:g} rad, "
-            f"and {reordered:.2f} rad as w, x, y, z: scalar first? ROS wants w last; or set tracker.axes to xyz, so that positions are used"
+            f"and {reordered:.2f} rad as w, x, y, z: scalar first? They are taken as that; ROS wants w last"
         )
         early = 1 if Kind.SCALAR_FIRST in self.findings else self._reordered
         self.findings.add(Kind.SCALAR_FIRST, at, given, "rad", text, count=early)
-        return Verdict("correct", Kind.SCALAR_FIRST, text, orientation=False)
+        return Verdict("correct", Kind.SCALAR_FIRST, text, quaternion_xyzw=(y, z, w, x))
 
 
 def _angle(one: Sequence[float], other: Sequence[float]) -> float:

@@ -165,11 +165,12 @@ class PoseChecks:
         if kind is None and oriented is ACCEPT:
             return timed
         return Verdict(
-            "correct" if timed.stamp_ns is not None or not oriented.orientation else "accept",
+            "correct" if "correct" in (timed.use, oriented.use) else "accept",
             kind,
             text,
             timed.stamp_ns,
             orientation=oriented.orientation,
+            quaternion_xyzw=oriented.quaternion_xyzw,
             retract_ns=stamped.retract_ns,
             error_s=timed.error_s,
         )

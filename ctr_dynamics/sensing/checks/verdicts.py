@@ -80,7 +80,7 @@ class Verdict:
         kind, text: what was found, with value, limit, unit and what to do; None and empty where nothing was. An accepted message may have one.
         stamp_ns: the time to use instead of its stamp. error_s: 1-sigma of that, s.
         rotations: (N,) rad to use instead of its own.
-        orientation: False where only the position of a pose is to be used.
+        orientation: False where only the position of a pose is to be used. quaternion_xyzw: (4,) to use instead of its own.
         retract_ns: stamp of a message accepted earlier that has turned out wrong; as it was given out, so corrected where it was.
     """
 
@@ -90,6 +90,7 @@ class Verdict:
     stamp_ns: int | None = None
     rotations: tuple[float, ...] | None = None
     orientation: bool = True
+    quaternion_xyzw: tuple[float, float, float, float] | None = None
     retract_ns: int | None = None
     error_s: float = 0.0
 
