@@ -40,7 +40,14 @@ from ctr_dynamics.estimation.filter.parameter_priors import tip_compliance
 from ctr_dynamics.robot import Robot
 from ctr_dynamics.robot_files import robot_from_dict, robot_to_dict
 from ctr_dynamics.simulation.scenario import Load, Scenario
-from studies.diagnosis_study import fraction, named_effects, true_separations
+from studies.diagnosis_study import (
+    fraction,
+    interval_hits,
+    is_sure,
+    likeliest_is_right,
+    named_effects,
+    true_separations,
+)
 
 STRATA = ("clean", "single", "many", "pair", "outside")
 HIDDEN = {"single": 1, "pair": 2}  # effects of the catalogue
@@ -175,6 +182,10 @@ def table(rows: list[dict[str, Any]]) -> str:
             "no wrong name above 0.5": fraction(not wrongly_named(r) for r in by["outside"]),
             "many small: tolerances": fraction(r["verdict"] == "tolerances" for r in by["many"]),
             "no wrong name above 0.5 ": fraction(not wrongly_named(r) for r in by["many"]),
+            "sure of something hidden (0.95): right": fraction(
+                likeliest_is_right(r) for r in by["single"] + by["pair"] if is_sure(r)
+            ),
+            "90 % intervals that hold the truth": fraction(interval_hits(clear + by["pair"], "ci90")),
             "median, longest diagnosis": f"{seconds[len(seconds) // 2]:.0f} s, {seconds[-1]:.0f} s",
         }
 

@@ -276,7 +276,16 @@ def set_path(data, path, value):
         ),
         (("tubes", 0, "precurvature", 1, "curvature"), None, ["either curvature or curvature_polynomial"]),
         (("tubes", 0, "end_body", "mass", "value"), 8.0, ["8 kg is outside [0, 1] kg"]),
-        (("tubes", 0, "end_body", "inertia", "value"), [1e-6, -1e-6, 1e-6], ["-1e-06 kg m^2 is outside"]),
+        (
+            ("tubes", 0, "end_body", "inertia", "value"),
+            [1e-6, -1e-6, 1e-6],
+            ["-1e-06 kg m^2 is outside", "must not be negative"],
+        ),
+        (
+            ("tubes", 0, "outer_radius", "value"),
+            -6.22e-4,
+            ["-0.000622 m is outside (0, 0.05] m; it must be positive"],
+        ),
         (("friction", "epsilon", "value"), 0.0, ["0 rad/s is outside (0, 100000] rad/s"]),
         (("friction", "base", "coulomb", "unit"), "N", ["unit 'N' must be '1'"]),
         (("gravity", "value"), [0, -9810.0, 0], ["gravity is 9810 m/s^2"]),

@@ -216,6 +216,8 @@ def check_range(values: list[float], unit: str, low: float, high: float, above: 
     for value in values:
         if value < low or value > high or (above and value == low):
             interval = f"{'(' if above else '['}{low:g}, {high:g}]"
+            if low >= 0.0 and value <= 0.0:  # no other unit makes it right
+                hint = "it must be positive" if above or low > 0.0 else "it must not be negative"
             raise problem(f"{value:g} {unit} is outside {interval} {unit}; {hint}")
 
 

@@ -89,8 +89,8 @@ class OrientationChecks:
         if not self.scalar_first:
             return Verdict("correct", orientation=False)
         text = (
-            f"orientations are {given:.2f} rad off the expected ones as x, y, z, w, limit {limits.fitting_rad:g} rad, "
-            f"and {reordered:.2f} rad as w, x, y, z: scalar first? They are taken as that; ROS wants w last"
+            f"orientations are {reordered:.2f} rad off the expected ones as w, x, y, z (limit {limits.fitting_rad:g} rad), and {given:.2f} rad "
+            "as x, y, z, w: they are taken as w, x, y, z; ROS wants w last"
         )
         early = 1 if Kind.SCALAR_FIRST in self.findings else self._reordered
         self.findings.add(Kind.SCALAR_FIRST, at, given, "rad", text, count=early)
