@@ -320,10 +320,10 @@ def test_figures_of_poses_that_are_first_fused_on_a_way_back_count_once(sweep, i
     """Residuals and NIS are means over the same measurements, however late these came."""
     late = [m.late(0.012) if m.kind == "joints" else m for m in sweep]
     run = play(late, {"output.policy": "predict"}, tick=STEP, spare=lambda made: 0.0)
-    h, reference = run.estimator.health, in_time.estimator.health
-    assert h.corrected_steps > 100
+    assert run.estimator.health.corrected_steps > 100
+    h, reference = run.estimator.health.measurements, in_time.estimator.health.measurements
     assert (h.residuals.compared, h.nis_count) == (reference.residuals.compared, reference.nis_count)
-    found, expected = h.residual_rms(), reference.residual_rms()
+    found, expected = h.residuals.rms(True), reference.residuals.rms(True)
     assert found["predicted"] == pytest.approx(expected["predicted"], rel=1e-3)
     assert found["fused"] == pytest.approx(expected["fused"], rel=0.02)
 
