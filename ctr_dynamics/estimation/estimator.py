@@ -44,7 +44,7 @@ from ctr_dynamics.model.simulator import StepResult
 from ctr_dynamics.model.stability import StabilityWatch
 from ctr_dynamics.parameters import Settings
 from ctr_dynamics.robot import Robot
-from ctr_dynamics.sensing.tracker_parameters import with_robot_file
+from ctr_dynamics.sensing.tracker_parameters import with_least_noise, with_robot_file
 
 Floats = NDArray[np.float64]
 
@@ -78,8 +78,8 @@ class Estimator:
     """
 
     def __init__(self, robot: Robot, settings: Settings) -> None:
-        self.robot, self.settings = robot, with_robot_file(settings, robot)
-        settings = self.settings
+        self.robot = robot = with_least_noise(robot)
+        self.settings = settings = with_robot_file(settings, robot)
         self.options = EstimatorOptions()
         self._length = robot.tubes[0].length
         self._largest_deviation = (
@@ -417,8 +417,8 @@ class Estimator:
         state, predicted = fused.state, self.runs.open_loop.tips.last.mean[:7].copy()
         assert state is not None
         shown = fused.with_alternatives(tip, self.runs.open_loop, self._largest_deviation)
-        since = fused.measured_ns if fused.measured_ns is not None else self.t0_ns
-        self.health.tracker_age_s = max(0.0, (stamp - (since or stamp)) * 1e-9)
+        since = self.timeline.stamp(0) if fused.measured_ns is None else fused.measured_ns
+        self.health.tracker_age_s = max(0.0, (stamp - since) * 1e-9)
         modes = self._modes.measure(state, k)
         lag_ns = self.late.lag * STEP_NS
         self._covariance.inflate(tip, stamp, self.runs, self.inputs, self._settling, modes, lag_ns)

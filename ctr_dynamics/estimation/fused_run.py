@@ -140,12 +140,6 @@ class FusedRun:
                 self.confirmed += 1
             if update.dof:
                 self.measured_ns = max(self.measured_ns or 0, measurement.stamp_ns)
-            else:
-                self._health.note(
-                    "tracker",
-                    "outside the window",
-                    f"pose of t = {time_s:.3f} s at step {k}: {update.reason}",
-                )
             self._innovations.add(
                 Innovation(
                     measurement.stamp_ns, update.residual, update.variance, update.nis, update.dof, update.accepted,

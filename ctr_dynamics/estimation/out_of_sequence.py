@@ -161,21 +161,24 @@ class OutOfSequence:
         """Have nothing to correct and nothing to return to: the steps go on elsewhere."""
         self.history.checkpoints.clear()
         self._from_ns = self.repeated = None
+        self._joints_only, self._urgent = True, False
         self._inputs.actuator_error.corrected()
 
     # -- 1. what has changed --
 
-    def changed(self, from_ns: int) -> None:
-        """Inputs from the stamp ``from_ns`` on are others than the steps were taken with."""
+    def changed(self, from_ns: int) -> bool:
+        """Inputs from the stamp ``from_ns`` on are others than before; returns whether steps were taken with those."""
         taken_ns = self._inputs.timeline.taken_ns
-        if taken_ns is not None and from_ns < taken_ns and self._runs.running:
-            self._from_ns = from_ns if self._from_ns is None else min(self._from_ns, from_ns)
+        if taken_ns is None or from_ns >= taken_ns or not self._runs.running:
+            return False
+        self._from_ns = from_ns if self._from_ns is None else min(self._from_ns, from_ns)
+        return True
 
     def load_changed(self, from_ns: int, jumped: bool) -> None:
         """The same for the known load. Where it has ``jumped``, uncorrected steps soon have nothing to do with the robot."""
-        self.changed(from_ns)
-        self._joints_only = False
-        self._urgent |= self.pending and jumped
+        if self.changed(from_ns):
+            self._joints_only = False
+            self._urgent |= jumped
 
     @property
     def pending(self) -> bool:

@@ -10,6 +10,8 @@ from ctr_dynamics.kernels.rotations import from_vector, matrix, multiply, to_vec
 from ctr_dynamics.parameters import Settings, parameter
 from ctr_dynamics.robot import Robot
 
+LEAST_NOISE_M = 1e-6  # per axis, below that of any tracker
+
 
 def with_tracker_parameters(robot: Robot, settings: Settings) -> Robot:
     """``robot`` with the delay, lever arm and registration of its tracker corrected by the parameters ``tracker.*``.
@@ -30,6 +32,16 @@ def with_tracker_parameters(robot: Robot, settings: Settings) -> Robot:
         lever_arm=tuple((np.array(tracker.lever_arm.value) + lever).tolist()),
         delay=float(tracker.delay.value + delay),
     )
+
+
+def with_least_noise(robot: Robot) -> Robot:
+    """``robot`` whose tracker has at least the noise of the best: measurements are weighed by it, and an exact one has no finite weight."""
+    noise = robot.tracker.noise
+    if noise.position.value >= LEAST_NOISE_M:
+        return robot
+    position = noise.position.model_copy(update={"value": LEAST_NOISE_M})
+    tracker = robot.tracker.model_copy(update={"noise": noise.model_copy(update={"position": position})})
+    return robot.model_copy(update={"tracker": tracker})
 
 
 def with_robot_file(settings: Settings, robot: Robot) -> Settings:

@@ -53,6 +53,27 @@ def test_a_fast_tracker_is_counted_once_over_the_longest_correction():
     assert len(log._reported) == 1, "the memory is bounded"
 
 
+def test_what_could_not_be_compared_is_noted_once_however_often_it_comes_due():
+    health = Health()
+    log = InnovationLog(health)
+    for _ in range(3):
+        mark = log.mark()
+        log.add(innovation(MS)._replace(dof=0, reason="no joint states at its time"))
+        log.discard(mark)
+    assert not health.tracker
+    log.add(innovation(MS)._replace(dof=0, reason="no joint states at its time"))
+    log.take()
+    assert health.tracker["not compared"].count == 1
+    assert "no joint states" in health.tracker["not compared"].last
+
+
+def test_the_limit_of_the_recent_nis_goes_by_its_degrees_of_freedom():
+    record = Health().measurements
+    for _ in range(10):
+        record.add(innovation(MS)._replace(nis=3.0, dof=3), fusing=True)
+    assert record.recent_nis == pytest.approx((1.0, 1.0 + 4.0 * (2.0 / 30.0) ** 0.5))
+
+
 def test_distances_that_are_taken_back_do_not_count():
     health = Health()
     log = InnovationLog(health)

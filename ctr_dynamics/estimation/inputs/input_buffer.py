@@ -150,15 +150,17 @@ class InputBuffer:
             from_ns = self._end_gap(waiting, given)
             self._take(given)
             return from_ns
-        if waiting is not None:  # the only one for long
-            self._end_gap(waiting, None)
+        changed: list[int | None] = []
+        if waiting is not None:  # it was the only one for long
+            changed.append(self._end_gap(waiting, None))
         last = self.joints.stamps[-1] if self.joints.stamps else None
-        if last is not None and stamp_ns - last > self.timeout_ns:
-            if stamp_ns - last <= LONGEST_BRIDGE * STEP_NS:
-                self._after_gap = given  # the next one tells the rate there
-                return None
-            return self._end_gap(given, None)
-        return self._take(given)
+        if last is None or stamp_ns - last <= self.timeout_ns:
+            changed.append(self._take(given))
+        elif stamp_ns - last <= LONGEST_BRIDGE * STEP_NS:
+            self._after_gap = given  # the next one tells the rate there
+        else:
+            changed.append(self._end_gap(given, None))
+        return min((from_ns for from_ns in changed if from_ns is not None), default=None)
 
     def _end_gap(self, first: KnownActuators, second: KnownActuators | None) -> int:
         """Have the actuators known over a gap of which ``first`` is the end; ``second`` is the one after it, None where that is not near.
@@ -260,8 +262,9 @@ class InputBuffer:
             from_ns = load.stamps[i - 1]
         else:
             return None
-        begin_ns = stamp_ns if first or not i else load.stamps[i - 1]
-        difference = np.zeros(6) if begin_ns == stamp_ns else value - before
+        i = load.stamps.index(stamp_ns)  # where the time without load may have been put before it
+        begin_ns = load.stamps[i - 1] if i else stamp_ns
+        difference = value - load.values[i - 1] if i else np.zeros(6)
         jumped = bool(np.any(np.abs(value - known) > self.model.load_slope_limit))
         return LoadChange(from_ns, jumped, begin_ns, stamp_ns, difference)
 

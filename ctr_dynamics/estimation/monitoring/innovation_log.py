@@ -54,6 +54,12 @@ class InnovationLog:
         while self._reported and self._reported[0] < self._newest_ns - REMEMBERED_NS:
             self._reported.popleft()
         self._unjudged.extend(waiting)
+        for innovation in waiting:
+            if not innovation.dof:
+                text = (
+                    f"the pose of stamp {innovation.stamp_ns} ns could not be compared: {innovation.reason}"
+                )
+                self._health.note("tracker", "not compared", text)
         return waiting
 
     def judge(self) -> None:

@@ -46,7 +46,7 @@ class MeasurementRecord:
         accepted, rejected, dropped: measurements that were fused, lay outside the gate, or could not be compared.
         nis_sum, nis_dof, nis_count: over all measurements that reached the gate.
         residuals: of the measurements that were used; unused_residuals: of those that were rejected or dropped.
-        recent: (nis / dof, within the gate) of the last of them.
+        recent: (nis, dof, within the gate) of the last of them.
         distances: m, between measured and published positions, of the last measurements.
     """
 
@@ -58,7 +58,7 @@ class MeasurementRecord:
     nis_count: int = 0
     residuals: Residuals = NOTHING_COMPARED
     unused_residuals: Residuals = NOTHING_COMPARED
-    recent: deque[tuple[float, bool]] = field(default_factory=lambda: deque(maxlen=RECENT))
+    recent: deque[tuple[float, int, bool]] = field(default_factory=lambda: deque(maxlen=RECENT))
     distances: deque[float] = field(default_factory=lambda: deque(maxlen=APART))
 
     def copy(self) -> MeasurementRecord:
@@ -83,7 +83,7 @@ class MeasurementRecord:
             innovation.accepted and not innovation.reason
         )
         if innovation.dof:
-            self.recent.append((innovation.nis / innovation.dof, within))
+            self.recent.append((innovation.nis, innovation.dof, within))
         if innovation.fused_residual is not None:
             self.distances.append(float(np.linalg.norm(innovation.fused_residual)))
         if again:
@@ -121,12 +121,18 @@ class MeasurementRecord:
     @property
     def outside(self) -> int:
         """How many of the recent measurements lay outside the gate."""
-        return sum(not within for _, within in self.recent)
+        return sum(not within for _, _, within in self.recent)
 
     @property
     def mostly_outside(self) -> bool:
         """Whether most of the recent measurements lay outside the gate."""
         return len(self.recent) >= FEWEST_RECENT and self.outside > 0.5 * len(self.recent)
+
+    @property
+    def recent_nis(self) -> tuple[float, float]:
+        """Mean NIS per degree of freedom of the recent measurements, and the limit for a consistent filter: four deviations of that mean."""
+        dof = sum(dof for _, dof, _ in self.recent)
+        return sum(nis for nis, _, _ in self.recent) / dof, 1.0 + 4.0 * math.sqrt(2.0 / dof)
 
     def nis_summary(self) -> dict[str, float | int | bool | None]:
         """Mean NIS per degree of freedom with the 95 % band of that mean for a consistent filter."""

@@ -131,9 +131,7 @@ def consistency(health: Health) -> Status:
         values["model error rad"] = f"{error.rotation:.4g}"
     if not health.measurements.recent:
         return Status("consistency", OK, "no samples yet", values)
-    mean = sum(ratio for ratio, _ in health.measurements.recent) / len(health.measurements.recent)
-    # the measurements of one second: white for a consistent filter, 6 degrees of freedom each
-    limit = 1.0 + 4.0 * math.sqrt(2.0 / (6.0 * len(health.measurements.recent)))
+    mean, limit = health.measurements.recent_nis
     values["nis per dof, last second"] = f"{mean:.2f}"
     if error is not None:
         message = (
