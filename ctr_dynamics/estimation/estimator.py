@@ -26,7 +26,6 @@ from ctr_dynamics.estimation.inputs.measurement_queue import tracker_of
 from ctr_dynamics.estimation.inputs.unseen_load import UnseenLoad
 from ctr_dynamics.estimation.mode_tracker import ModeTracker
 from ctr_dynamics.estimation.monitoring.consistency_monitor import consistency_monitor
-from ctr_dynamics.estimation.monitoring.deviations import Deviations
 from ctr_dynamics.estimation.monitoring.health import Health
 from ctr_dynamics.estimation.monitoring.innovation_log import InnovationLog
 from ctr_dynamics.estimation.monitoring.settling import Settling
@@ -97,7 +96,9 @@ class Estimator:
         self.timeline = self.inputs.timeline
         self._schedule = StepSchedule(self.timeline, self.inputs, self.options)
         self.innovations = InnovationLog(self.health)
-        self.runs = Runs(self.model, settings, self.inputs, self.health, self.innovations)
+        self.runs = Runs(
+            self.model, settings, self.inputs, self.health, self.innovations, self.discretisation.vibration
+        )
         self.late = OutOfSequence(self.runs, self.inputs, self.health, self.innovations)
         self.step_times_s: array[float] | None = None
         self._backbone = Backbone(self.model, self.runs.fused.ekf)
@@ -173,6 +174,7 @@ class Estimator:
         """
         change = self.inputs.add_load(stamp_ns, force, torque, frame_id)
         if change is not None:
+            self.runs.load_doubt.load_changed(change)
             self.late.load_changed(change.from_ns, change.jumped)
             self._covariance.load_changed(change)
             self._unseen_load.look(self._settling, change=change)
@@ -204,6 +206,9 @@ class Estimator:
             self._correct(spare_s)  # now, while nothing waits for it
         while self._schedule.due(self.k + 1, now_ns) and (most is None or len(outputs) < most):
             begin = time.perf_counter()
+            wrong_ns = self.runs.leave_wrong_load_out()
+            if wrong_ns is not None:
+                self.late.load_changed(wrong_ns, jumped=True)
             # 1. Go back, if inputs came late and the step cannot go ahead.
             if self.late.pending and (spare_s is None or not self.late.may_go_ahead):
                 self._correct(spare_s)
@@ -457,7 +462,7 @@ class Estimator:
             return f"joint states are missing: the last is {age_s:.3f} s old, limit {limit_s:g} s"
         if unsettled:
             return unsettled
-        deviations = Deviations(deviation, self._covariance.driven_m, self._largest_deviation)
+        deviations = self._covariance.deviations(deviation)
         return deviations.problem(self.health, self.runs.fused.alternatives.late_by_m)
 
     def _look_for_motion(self) -> None:

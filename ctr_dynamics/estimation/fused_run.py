@@ -16,6 +16,7 @@ from ctr_dynamics.estimation.filter.filter_records import FilterState, TipEstima
 from ctr_dynamics.estimation.inputs.input_buffer import InputBuffer
 from ctr_dynamics.estimation.inputs.measurement_queue import DueMeasurement
 from ctr_dynamics.estimation.inputs.run_inputs import InterpolatedInputs, RunInputs
+from ctr_dynamics.estimation.load_doubt import LoadDoubt
 from ctr_dynamics.estimation.monitoring.densities import allowance
 from ctr_dynamics.estimation.monitoring.disagreement import Disagreement
 from ctr_dynamics.estimation.monitoring.health import Health
@@ -109,7 +110,9 @@ class FusedRun:
         """Actuators and load with the estimated offsets and force."""
         return RunInputs(self._interpolated, self._load, self._by_theta, self.ekf.theta)
 
-    def update(self, k: int, due: Sequence[DueMeasurement], open_loop: OpenLoopRun) -> None:
+    def update(
+        self, k: int, due: Sequence[DueMeasurement], open_loop: OpenLoopRun, load_doubt: LoadDoubt
+    ) -> None:
         """Compare the measurements that have come ``due`` after step ``k`` with the tips of their times, and fuse them."""
         assert self.state is not None
         not_fused = self.alternatives.not_fused
@@ -125,6 +128,10 @@ class FusedRun:
                 update = self.ekf.compare(*given)
                 if not_fused:
                     update = update._replace(reason=update.reason.replace(FUSION_OFF, not_fused))
+            if motion is not None:
+                tracker = self.ekf.tracker
+                own_s = time_s - tracker.delay - self.ekf.expected.delay
+                load_doubt.take(measurement.stamp_ns, own_s, motion.residual, motion.position, tracker)
             if motion is not None and residual is not None:
                 seen = motion.position + motion.residual
                 self.disagreement.add(measurement.stamp_ns, seen, motion.position, residual)

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from ctr_dynamics.estimation.discretisation import Discretisation
 from ctr_dynamics.estimation.filter.filter_records import TipEstimate
 from ctr_dynamics.estimation.inputs.input_buffer import InputBuffer, LoadChange
+from ctr_dynamics.estimation.monitoring.deviations import Deviations
 from ctr_dynamics.estimation.monitoring.settling import Settling
 from ctr_dynamics.estimation.monitoring.twist_error import TwistError, UnseenVibration
 from ctr_dynamics.estimation.monitoring.unexpected_innovation import UnexpectedInnovation
@@ -25,15 +26,15 @@ class PublishedCovariance:
 
     Attributes:
         unseen_vibration: of such a robot.
-        driven_m: m, by which actuators may have moved the tip unknown to the last step.
+        driven_m: m, by which actuators may have moved the tip unknown to the last step. by_load_m: by which a known load in doubt has moved it.
     """
 
     def __init__(self, discretisation: Discretisation, robot: Robot, largest: float, unseen: float) -> None:
-        self._length = robot.tubes[0].length
+        self._length, self._largest = robot.tubes[0].length, largest
         self._unexpected = UnexpectedInnovation(largest, robot.tracker.noise.position.value)
         self._twist_error = TwistError(discretisation.vibration, robot)
         self.unseen_vibration = UnseenVibration(discretisation.vibration, unseen)
-        self.driven_m = 0.0
+        self.driven_m = self.by_load_m = 0.0
 
     def load_changed(self, change: LoadChange) -> None:
         """The known load has changed."""
@@ -44,6 +45,10 @@ class PublishedCovariance:
     def take(self, innovations: Sequence[Innovation], refuted: bool, confirmed: bool) -> None:
         """The measurements of one step; see :meth:`UnexpectedInnovation.take`."""
         self._unexpected.take(innovations, refuted, confirmed)
+
+    def deviations(self, tip: float) -> Deviations:
+        """What the last covariance holds, with that of the ``tip``, m."""
+        return Deviations(tip, self.driven_m, self.by_load_m, self._largest)
 
     def inflate(
         self, tip: TipEstimate, stamp: int, runs: Runs, inputs: InputBuffer, settling: Settling, modes: Modes, lag_ns: int
@@ -60,4 +65,7 @@ class PublishedCovariance:
         self._twist_error.inflate(tip, stamp, runs.open_loop.tips.last, fused.ekf, periods_s, modes)
         if (apart := settling.unseen(stamp)) is not None:
             self.unseen_vibration.inflate(covariance, apart)
+        alive = inputs.health.tracker_alive  # else nothing will tell
+        mean = runs.open_loop.tips.last.mean
+        self.by_load_m = runs.load_doubt.inflate(covariance, mean) if alive else 0.0
         self.driven_m = inputs.actuator_error.inflate(covariance, tip.position, self._length, stamp, lag_ns)

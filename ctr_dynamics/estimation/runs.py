@@ -9,12 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctr_dynamics.errors import InputError
+from ctr_dynamics.estimation.discretisation import VibrationErrors
 from ctr_dynamics.estimation.filter.ekf import RodEkf
 from ctr_dynamics.estimation.filter.filter_records import FilterOptions, FilterState
 from ctr_dynamics.estimation.filter.gating import GateOptions
 from ctr_dynamics.estimation.fused_run import FusedRun
 from ctr_dynamics.estimation.inputs.input_buffer import InputBuffer
 from ctr_dynamics.estimation.inputs.run_inputs import InterpolatedInputs, RunInputs, standing
+from ctr_dynamics.estimation.load_doubt import HeldLoad, LoadDoubt
 from ctr_dynamics.estimation.monitoring.health import Health
 from ctr_dynamics.estimation.monitoring.innovation_log import InnovationLog
 from ctr_dynamics.estimation.open_loop import OpenLoopRun
@@ -38,14 +40,15 @@ class Runs:
         settings: the parameter table's values.
         inputs: that drive both.
         health, innovations: where outcomes are counted and collected.
+        modes: of the robot at rest.
 
     Attributes:
-        fused, open_loop: the runs.
+        fused, open_loop: the runs. load_doubt: a third one, while the known load is in doubt.
         k: the last step that both have taken; -1 before the start.
     """
 
     def __init__(
-        self, model: Model, settings: Settings, inputs: InputBuffer, health: Health, innovations: InnovationLog
+        self, model: Model, settings: Settings, inputs: InputBuffer, health: Health, innovations: InnovationLog, modes: VibrationErrors,
     ) -> None:  # fmt: skip
         self._inputs, self._health = inputs, health
         scheme = scheme_of(str(settings["model.scheme"]), DT, float(settings["model.alpha"]))
@@ -59,11 +62,13 @@ class Runs:
         ekf = RodEkf(corrected, self.tracker, filter_options(settings))
         self.fused = FusedRun(ekf, self._interpolated, load, inputs, health, innovations)
         no_effect = np.zeros((model.input_count, 0))
+        tips = ekf.tips.size + math.ceil(self.fused.alternatives.usual_timing.reach_s / DT)
         self.open_loop = OpenLoopRun(
-            nominal,
-            RunInputs(self._interpolated, load, no_effect, np.zeros(0)),
-            ekf.tips.size + math.ceil(self.fused.alternatives.usual_timing.reach_s / DT),
+            nominal, RunInputs(self._interpolated, load, no_effect, np.zeros(0)), tips
         )
+        held = HeldLoad(self._interpolated, load)
+        without = OpenLoopRun(Simulator(model, scheme, tolerance), held, tips)
+        self.load_doubt = LoadDoubt(without, held, inputs, modes, model.robot.tracker.noise.position.value)
         self.clear()
 
     def clear(self) -> None:
@@ -71,6 +76,7 @@ class Runs:
         self.fused.clear()
         self.open_loop.clear()
         self._interpolated.clear()
+        self.load_doubt.clear()
         self.k = -1
         self._failures = 0
 
@@ -94,6 +100,7 @@ class Runs:
         """Both runs at rest at step ``k``; returns the reason when there is no equilibrium."""
         t = seconds(k)
         self._interpolated.clear()
+        self.load_doubt.clear()
         self.fused.confirmed = 0
         self.fused.ekf.forget_parameters()
         self.fused.ekf.gate.rejections = 0
@@ -122,11 +129,13 @@ class Runs:
         """
         t = seconds(k)
         # 1. Propagate both runs.
+        self.load_doubt.before_step(k, self.open_loop)
         result, open_loop = self._propagate(k, extrapolated, record=reuse is None)
         if not open_loop.ok:
             return open_loop
         self.k = k
         self.open_loop.append_tip(t)
+        self.load_doubt.after_step(k)
         if not result.ok:
             self.fused.reinitialise(self.open_loop, k)
             self._health.restarts += 1
@@ -145,7 +154,7 @@ class Runs:
                 "tracker", "tangent", "the step could not be linearised; the covariance was held"
             )
         # 3. Update with the measurements that have come due.
-        self.fused.update(k, due, self.open_loop)
+        self.fused.update(k, due, self.open_loop, self.load_doubt)
         self._inputs.measurements.forget(k)
         return result
 
@@ -155,6 +164,16 @@ class Runs:
         ``moves_as_modelled``: whether the open-loop run moves as the robot does, but for faults. Else nothing but the timing is concluded.
         """
         return self.fused.alternatives.conclude(self.open_loop, self.k, moves_as_modelled)
+
+    def leave_wrong_load_out(self) -> int | None:
+        """Stamp (ns) from which on the known load is left out, as the tracker shows that the robot does not bear it; None where it is not."""
+        doubt, taken_ns = self.load_doubt, self._inputs.timeline.taken_ns
+        begin_ns = doubt.begin_ns
+        if begin_ns is None or taken_ns is None or not doubt.decided(taken_ns, self.fused.on_time()):
+            return None
+        doubt.clear()
+        self._inputs.leave_load_out(begin_ns)
+        return begin_ns
 
     def judge(self, result: StepResult) -> None:
         """Count the outcome of a step; after too many failures in a row there is no state to go on from."""

@@ -6,6 +6,7 @@ Inputs are validated, and odd ones counted. A new one tells from which stamp on 
 from __future__ import annotations
 
 import bisect
+import math
 from collections import deque
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -29,6 +30,7 @@ Floats = NDArray[np.float64]
 LOAD_GRACE_NS = 100_000_000  # a first load that comes this soon after the joints is there from the start: nodes start one after another
 
 
+RETURNED = 0.1  # of a jump, within which a load has returned
 LONGEST_BRIDGE = 1000  # steps that are taken again where joints come back after a gap
 
 
@@ -99,6 +101,9 @@ class InputBuffer:
         self._opening: int | None = None  # ns of the value without load that was put before the first load
         self.measurements.clear()
         self.backwards = 0
+        self._left_out: tuple[Floats, float] | None = (
+            None  # load that holds instead, and the size of the wrong jump from it
+        )
         self.gap: JointGap | None = None
         self._after_gap: KnownActuators | None = None
         self._gaps: deque[tuple[int, int]] = deque(maxlen=20)  # the last ones, ns
@@ -228,6 +233,14 @@ class InputBuffer:
             return None
         stamp_ns += self._load_delay_ns
         load, taken = self.load, self.timeline.taken_ns
+        if self._left_out is not None:
+            held, jump = self._left_out
+            if float(np.linalg.norm(value - held)) > RETURNED * jump:
+                self.health.note(
+                    "load", "contradicted", "loads are left out until they return to that before the jump"
+                )
+                return None
+            self._left_out = None
         if load.stamps and taken is not None and stamp_ns < min(load.stamps[-1], taken - self.window_ns):
             late = (taken - stamp_ns) * 1e-9
             self.health.note(
@@ -267,6 +280,26 @@ class InputBuffer:
         difference = value - load.values[i - 1] if i else np.zeros(6)
         jumped = bool(np.any(np.abs(value - known) > self.model.load_slope_limit))
         return LoadChange(from_ns, jumped, begin_ns, stamp_ns, difference)
+
+    def leave_load_out(self, from_ns: int) -> None:
+        """Have the known load stay as it was at ``from_ns``: what came then contradicts the tracker. It counts again once it returns there."""
+        load = self.load
+        held, wrong = (
+            load.at(from_ns)[0],
+            [v for s, v in zip(load.stamps, load.values, strict=True) if s > from_ns],
+        )
+        while len(load.stamps) > 1 and load.stamps[-1] > from_ns:
+            del load.stamps[-1], load.values[-1]
+        jump = max(float(np.linalg.norm(value - held)) for value in wrong)
+        returned = float(np.linalg.norm(wrong[-1] - held)) <= RETURNED * jump
+        self._left_out = None if returned else (held, jump)
+        size = max(math.hypot(*value[:3].tolist()) for value in wrong)
+        self.health.note(
+            "load",
+            "contradicted",
+            f"the robot does not move as with a load of {size:.3g} N, the tracker shows: left out until it returns to that before the jump; "
+            "check the sensor, its unit and its frame",
+        )
 
     def _open_load(self, t0_ns: int) -> None:
         """Before the first load there is none, or that one if it comes soon enough after the first joints."""

@@ -11,11 +11,13 @@ class Deviations(NamedTuple):
     """Deviations of one output, m in 3-D.
 
     Attributes:
-        tip: by the published covariance. driven: part of it, by actuators that are not known yet. largest: limit of all.
+        tip: by the published covariance. driven: part of it, by actuators that are not known yet. by_load: how far a known load that no measurement
+            has confirmed moves the tip. largest: limit of the deviation.
     """
 
     tip: float
     driven: float
+    by_load: float
     largest: float
 
     def problem(self, health: Health, unknown_delay: float | None = None) -> str:
@@ -27,6 +29,11 @@ class Deviations(NamedTuple):
         if self.tip > self.largest and 2.0 * self.driven**2 > self.tip**2:
             return (
                 f"joint states come too late: what the actuators did meanwhile may have moved the tip by {1e3 * self.tip:.1f} mm, {limit} "
+                "(output.largest_deviation_m)"
+            )
+        if self.tip > self.largest and self.by_load > self.largest:
+            return (
+                f"the known load has jumped and moves the tip by {1e3 * self.by_load:.1f} mm, and no measurement has confirmed it: {limit} "
                 "(output.largest_deviation_m)"
             )
         if self.tip > self.largest:
