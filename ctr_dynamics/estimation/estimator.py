@@ -84,21 +84,19 @@ class Estimator:
         self._largest_deviation = (
             float(settings["output.largest_deviation_m"]) or self.options.deviation_fraction * self._length
         )
-        self.discretisation = discretise(
-            robot, int(settings["model.nodes"]), float(settings["model.accuracy_m"])
-        )
+        accuracy_m = float(settings["model.accuracy_m"])
+        self.discretisation = discretise(robot, int(settings["model.nodes"]), accuracy_m)
         self.model = Model(robot, nodes=self.discretisation.nodes)
         self.tracker = tracker_of(self.model, settings)
         self.health = Health(consistency=consistency_monitor(settings, robot.tracker.noise.position.value))
-        self.health.shortfall = self.discretisation.shortfall(float(settings["model.accuracy_m"]))
+        self.health.shortfall = self.discretisation.shortfall(accuracy_m)
         self.health.fusing = bool(settings["filter.enabled"])
         self.inputs = InputBuffer(self.model, self.tracker, settings, self.health)
         self.timeline = self.inputs.timeline
         self._schedule = StepSchedule(self.timeline, self.inputs, self.options)
         self.innovations = InnovationLog(self.health)
-        self.runs = Runs(
-            self.model, settings, self.inputs, self.health, self.innovations, self.discretisation.vibration
-        )
+        modes = self.discretisation.vibration
+        self.runs = Runs(self.model, settings, self.inputs, self.health, self.innovations, modes)
         self.late = OutOfSequence(self.runs, self.inputs, self.health, self.innovations)
         self.step_times_s: array[float] | None = None
         self._backbone = Backbone(self.model, self.runs.fused.ekf)

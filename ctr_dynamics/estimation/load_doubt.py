@@ -1,7 +1,7 @@
 """A known load that has jumped and that nothing confirms: a sensor that sends nonsense bends the model, not the robot.
 
 From the jump on, a second open-loop run goes on without it. Measurements tell which of the two runs the robot follows, by their likelihoods. Until
-they do, three published deviations reach from one run to the other. A load that the robot does not follow is left out from the jump on.
+they do, two published deviations reach from one run to the other. A load that the robot does not follow is left out from the jump on.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from ctr_dynamics.model.simulator import Inputs
 from ctr_dynamics.sensing import TrackerModel
 
 Floats = NDArray[np.float64]
-REACHED = 3.0  # published deviations, within which a tip is promised to be
+REACHED = 2.0  # published deviations, from one run to the other; three are the promise
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class LoadDoubtOptions:
         misfit: by which the movement of a load may differ from the model's, as a fraction: payloads and stiffnesses of a file that is not calibrated.
         prior: probability that a load that jumps is wrong. believed: probability from which on it is confirmed, or left out.
         followed: mean square of what remains of the measurements without the load, in its deviations, up to which the robot does not bear it.
-        longest_s: s, by which an unknown tracker may be late. Until then a robot that bears the load may seem to stand still.
+        longest_s: s, by which a tracker may be late. For so long a robot that bears the load may seem to stand still.
         expires_s: s after the last jump, from which on the load is taken as it is said.
     """
 
@@ -138,7 +138,7 @@ class LoadDoubt:
             self.clear()
 
     def inflate(self, covariance: Floats, mean: Floats) -> float:
-        """Have three deviations reach to the run without the load, which is (13,) ``mean`` of the tip with it; returns how far that is, m.
+        """Have two deviations reach to the run without the load, which is (13,) ``mean`` of the tip with it; returns how far that is, m.
 
         ``covariance`` (12, 12) of the tip is changed in place.
         """
@@ -176,21 +176,20 @@ class LoadDoubt:
         by_none = float(remains @ remains) / square
         self._taken[stamp_ns] = 0.5 * (by_none - by_load), by_none
 
-    def decided(self, stamp_ns: int, on_time: bool) -> bool:
+    def wrong(self, stamp_ns: int) -> bool:
         """Whether the load is wrong by what is known up to ``stamp_ns``; a load that is right is in doubt no more.
 
-        ``on_time``: whether the tracker is known to have the delay that the filter counts on. Else the robot may bear the load and not show it yet.
+        A robot that bears the load may not show it yet, as its tracker may be late. One that stands still for longer does not bear it.
         """
         if self.begin_ns is None:
             return False
-        options = self.options
+        options, since_s = self.options, 1e-9 * (stamp_ns - self._jump_ns)
         right = sum(ratio for ratio, _ in self._taken.values())
         sure = math.log(options.believed / (1.0 - options.believed))
-        if right > sure or stamp_ns - self._jump_ns > options.expires_s * 1e9:
+        if right > sure or since_s > options.expires_s:
             self.clear()
             return False
-        shown = on_time or stamp_ns - self._jump_ns > options.longest_s * 1e9
-        wrong = shown and right < -sure - math.log((1.0 - options.prior) / options.prior)
-        return wrong and sum(square for _, square in self._taken.values()) <= options.followed * len(
-            self._taken
-        )
+        shown = 1e-9 * (stamp_ns - self.begin_ns) > options.longest_s
+        refuted = right < -sure - math.log((1.0 - options.prior) / options.prior)
+        still = sum(square for _, square in self._taken.values()) <= options.followed * len(self._taken)
+        return shown and refuted and still

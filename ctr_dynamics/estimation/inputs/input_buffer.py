@@ -236,9 +236,7 @@ class InputBuffer:
         if self._left_out is not None:
             held, jump = self._left_out
             if float(np.linalg.norm(value - held)) > RETURNED * jump:
-                self.health.note(
-                    "load", "contradicted", "loads are left out until they return to that before the jump"
-                )
+                self.health.note("load", "contradicted", "")
                 return None
             self._left_out = None
         if load.stamps and taken is not None and stamp_ns < min(load.stamps[-1], taken - self.window_ns):
@@ -293,12 +291,12 @@ class InputBuffer:
         jump = max(float(np.linalg.norm(value - held)) for value in wrong)
         returned = float(np.linalg.norm(wrong[-1] - held)) <= RETURNED * jump
         self._left_out = None if returned else (held, jump)
-        size = max(math.hypot(*value[:3].tolist()) for value in wrong)
+        most, before = (max(math.hypot(*v[:3].tolist()) for v in values) for values in (wrong, [held]))
         self.health.note(
             "load",
             "contradicted",
-            f"the robot does not move as with a load of {size:.3g} N, the tracker shows: left out until it returns to that before the jump; "
-            "check the sensor, its unit and its frame",
+            f"the robot does not move as by a change of the load from {before:.3g} to {most:.3g} N, as the tracker shows: left out until it is "
+            "back; check the sensor, its unit and its frame",
         )
 
     def _open_load(self, t0_ns: int) -> None:
