@@ -176,6 +176,17 @@ class LoadDoubt:
         by_none = float(remains @ remains) / square
         self._taken[stamp_ns] = 0.5 * (by_none - by_load), by_none
 
+    @property
+    def _right(self) -> float:
+        """Logarithm of the likelihood ratio of the load to none."""
+        return sum(ratio for ratio, _ in self._taken.values())
+
+    @property
+    def seems_wrong(self) -> bool:
+        """Whether the robot moves as without the load so far, and no better as with it. Nothing else is concluded from such measurements."""
+        squares = [square for _, square in self._taken.values()]
+        return bool(squares) and self._right < 0.0 and sum(squares) <= self.options.followed * len(squares)
+
     def wrong(self, stamp_ns: int) -> bool:
         """Whether the load is wrong by what is known up to ``stamp_ns``; a load that is right is in doubt no more.
 
@@ -183,13 +194,11 @@ class LoadDoubt:
         """
         if self.begin_ns is None:
             return False
-        options, since_s = self.options, 1e-9 * (stamp_ns - self._jump_ns)
-        right = sum(ratio for ratio, _ in self._taken.values())
+        options, right = self.options, self._right
         sure = math.log(options.believed / (1.0 - options.believed))
-        if right > sure or since_s > options.expires_s:
+        if right > sure or stamp_ns - self._jump_ns > options.expires_s * 1e9:
             self.clear()
             return False
-        shown = 1e-9 * (stamp_ns - self.begin_ns) > options.longest_s
-        refuted = right < -sure - math.log((1.0 - options.prior) / options.prior)
-        still = sum(square for _, square in self._taken.values()) <= options.followed * len(self._taken)
-        return shown and refuted and still
+        shown = stamp_ns - self.begin_ns > options.longest_s * 1e9
+        unlikely = math.log((1.0 - options.prior) / options.prior)
+        return shown and self.seems_wrong and right < -sure - unlikely

@@ -163,6 +163,8 @@ class Runs:
 
         ``moves_as_modelled``: whether the open-loop run moves as the robot does, but for faults. Else nothing but the timing is concluded.
         """
+        if self.load_doubt.seems_wrong:
+            return False
         return self.fused.alternatives.conclude(self.open_loop, self.k, moves_as_modelled)
 
     def leave_wrong_load_out(self) -> int | None:
@@ -173,6 +175,9 @@ class Runs:
             return None
         doubt.clear()
         self._inputs.leave_load_out(begin_ns)
+        self._health.measurements.forget_recent()
+        self.fused.alternatives.clear()
+        self.fused.disagreement.clear()
         return begin_ns
 
     def judge(self, result: StepResult) -> None:
