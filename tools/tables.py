@@ -145,6 +145,8 @@ def _comment(p: Parameter) -> str:
 
 
 def _yaml_value(value: Any) -> str:
+    if value == ():
+        return "['']"  # ROS gives an empty list no type, and nodes cannot take it
     if isinstance(value, tuple):
         return "[" + ", ".join(repr(v) for v in value) + "]"
     if isinstance(value, float):

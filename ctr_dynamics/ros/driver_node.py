@@ -12,7 +12,6 @@ from typing import Any
 import rclpy
 from rclpy.duration import Duration
 from rclpy.exceptions import ParameterException
-from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.serialization import serialize_message
 from rclpy.signals import SignalHandlerOptions
@@ -26,7 +25,7 @@ from ctr_dynamics.io.messages import topics
 from ctr_dynamics.io.messages.cdr import CdrError, split_stamp
 from ctr_dynamics.ros import qos
 from ctr_dynamics.ros.node_runner import RCLError, Stopped, exit_at_once, run_in_thread, stop_on_signals
-from ctr_dynamics.ros.parameter_declaration import declare_table
+from ctr_dynamics.ros.parameter_declaration import TableNode, declare_table
 from ctr_dynamics.ros.topic_names import NAMESPACE, message_class, node_topic
 from ctr_dynamics.runtime.node_parameters import DRIVER
 from ctr_dynamics.runtime.playback import load, pace, shifted
@@ -35,7 +34,7 @@ LEAD_NS = 500_000_000
 """From the match of the topics, as the publishers see it, to the first message: on a busy machine subscribers see it that much later."""
 
 
-class DriverNode(Node):
+class DriverNode(TableNode):
     """Node `/ctr/driver`: publishes a bag's inputs in real time.
 
     Raises:
@@ -44,7 +43,7 @@ class DriverNode(Node):
     """
 
     def __init__(self, stop: threading.Event) -> None:
-        super().__init__("driver", namespace=NAMESPACE, automatically_declare_parameters_from_overrides=True)
+        super().__init__("driver", NAMESPACE)
         self.values = declare_table(self, DRIVER)
         values = self.values
         if not values["bag"]:

@@ -15,7 +15,6 @@ from rclpy.clock import JumpHandle, JumpThreshold, TimeJump
 from rclpy.duration import Duration
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.logging import get_logging_directory
-from rclpy.node import Node
 from rclpy.parameter import Parameter as RosParameter
 from std_srvs.srv import SetBool, Trigger
 
@@ -39,7 +38,7 @@ from ctr_dynamics.robot_files import load_robot
 from ctr_dynamics.ros import qos, transform_topics
 from ctr_dynamics.ros.input_subscriptions import InputSubscriptions
 from ctr_dynamics.ros.node_runner import Stopped, run_in_thread, run_node
-from ctr_dynamics.ros.parameter_declaration import declare, watch
+from ctr_dynamics.ros.parameter_declaration import TableNode, declare, watch
 from ctr_dynamics.ros.publishers import Outputs
 from ctr_dynamics.ros.topic_names import NAME, NAMESPACE, message_class, node_topic
 from ctr_dynamics.runtime import node_diagnostics
@@ -60,7 +59,7 @@ DIAGNOSTICS_WAIT_NS = 100_000_000  # how long they wait for time between steps
 SWITCH_INTERVAL_S = 1e-4
 
 
-class EstimatorNode(Node):
+class EstimatorNode(TableNode):
     """Node `/ctr/estimator`. The executor only queues what arrives; a thread of its own takes the steps.
 
     Raises:
@@ -69,7 +68,7 @@ class EstimatorNode(Node):
     """
 
     def __init__(self, stop: threading.Event) -> None:
-        super().__init__(NAME, namespace=NAMESPACE, automatically_declare_parameters_from_overrides=True)
+        super().__init__(NAME, NAMESPACE)
         self._stop = stop
         self.settings = declare(self)
         self.start_up()

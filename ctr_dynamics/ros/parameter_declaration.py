@@ -8,6 +8,7 @@ from dataclasses import replace
 from typing import Any, TypeVar
 
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
+from rclpy.context import Context
 from rclpy.node import Node
 from rclpy.parameter import Parameter as RosParameter
 
@@ -21,7 +22,32 @@ Checked = TypeVar("Checked", bound=Mapping[str, Any])
 _TABLE = {parameter.name: parameter for parameter in PARAMETERS}
 
 
-def declare(node: Node) -> Settings:
+class TableNode(Node):
+    """A node whose parameters are those of a table.
+
+    ROS declares at once what the node was started with, so that a name that no parameter has is seen at all; otherwise it passes over it in silence.
+
+    Attributes:
+        without_value: names of parameters that were given an empty list, which has no type in ROS and cannot be declared.
+    """
+
+    def __init__(self, name: str, namespace: str, context: Context | None = None) -> None:
+        self.without_value: list[str] = []
+        super().__init__(
+            name, context=context, namespace=namespace, automatically_declare_parameters_from_overrides=True
+        )
+
+    def declare_parameters(
+        self, namespace: str, parameters: Sequence[Any], *args: Any, **options: Any
+    ) -> Any:
+        """Declare what has a value or a type; what has none is remembered."""
+        empty = [p[0] for p in parameters if len(p) > 1 and p[1] is None]
+        self.without_value += empty
+        usable = [p for p in parameters if p[0] not in empty]
+        return super().declare_parameters(namespace, usable, *args, **options)
+
+
+def declare(node: TableNode) -> Settings:
     """Declare every parameter of the estimator with type, text, range and read-only mark.
 
     Raises:
@@ -39,11 +65,8 @@ def declared(node: Node) -> Settings:
     return Settings({p.name: _plain(node.get_parameter(p.name).value) for p in PARAMETERS})
 
 
-def declare_table(node: Node, table: Sequence[Parameter]) -> dict[str, Any]:
+def declare_table(node: TableNode, table: Sequence[Parameter]) -> dict[str, Any]:
     """Declare the parameters of a ``table``, fixed from then on; returns their values by name.
-
-    The node must have been made with `automatically_declare_parameters_from_overrides=True`, so that a name
-    that no parameter has is seen at all; ROS otherwise passes over it in silence.
 
     Raises:
         InputError: an unknown name, or a value of the wrong type or out of its range.
@@ -55,18 +78,21 @@ def declare_table(node: Node, table: Sequence[Parameter]) -> dict[str, Any]:
     )
 
 
-def _declare(node: Node, table: Sequence[Parameter], check: Callable[[dict[str, Any]], Checked]) -> Checked:
+def _declare(
+    node: TableNode, table: Sequence[Parameter], check: Callable[[dict[str, Any]], Checked]
+) -> Checked:
     names = [p.name for p in table]
     given: dict[str, Any] = {}
-    for name, parameter in node.get_parameters_by_prefix("").items():
+    started_with = {name: _plain(p.value) for name, p in node.get_parameters_by_prefix("").items()}
+    for name, value in {**started_with, **{name: [] for name in node.without_value}}.items():
         if name in names:
-            given[name] = _plain(parameter.value)
+            given[name] = value
         elif name not in _ROS_NAMES and not name.startswith(_ROS_PREFIXES):
             raise InputError(f"parameter {name} is unknown", do=_advice(name, names))
     values = check(given)
     for entry in table:
         value = _ros_value(values[entry.name])
-        if entry.name in given:
+        if entry.name in started_with:
             node.undeclare_parameter(entry.name)
         # The value has been checked: a whole number given for a float is a float by now.
         node.declare_parameter(entry.name, value, _descriptor(entry, value), ignore_override=True)

@@ -5,20 +5,18 @@ from __future__ import annotations
 import sys
 from typing import Any
 
-from rclpy.node import Node
-
 from ctr_dynamics.io.messages import topics
 from ctr_dynamics.robot_files import load_robot
 from ctr_dynamics.ros import qos
 from ctr_dynamics.ros.node_runner import run_node
-from ctr_dynamics.ros.parameter_declaration import declare_table
+from ctr_dynamics.ros.parameter_declaration import TableNode, declare_table
 from ctr_dynamics.ros.topic_names import NAMESPACE, message_class
 from ctr_dynamics.runtime.node_parameters import VIEW
 from ctr_dynamics.view.markers import MARKER_ARRAY, TUBES_TOPIC
 from ctr_dynamics.view.scene import Scene
 
 
-class ViewNode(Node):
+class ViewNode(TableNode):
     """Node `/ctr/view`.
 
     Raises:
@@ -26,7 +24,7 @@ class ViewNode(Node):
     """
 
     def __init__(self) -> None:
-        super().__init__("view", namespace=NAMESPACE, automatically_declare_parameters_from_overrides=True)
+        super().__init__("view", NAMESPACE)
         values = declare_table(self, VIEW)
         self.scene = Scene(
             load_robot(values["robot"]),
