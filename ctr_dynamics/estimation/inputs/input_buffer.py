@@ -196,6 +196,7 @@ class InputBuffer:
                 "joints", "duplicate stamp", f"a second joint state of {stamp_ns} ns; the first one counts"
             )
             return None
+        self.health.joint_stamps.append(stamp_ns)
         if self.t0_ns is None:
             self.timeline.t0_ns = stamp_ns
             if self._carried is not None and self._carried > stamp_ns + LOAD_GRACE_NS:

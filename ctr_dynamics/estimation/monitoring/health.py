@@ -2,29 +2,36 @@
 
 from __future__ import annotations
 
+import statistics
+from collections import deque
 from dataclasses import dataclass, field
+from itertools import pairwise
 from typing import Any
 
 from ctr_dynamics.estimation.filter.filter_records import ModelErrorSize
 from ctr_dynamics.estimation.monitoring.consistency_monitor import ConsistencyMonitor
 from ctr_dynamics.estimation.monitoring.measurement_record import MeasurementRecord
+from ctr_dynamics.estimation.timeline import seconds
 from ctr_dynamics.model.stability import Stability
 
 TRACKER_LIMIT_S = 1.0  # without a usable measurement for longer the status says so: 40 are missing at 40 Hz
+RECENT_S = 10.0  # of steps: an input problem is said for so long after its last occurrence
+SLOW_JOINTS_S = 0.05  # s between joint states: more than twice what 50 Hz make. At 10 rad/s a tube turns by half a radian meanwhile.
+JOINTS_COMPARED = 11  # the last joint states, whose median period counts
 WAITING = "waiting for the first complete joint state"
 
 
 @dataclass
 class Counter:
-    """How often something happened, and its last occurrence in words."""
+    """How often something happened, its ``last`` occurrence in words, and after how many of the estimator's ``steps`` that was.
+
+    ``place``: in the order in which problems of any kind last occurred.
+    """
 
     count: int = 0
     last: str = ""
-
-    def add(self, what: str, count: int = 1) -> None:
-        """Count one, or as many as ``count`` says."""
-        self.count += count
-        self.last = what
+    steps: int = 0
+    place: int = 0
 
 
 @dataclass
@@ -36,6 +43,7 @@ class Health:
         problem: why the last output is invalid; empty when it is valid.
         shortfall: what of the accuracy that is asked cannot be had; empty where nothing is missing.
         propagated: steps whose ``substeps_taken`` are counted, and ``most_substeps`` of one.
+        joint_stamps: ns, of the last joint states that are used.
         steps, failures, restarts, substeps, sweeps: of the runs; reasons: failures by reason. corrected_steps: taken again for late inputs.
         measurements: what has become of them. late: how many came late. fusing: whether they are fused.
         tracker_age_s: since the newest measurement that reached the gate, or the start.
@@ -52,6 +60,7 @@ class Health:
     load: dict[str, Counter] = field(default_factory=dict)
     problem: str = WAITING
     steps: int = 0
+    joint_stamps: deque[int] = field(default_factory=lambda: deque(maxlen=JOINTS_COMPARED))
     failures: int = 0
     reasons: dict[str, int] = field(default_factory=dict)
     restarts: int = 0
@@ -73,6 +82,7 @@ class Health:
     consistency: ConsistencyMonitor = field(default_factory=ConsistencyMonitor)
     stability: Stability | None = None
     refutation: str = ""
+    _noted: int = 0
 
     # -- counting --
 
@@ -80,7 +90,11 @@ class Health:
         """Count an input problem of ``kind`` in ``group`` (joints, tracker or load); a negative ``count`` takes some back."""
         counters = getattr(self, group)
         counter = counters.setdefault(kind, Counter())
-        counter.add(what or counter.last, count)
+        counter.count += count
+        counter.last = what or counter.last
+        if count > 0:
+            self._noted += 1
+            counter.steps, counter.place = self.steps, self._noted
         if counter.count <= 0:
             del counters[kind]
 
@@ -97,8 +111,25 @@ class Health:
         self.stability, self.refutation = None, ""
         self.tracker_age_s = self.force_sigma = self.shift_m = 0.0
         self.noise_ratio = 1.0
+        self.joint_stamps.clear()
 
     # -- what it comes to --
+
+    def newest_first(self, group: str) -> list[tuple[str, Counter]]:
+        """Problems of the input ``group`` with their kinds, those that occurred last first."""
+        counters: dict[str, Counter] = getattr(self, group)
+        return sorted(counters.items(), key=lambda item: -item[1].place)
+
+    def is_recent(self, counter: Counter) -> bool:
+        """Whether the last occurrence is less than ``RECENT_S`` of steps ago; steps rise whatever clocks do."""
+        return seconds(self.steps - counter.steps) < RECENT_S
+
+    @property
+    def joint_period_s(self) -> float:
+        """Median time between the last joint states, s; 0 while fewer than half of those that count are known."""
+        if len(self.joint_stamps) <= JOINTS_COMPARED // 2:
+            return 0.0
+        return statistics.median(b - a for a, b in pairwise(sorted(self.joint_stamps))) * 1e-9
 
     @property
     def tracker_alive(self) -> bool:

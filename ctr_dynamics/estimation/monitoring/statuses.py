@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 
-from ctr_dynamics.estimation.monitoring.health import TRACKER_LIMIT_S, Counter, Health
+from ctr_dynamics.estimation.monitoring.health import SLOW_JOINTS_S, TRACKER_LIMIT_S, Health
 from ctr_dynamics.estimation.step_output import ERROR, OK, WARN, Status
+from ctr_dynamics.io.messages.topics import JOINT_RATE_HZ
 
 SNAP_WARNING_S = 1.0  # a snap that is nearer than this is warned of: time to stop an actuator by hand
 
@@ -15,7 +16,7 @@ def all_statuses(health: Health) -> list[Status]:
     return [
         output(health.problem, health.steps),
         solver(health),
-        inputs(health, "joints"),
+        joints(health),
         tracker(health),
         inputs(health, "load"),
         consistency(health),
@@ -52,13 +53,28 @@ def solver(health: Health) -> Status:
 
 
 def inputs(health: Health, group: str) -> Status:
-    """Problems of the input ``group``: joints, tracker or load."""
-    counters: dict[str, Counter] = getattr(health, group)
-    values = {kind: f"{c.count}, last: {c.last}" for kind, c in counters.items()}
-    if counters:
-        worst = max(counters.items(), key=lambda item: item[1].count)
-        return Status(group, WARN, f"{worst[0]} ({worst[1].count}): {worst[1].last}", values)
-    return Status(group, OK, "ok", values)
+    """Problems of the input ``group`` (joints, tracker or load): the newest while it is recent, and all of them in the values."""
+    found = health.newest_first(group)
+    values = {kind: f"{c.count}, last: {c.last}" for kind, c in getattr(health, group).items()}
+    if not found:
+        return Status(group, OK, "ok", values)
+    kind, newest = found[0]
+    if health.is_recent(newest):
+        return Status(group, WARN, f"{kind} ({newest.count}): {newest.last}", values)
+    return Status(group, OK, "ok; earlier: " + ", ".join(f"{kind} ({c.count})" for kind, c in found), values)
+
+
+def joints(health: Health) -> Status:
+    """Problems of the joint states, and whether they come often enough."""
+    status, period_s = inputs(health, "joints"), health.joint_period_s
+    if period_s <= SLOW_JOINTS_S:
+        return status
+    slow = (
+        f"joint states come every {period_s:.3g} s (median of the last ones), limit {SLOW_JOINTS_S:g} s: what the actuators do "
+        f"in between is guessed; publish them at {JOINT_RATE_HZ:g} Hz or more"
+    )
+    message = slow if status.level == OK else f"{status.message}; {slow}"
+    return Status("joints", WARN, message, status.values)
 
 
 def tracker(health: Health) -> Status:
@@ -85,6 +101,8 @@ def tracker(health: Health) -> Status:
             f"no usable measurement for {health.tracker_age_s:.1f} s, limit {TRACKER_LIMIT_S:g} s: "
             "the pose is the model's prediction since then"
         )
+        if status.level == WARN:  # what becomes of those that come
+            message += f"; the last: {health.newest_first('tracker')[0][1].last}"
         return Status("tracker", WARN, message, values)
     if health.shift_m:
         message = (

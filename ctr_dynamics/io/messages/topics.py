@@ -14,6 +14,7 @@ from typing import Literal
 STEP_NS = 3_000_000  # model step and output grid
 BACKBONE_EVERY = 11  # steps between two messages of the display topic (30 Hz)
 DIAGNOSTICS_EVERY = 333  # steps between two /diagnostics messages without news (1 Hz)
+JOINT_RATE_HZ = 50.0  # at which joint states should come at least
 
 JOINT_STATES = "/ctr/joint_states"
 TRACKER_TIP = "/ctr/tracker/tip"
@@ -102,7 +103,7 @@ TOPICS: tuple[Topic, ...] = (
         "sensor_msgs/msg/JointState",
         "in",
         INPUT_QOS,
-        "50 Hz or more (100 Hz in the shipped bags)",
+        f"{JOINT_RATE_HZ:g} Hz or more (100 Hz in the shipped bags)",
         "Rotation and translation of the actuators of all tubes.",
         (
             Field("header.stamp", "time at which the encoders were read", "s, ns"),
