@@ -9,9 +9,11 @@ from ctr_dynamics.runtime.clock_offset import LIMIT_NS, ClockOffset
 from ctr_dynamics.runtime.step_loop import INBOX_BYTES, INBOX_LIMIT
 from ctr_dynamics.runtime.timing import LATE_NS, VERY_LATE_NS, StepTiming
 
+LATE_SHARE = 0.001  # of the steps may be late
+
 
 def timing_status(timing: StepTiming, faults: int, last_fault: str, withheld_behind_ns: int = 0) -> Status:
-    """Punctuality of the steps: WARN when late or skipped, ERROR after a fault or when stamps went back."""
+    """Punctuality of the last steps: WARN when late or skipped, ERROR when stamps went back, and after a fault, which is for good: a defect."""
     report = timing.report()
 
     def spread(name: str) -> str:
@@ -19,10 +21,10 @@ def timing_status(timing: StepTiming, faults: int, last_fault: str, withheld_beh
 
     values = {
         "policy": timing.policy,
-        "steps": str(timing.steps),
-        "later than 3 ms": str(timing.late),
-        "later than 20 ms": str(timing.very_late),
-        "skipped": str(timing.skipped),
+        "steps": str(timing.totals.steps),
+        "later than 3 ms": str(timing.totals.late),
+        "later than 20 ms": str(timing.totals.very_late),
+        "skipped": str(timing.totals.skipped),
         "withheld": str(timing.withheld),
         "too old": str(timing.too_old),
         "restarts": str(timing.restarts),
@@ -45,17 +47,21 @@ def timing_status(timing: StepTiming, faults: int, last_fault: str, withheld_beh
             f"{faults} faults inside the node, see the log; the last: {last_fault}",
             values,
         )
-    if timing.skipped:
-        return Status("timing", WARN, f"{timing.skipped} steps were skipped, none should be", values)
-    if timing.very_late or timing.late > 0.001 * max(timing.steps, 1000):
+    recent = timing.recent
+    if recent.skipped:
+        message = f"{recent.skipped} steps were skipped among the last {recent.steps}, none should be"
+        return Status("timing", WARN, message, values)
+    if recent.very_late or recent.late > LATE_SHARE * max(recent.steps, 1000):
         return Status(
             "timing",
             WARN,
-            f"{timing.late} of {timing.steps} steps were published later than {LATE_NS * 1e-6:g} ms, "
-            f"{timing.very_late} later than {VERY_LATE_NS * 1e-6:g} ms; limits 0.1 % and 0",
+            f"{recent.late} of the last {recent.steps} steps were published later than {LATE_NS * 1e-6:g} ms, "
+            f"{recent.very_late} later than {VERY_LATE_NS * 1e-6:g} ms; limits {100.0 * LATE_SHARE:g} % and 0",
             values,
         )
-    return Status("timing", OK, f"{timing.steps} steps on time", values)
+    return Status(
+        "timing", OK, f"{timing.totals.steps} steps, the last {recent.steps} of them on time", values
+    )
 
 
 def clock_status(clock: ClockOffset, now_ns: int, use_sim_time: bool, limit_ns: int | None) -> Status:

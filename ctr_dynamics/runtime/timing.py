@@ -5,40 +5,46 @@ from __future__ import annotations
 import heapq
 from array import array
 from collections import deque
-from typing import Any
+from operator import add
+from typing import Any, NamedTuple
 
 LATE_NS = 3_000_000
 """A step published later than one step after it was due is late."""
 VERY_LATE_NS = 20_000_000
 
 
-class Histogram:
-    """Counts of durations in bins of constant width, in constant memory; durations in ns.
+RECENT_STEPS = 3330
+"""Published steps that the diagnostics judge, about 10 s of them."""
+STRETCHES = 10  # in which they are forgotten
+_UNIT_NS = 1000
+_PARTS = 64  # bins to a doubling of the duration
+_BITS = 40  # of the longest duration in units: 12 days
 
-    Quantiles are the upper edge of their bin (`bin_ns` is their resolution), the maximum is exact.
+
+class Histogram:
+    """Counts of durations in bins of 1 us up to 128 us, and of a sixty-fourth of each doubling beyond, in constant memory; durations in ns.
+
+    Quantiles are the upper edge of their bin, at most 1.6 % too large; the maximum is exact.
     """
 
-    def __init__(self, bin_ns: int = 10_000, bins: int = 5000) -> None:
-        self.bin_ns = bin_ns
-        self.counts = array("Q", bytes(8 * (bins + 1)))  # the last one holds everything beyond
+    def __init__(self) -> None:
+        self.counts = array("Q", bytes(8 * (_bin((1 << _BITS) - 1) + 1)))
         self.count = 0
         self.max_ns = 0
 
     def add(self, value_ns: int) -> None:
-        index = min(max(value_ns, 0) // self.bin_ns, len(self.counts) - 1)
-        self.counts[index] += 1
+        units = min(max(value_ns, 0) // _UNIT_NS, (1 << _BITS) - 1)
+        self.counts[_bin(units)] += 1
         self.count += 1
         self.max_ns = max(self.max_ns, value_ns)
 
     def quantile(self, fraction: float) -> float:
         """Duration in ms that `fraction` of the values do not exceed; 0 without values."""
-        if self.count == 0:
-            return 0.0
         wanted, seen = fraction * self.count, 0
-        for index, count in enumerate(self.counts[:-1]):
+        for index, count in enumerate(self.counts):
             seen += count
-            if seen >= wanted:
-                return min((index + 1) * self.bin_ns, self.max_ns) * 1e-6
+            if count and seen >= wanted:
+                return min(_upper_edge(index) * _UNIT_NS, self.max_ns) * 1e-6
         return self.max_ns * 1e-6
 
     def summary(self) -> dict[str, float]:
@@ -47,6 +53,30 @@ class Histogram:
         values = {name: self.quantile(fraction) for name, fraction in quantiles.items()}
         values["max"] = self.max_ns * 1e-6
         return {name: round(value, 4) for name, value in values.items()}
+
+
+def _bin(units: int) -> int:
+    """The bin of a duration in units."""
+    shift = max(units.bit_length() - _PARTS.bit_length(), 0)
+    return shift * _PARTS + (units >> shift)
+
+
+def _upper_edge(index: int) -> int:
+    """The least duration in units that belongs to a bin behind that one."""
+    shift = max(index // _PARTS - 1, 0)
+    return (index - shift * _PARTS + 1) << shift
+
+
+class Punctuality(NamedTuple):
+    """Of published steps: how many, how many of them late and very late, and how many were skipped."""
+
+    steps: int
+    late: int
+    very_late: int
+    skipped: int
+
+
+NO_STEPS = Punctuality(0, 0, 0, 0)
 
 
 class StepTiming:
@@ -59,6 +89,7 @@ class StepTiming:
     Steps that fall due while the start is still being solved (the static equilibrium of the first joints) are
     counted apart as `start`: the node cannot publish before it has a state.
 
+    `totals`: since the start, and `recent`: of the last ten seconds.
     `period_ns`: between the stamps of the last two joint states; `next_arrival_ns`: when the next one is to be expected, None before two.
     """
 
@@ -67,10 +98,8 @@ class StepTiming:
         self.input_timeout_ns = input_timeout_ns
         self.lateness = Histogram()
         self.step_time = Histogram()
-        self.steps = 0
-        self.late = 0
-        self.very_late = 0
-        self.skipped = 0
+        self.totals = NO_STEPS
+        self._stretches = deque([NO_STEPS], maxlen=STRETCHES)  # of the last steps
         self.withheld = self.too_old = 0
         self.restarts = 0
         self.start_steps = 0
@@ -114,7 +143,7 @@ class StepTiming:
     def published(self, k: int, stamp_ns: int, now_ns: int) -> int:
         """Step k with this stamp is out at `now_ns`; returns its lateness in ns."""
         if self._last_k is not None and k > self._last_k + 1:
-            self.skipped += k - self._last_k - 1
+            self._count(0, 0, 0, k - self._last_k - 1)
         if self._last_k is None:
             self._start_until_ns = now_ns
         self._last_k = k
@@ -125,15 +154,25 @@ class StepTiming:
                 self.start_max_ns = max(self.start_max_ns, lateness)
                 return lateness
             self._start_until_ns = None
-        self.steps += 1
+        self._count(1, int(lateness > LATE_NS), int(lateness > VERY_LATE_NS), 0)
         self.lateness.add(lateness)
-        self.late += lateness > LATE_NS
-        self.very_late += lateness > VERY_LATE_NS
         if len(self._worst) < 10:
             heapq.heappush(self._worst, (lateness, k))
         elif lateness > self._worst[0][0]:
             heapq.heapreplace(self._worst, (lateness, k))
         return lateness
+
+    def _count(self, *figures: int) -> None:
+        """Count steps, late ones, very late ones and skipped ones."""
+        self.totals = Punctuality(*map(add, self.totals, figures))
+        if self._stretches[-1][0] >= RECENT_STEPS // STRETCHES:
+            self._stretches.append(NO_STEPS)
+        self._stretches[-1] = Punctuality(*map(add, self._stretches[-1], figures))
+
+    @property
+    def recent(self) -> Punctuality:
+        """Of the last ``RECENT_STEPS`` steps, of which up to a tenth are forgotten already."""
+        return Punctuality(*map(sum, zip(*self._stretches, strict=True)))
 
     def _due_ns(self, stamp_ns: int, now_ns: int) -> int:
         if self.policy == "predict":
@@ -147,11 +186,11 @@ class StepTiming:
         """Everything as JSON-able numbers; durations in ms."""
         return {
             "policy": self.policy,
-            "steps": self.steps,
-            "late_over_3ms": self.late,
-            "late_over_20ms": self.very_late,
-            "late_fraction": self.late / self.steps if self.steps else 0.0,
-            "skipped": self.skipped,
+            "steps": self.totals.steps,
+            "late_over_3ms": self.totals.late,
+            "late_over_20ms": self.totals.very_late,
+            "late_fraction": self.totals.late / self.totals.steps if self.totals.steps else 0.0,
+            "skipped": self.totals.skipped,
             "withheld": self.withheld,
             "too_old": self.too_old,
             "restarts": self.restarts,
