@@ -40,7 +40,7 @@ from ctr_dynamics.ros.input_subscriptions import InputSubscriptions
 from ctr_dynamics.ros.node_runner import Stopped, run_in_thread, run_node
 from ctr_dynamics.ros.parameter_declaration import TableNode, declare, watch
 from ctr_dynamics.ros.publishers import Outputs
-from ctr_dynamics.ros.topic_names import NAME, NAMESPACE, message_class, node_topic
+from ctr_dynamics.ros.topic_names import NAME, NAMESPACE, hardware_id, message_class, node_topic
 from ctr_dynamics.runtime import node_diagnostics
 from ctr_dynamics.runtime.input_gate import InputGate
 from ctr_dynamics.runtime.memory import keep_memory
@@ -114,7 +114,7 @@ class EstimatorNode(TableNode):
             self._qos_faults,
             StepEncoder(
                 self.settings["output.frame_id"],
-                self._robot.name,
+                hardware_id(self._robot.name, self.get_fully_qualified_name()),
                 self.settings["output.backbone_every"],
                 transforms,
             ),

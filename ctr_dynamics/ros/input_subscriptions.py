@@ -13,9 +13,10 @@ from ctr_dynamics.estimation.step_output import OK, Status
 from ctr_dynamics.io.messages import topics
 from ctr_dynamics.ros.node_runner import RCLError
 from ctr_dynamics.ros.topic_names import message_class, node_topic
-from ctr_dynamics.runtime.input_publishers import Endpoint, publishers_status, wanted_type
+from ctr_dynamics.runtime.input_publishers import Endpoint, publishers_status, shared_outputs, wanted_type
 
 PERIOD_S = 1.0
+SHARED = (topics.DIAGNOSTICS, *topics.TRANSFORMS)  # which any number of nodes publish
 _NAMELESS = "_NODE_NAME_UNKNOWN_"
 
 
@@ -33,6 +34,12 @@ class InputSubscriptions:
     def __init__(self, node: Node, subscribe: Callable[[topics.Topic], Any]) -> None:
         self._node, self._subscribe = node, subscribe
         self.names = {topic.name: node.resolve_topic_name(node_topic(topic.name)) for topic in topics.INPUTS}
+        self._outputs = [
+            node.resolve_topic_name(node_topic(topic.name))
+            for topic in topics.OUTPUTS
+            if topic.name not in SHARED
+        ]
+        self._told = ""
         self._types = {topic.name: topic.ros_type for topic in topics.INPUTS}
         self._subscriptions = {topic.name: subscribe(topic) for topic in topics.INPUTS}
         self.status = Status("publishers", OK, "the graph has not been looked at yet", {})
@@ -51,7 +58,17 @@ class InputSubscriptions:
                 self._node.destroy_subscription(self._subscriptions.pop(topic))
         needed = any(not found for topic, found in publishers.items() if topic != topics.TIP_LOAD)
         others = dict(self._node.get_topic_names_and_types()) if needed else {}
-        self.status = publishers_status(publishers, self.names, others)
+        outputs = {
+            name: self._publishers(name) for name in self._outputs if self._node.count_publishers(name) > 1
+        }
+        self.status = publishers_status(publishers, self.names, others, outputs)
+        self._tell(shared_outputs(outputs))
+
+    def _tell(self, text: str) -> None:
+        """Log that others publish the outputs, once each time it begins."""
+        if text and not self._told:
+            self._node.get_logger().warning(text)
+        self._told = text
 
     def _publishers(self, name: str) -> list[Endpoint]:
         return [

@@ -1,4 +1,4 @@
-"""Names and types of topics as the nodes open them."""
+"""Names and types of topics as the nodes open them, and what tells two nodes apart."""
 
 from __future__ import annotations
 
@@ -21,3 +21,8 @@ def node_topic(topic: str) -> str:
     if topic.startswith(own):
         return "~/" + topic.removeprefix(own)
     return topic.removeprefix(common) if topic.startswith(common) else topic
+
+
+def hardware_id(robot: str, node: str) -> str:
+    """What the diagnostics are about: the ``robot``, with the fully qualified name of its ``node`` where that is not the usual one."""
+    return robot if node == f"{NAMESPACE}/{NAME}" else f"{robot} ({node})"

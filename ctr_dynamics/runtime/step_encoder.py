@@ -56,7 +56,7 @@ class StepEncoder:
 
     Args:
         frame_id: frame of all outputs.
-        hardware_id: name of the robot in /diagnostics.
+        hardware_id: what /diagnostics are about, the robot's name.
         backbone_every: steps per display backbone, and per message of transforms.
         transforms: makes the latter; None for none.
     """

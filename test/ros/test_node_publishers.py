@@ -10,7 +10,7 @@ import pytest
 
 pytest.importorskip("rclpy")
 
-from geometry_msgs.msg import TransformStamped
+from geometry_msgs.msg import PoseStamped, TransformStamped
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 
@@ -75,6 +75,20 @@ def test_a_tracker_of_another_type_is_read_and_recorded(start, tmp_path):
     assert bag.topics[topics.TRACKER_TIP].messages > 5
     recorded = [item.message for item in bag.inputs() if item.topic == topics.TRACKER_TIP]
     assert all(math.hypot(*pose.position) < 0.5 for pose in recorded), "read as they were received"
+
+
+def test_a_second_estimator_of_the_same_name_is_noticed(start):
+    """And in a namespace the node does not take its own outputs for inputs."""
+    with start(ros_arguments=["-r", "__ns:=/arm1"], heard=[topics.DIAGNOSTICS]) as live:
+        node = live.listener.node
+        status = live.wait_for_status("publishers", 1, "nobody publishes /arm1/joint_states")
+        assert "it may be" not in status.message
+        assert status.hardware_id == "till2020_tissue (/arm1/estimator)"
+        other = node.create_publisher(PoseStamped, "/arm1/estimator/tip_pose_predicted", 1)
+        status = live.wait_for_status("publishers", 1, "/arm1/estimator/tip_pose_predicted has 2 publishers")
+        live.wait(lambda: "has 2 publishers" in live.process.output(), "a line in the log")
+        node.destroy_publisher(other)
+        live.wait_for_status("publishers", 1, "nobody publishes /arm1/tracker/tip")
 
 
 class Step(NamedTuple):

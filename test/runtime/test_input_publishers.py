@@ -6,7 +6,14 @@ import pytest
 
 from ctr_dynamics.estimation.step_output import ERROR, OK, WARN
 from ctr_dynamics.io.messages.input_types import TYPES
-from ctr_dynamics.io.messages.topics import JOINT_STATES, MODES, TIP_LOAD, TRACKER_TIP
+from ctr_dynamics.io.messages.topics import (
+    BACKBONE_STATE,
+    JOINT_STATES,
+    MODES,
+    TIP_LOAD,
+    TIP_POSE,
+    TRACKER_TIP,
+)
 from ctr_dynamics.runtime.input_publishers import Endpoint, publishers_status, wanted_type
 
 JOINT_STATE, POSE = TYPES[JOINT_STATES][0], TYPES[TRACKER_TIP][0]
@@ -44,6 +51,7 @@ def test_several_publishers_are_named():
 def test_nobody_and_who_it_may_be():
     others = {
         MODES: [JOINT_STATE],  # the node's own output is none
+        BACKBONE_STATE: ["sensor_msgs/msg/PointCloud2"],
         "/a/readings": [JOINT_STATE],
         "/robot1/joint_states": [JOINT_STATE],
         "/image": ["sensor_msgs/msg/Image"],
@@ -69,3 +77,25 @@ def test_nobody_and_who_it_may_be():
 )
 def test_the_type_to_read(kinds, wanted):
     assert wanted_type(TRACKER_TIP, [Endpoint("/x", kind) for kind in kinds]) == wanted
+
+
+def test_outputs_of_any_estimator_are_no_inputs():
+    others = {
+        "/arm1/left/tip_pose": ["geometry_msgs/msg/PoseWithCovarianceStamped"],
+        "/arm1/left/tip_pose_predicted": [POSE],
+        "/arm1/left/backbone_state": ["sensor_msgs/msg/PointCloud2"],
+    }
+    assert "may be" not in status(others.items(), tip=[]).message
+    others["/camera/tip_pose"] = [POSE]
+    assert f"it may be /camera/tip_pose ({POSE}): start" in status(others.items(), tip=[]).message
+
+
+def test_a_second_publisher_of_an_output_is_named():
+    twice = [Endpoint("/ctr/estimator", POSE)] * 2
+    found = publishers_status(GOOD, NAMES, {}, {TIP_POSE: twice, MODES: twice})
+    assert found.level == WARN
+    assert (
+        f"{TIP_POSE} (and 1 further outputs) has 2 publishers, /ctr/estimator, /ctr/estimator, limit 1"
+        in found.message
+    )
+    assert "-r __ns:=" in found.message

@@ -433,7 +433,10 @@ TOPICS: tuple[Topic, ...] = (
             Field("status[].level", "0 ok, 1 warning, 2 error, 3 stale"),
             Field("status[].name", "`ctr_estimator: ` and the subject"),
             Field("status[].message", "the problem, with value, limit and unit"),
-            Field("status[].hardware_id", "name of the robot"),
+            Field(
+                "status[].hardware_id",
+                "name of the robot; behind it in parentheses the node's name with its namespace where it is not `/ctr/estimator`",
+            ),
             Field("status[].values[].key", "name of a number, with its unit"),
             Field("status[].values[].value", "the number as text"),
         ),
