@@ -53,6 +53,7 @@ PARAMETERS: tuple[Parameter, ...] = (
         "Factor from a rotation reading to alpha in rad (0.0174533 for degrees): one number, one a tube, or the rows of a matrix.",
         -1e6,
         1e6,
+        nonzero=True,
     ),
     Parameter(
         "joints.rotation_offset_rad",
@@ -71,6 +72,7 @@ PARAMETERS: tuple[Parameter, ...] = (
         "Factor from a translation reading to beta in m (0.001 for mm, negative where a lab counts inwards): likewise.",
         -1e6,
         1e6,
+        nonzero=True,
     ),
     Parameter(
         "joints.translation_offset_m",

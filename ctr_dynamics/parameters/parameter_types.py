@@ -39,6 +39,7 @@ class Parameter:
         read_only: fixed once the node runs.
         syntax: called with a text; raises InputError when it is not one.
         syntax_text: the texts that `syntax` takes, for readers.
+        nonzero: whether an array must hold a number other than zero.
     """
 
     name: str
@@ -53,6 +54,7 @@ class Parameter:
     read_only: bool = False
     syntax: Callable[[str], object] | None = None
     syntax_text: str = ""
+    nonzero: bool = False
 
     @property
     def range(self) -> str:
@@ -103,6 +105,12 @@ class Parameter:
                 raise InputError(
                     f"has {len(items)} numbers, needs {self.size or 'at least one'}",
                     do=f"write {list(self.default) if isinstance(self.default, tuple) else self.default}",
+                    where=f"parameter {self.name}",
+                )
+            if self.nonzero and not any(items):
+                raise InputError(
+                    "0 throughout: readings would tell nothing",
+                    do="write a factor other than 0, 1 where readings are in SI units",
                     where=f"parameter {self.name}",
                 )
             return items

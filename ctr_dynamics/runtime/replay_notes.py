@@ -131,8 +131,12 @@ def no_step(bag: Bag, robot: Robot, names: set[str], problems: dict[str, Any]) -
         f"no step was possible: no usable joint state of robot '{robot.name}' on {JOINT_STATES} (joints "
         f"found: {found}; needed: {expected}; readable messages: {_readable(bag)}{odd})",
         where=str(bag.path),
-        do="name the joints with --set joints.rotation_names=A,B and joints.translation_names=C,D, "
-        "or look at units and robot with `ctr-dynamics info`",
+        do=(
+            "mend what is said of the joints"
+            if problems and "names" not in problems
+            else "name the joints with --set joints.rotation_names=A,B and joints.translation_names=C,D"
+        )
+        + ", or look at units and robot with `ctr-dynamics info`",
     )
 
 

@@ -381,3 +381,27 @@ def test_after_a_reset_everything_begins_anew(checks):
     checks.forget()
     earlier = [(s - 10**12, a, tuple(v + 2.0 for v in r), b) for s, a, r, b in joint_rows(50)]
     assert {v.use for v in feed_joints(checks, earlier)} == {"accept"}
+
+
+def test_joint_states_without_stamps_start_nothing(checks):
+    """They come on a wall clock; what follows with stamps is right, and judged by itself."""
+    rows = joint_rows(400)
+    verdicts = feed_joints(checks, [(0, *row[1:]) for row in rows[:100]] + rows[100:])
+    assert {v.use for v in verdicts[:100]} == {"drop"}
+    assert {v.use for v in verdicts[100:]} == {"accept"}
+    assert kinds(checks) == {Kind.STAMP_ZERO: 100}
+
+
+def test_joint_states_that_stand_still_without_stamps_start_nothing(checks):
+    rows = [(0, row[1], *joint_rows(1)[0][2:]) for row in joint_rows(100)]
+    assert {v.use for v in feed_joints(checks, rows)} == {"drop"}
+    assert kinds(checks) == {Kind.STAMP_ZERO: 100}
+
+
+@pytest.mark.parametrize("recorded", [False, True])
+def test_a_simulation_begins_at_zero(checks, recorded):
+    """Recorded on a wall clock, its first joint state is not used, as it may be without a stamp; nothing is found wrong."""
+    rows = [(s - T0, a if recorded else a - T0, *values) for s, a, *values in joint_rows(200)]
+    verdicts = feed_joints(checks, rows)
+    assert [v.use for v in verdicts] == ["drop" if recorded else "accept"] + ["accept"] * 199
+    assert kinds(checks) == {}

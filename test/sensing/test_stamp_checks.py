@@ -95,6 +95,20 @@ def test_one_stamp_ahead_of_its_arrival_is_dropped(stamps, ahead):
     assert stamps.findings.count(Kind.STAMP_AHEAD) == 1
 
 
+@pytest.mark.parametrize("behind_s", [0, 1041])
+def test_a_stamp_ahead_says_by_how_much_and_the_limit(stamps, behind_s):
+    """Against the arrivals where these are of the same clock, else against the stamps before it."""
+    messages = [(s - behind_s * 1_000_000_000, a) for s, a in even(100)]
+    messages[60] = (messages[60][0] + 402_000_000, messages[60][1])
+    feed(stamps, messages)
+    said = stamps.findings[Kind.STAMP_AHEAD].text
+    same, other = (
+        "0.400 s after its arrival, limit 0.020 s",
+        "0.402 s ahead of those before it, by their arrivals, limit 0.02 s",
+    )
+    assert (other if behind_s else same) in said
+
+
 def test_a_stamp_ahead_is_taken_back_where_arrivals_are_unknown(stamps):
     messages: list[tuple[int, int | None]] = [(s, None) for s, _ in even(100)]
     wrong = messages[60][0] + 900_000_000

@@ -112,10 +112,10 @@ class JointChecks:
         last, self._last = self._last, (stamp_ns, raw)
         if last is not None:
             self._received, self._equal = self._received + 1, self._equal + (last[1] == raw)
-        if last == self._last:
+        if last == self._last and self._train is not None:
             text = "a joint state came twice; the first counts; look at the driver"
             return self._drop(Kind.REPEATED, at, 0.0, "", text)
-        stamped = self.stamps.check(stamp_ns, arrival_ns)
+        stamped = self.stamps.check(stamp_ns, arrival_ns, hold_zero=True)
         if stamped.use == "drop":
             return stamped
         train = self._train

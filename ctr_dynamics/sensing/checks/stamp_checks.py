@@ -26,6 +26,9 @@ RHYTHM_FROM = 10  # steps from which the shortest usual one is first taken
 RHYTHM_STEP = (
     0.0025  # of itself, by which a longer step raises it; a shorter one lowers it by four times as much
 )
+WALL_NS = (
+    100_000_000 * 1_000_000_000
+)  # later times (1973) are of a wall clock, and no simulation has run for so long
 LOOK_EVERY = 4  # messages between two looks at the window
 Mode = Literal["", "bursts", "grid", "unusable"]
 
@@ -65,6 +68,7 @@ class StampChecks:
         self._resumes = False  # whether a pause was so short ago that the window is not full
         self._even = False  # whether enough stamps are known, and none follows another at once
         self._steady_ns = 0.0  # mean time between messages when that was even last; 0 where it is not usual
+        self._zero_held = False
         self._taken = self._ahead = self._ahead_ago = self._back = 0
         self._standing, self._standing_since_ns, self._moving = 0, 0, 0
         self._back_ns = 0
@@ -110,16 +114,29 @@ class StampChecks:
 
     # -- one message --
 
-    def check(self, stamp_ns: int, arrival_ns: int | None, zero_is_wrong: bool = False) -> Verdict:
+    def check(
+        self,
+        stamp_ns: int,
+        arrival_ns: int | None,
+        zero_is_wrong: bool = False,
+        hold_zero: bool = False,
+    ) -> Verdict:
         """Whether a stamp can be that of its message: accepted (perhaps with an earlier one retracted) or dropped.
 
         Args:
             zero_is_wrong: whether a first stamp of zero cannot be the begin of a simulation's clock.
+            hold_zero: whether a first stamp of zero is left out where arrivals are those of a wall clock. It is counted once a second one tells that
+                it is no simulation that begins.
         """
         at = stamp_ns if arrival_ns is None else arrival_ns
         if stamp_ns == 0:
-            if self._taken or zero_is_wrong:  # a simulation's clock may begin at zero, once
+            if (
+                self._taken or zero_is_wrong or self._zero_held
+            ):  # a simulation's clock may begin at zero, once
                 return self._zero(at)
+            if hold_zero and arrival_ns is not None and arrival_ns > WALL_NS:
+                self._zero_held = True
+                return Verdict("drop", Kind.STAMP_ZERO, self._zero_text)
         elif arrival_ns is not None and self._arrivals:
             offset, ahead = arrival_ns - stamp_ns, self._ahead_limit_ns()
             if offset < ahead:
@@ -198,11 +215,15 @@ class StampChecks:
 
     # -- stamps that cannot be --
 
+    @property
+    def _zero_text(self) -> str:
+        return f"stamp of the {self.noun} is zero; fill in header.stamp with the time of measurement"
+
     def _zero(self, at: int) -> Verdict:
-        text = f"stamp of the {self.noun} is zero; fill in header.stamp with the time of measurement"
-        new = Kind.STAMP_ZERO not in self.findings and self.newest_ns == 0
-        self.findings.add(Kind.STAMP_ZERO, at, 0.0, "s", text, count=2 if new else 1)
-        return Verdict("drop", Kind.STAMP_ZERO, text)
+        uncounted = self._zero_held or self.newest_ns == 0
+        new = Kind.STAMP_ZERO not in self.findings and uncounted
+        self.findings.add(Kind.STAMP_ZERO, at, 0.0, "s", self._zero_text, count=2 if new else 1)
+        return Verdict("drop", Kind.STAMP_ZERO, self._zero_text)
 
     def _ahead_limit_ns(self) -> float:
         """The least arrival - stamp, ns, that a message can have: that of the quickest before it, or none on one clock, less a margin."""
@@ -218,10 +239,11 @@ class StampChecks:
         self._ahead = self._ahead + 1 if excess < self.limits.late_s or not self._ahead_ago else 1
         self._ahead_ago = 0
         if self._ahead < WILD:
-            text = (
-                f"stamp of the {self.noun} is {-offset * 1e-9:.3f} s after its arrival, limit {-limit * 1e-9:.3f} s; "
-                "stamp at acquisition, with one clock"
-            )
+            if limit <= 0.0:
+                found = f"{-offset * 1e-9:.3f} s after its arrival, limit {-limit * 1e-9:.3f} s"
+            else:  # by another clock than the arrivals
+                found = f"{excess + self.limits.ahead_s:.3f} s ahead of those before it, by their arrivals, limit {self.limits.ahead_s:g} s"
+            text = f"stamp of the {self.noun} is {found}; stamp at acquisition, with one clock"
             self.findings.add(Kind.STAMP_AHEAD, at, -offset * 1e-9, "s", text)
             return Verdict("drop", Kind.STAMP_AHEAD, text)
         self._ahead = 0
