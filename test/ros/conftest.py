@@ -136,9 +136,11 @@ class Live:
         self.listener.__exit__(None, None, None)
         assert code == 0, self.process.output()
 
-    def resting_robot(self, matched: bool = True, shift_ns: int = 0, turning: float = 0.0) -> RestingRobot:
+    def resting_robot(
+        self, matched: bool = True, shift_ns: int = 0, turning: float = 0.0, joints_on: bool = True
+    ) -> RestingRobot:
         robot = RestingRobot(self, shift_ns)
-        robot.turning = turning
+        robot.turning, robot.joints_on = turning, joints_on
         self.robots.append(robot)
         if matched:
             self.wait(lambda: all(p.get_subscription_count() for p in robot.publishers.values()), "a match")

@@ -84,6 +84,22 @@ def test_joint_states_that_cannot_be_used(start):
         assert abs(live.stamps(topics.TIP_POSE)[-1] - time.time_ns()) < 60_000_000_000
 
 
+def test_joint_states_without_stamps_start_no_time_line(start):
+    with start() as live:
+        robot = live.resting_robot(joints_on=False)
+        for _ in range(20):
+            robot.joints(0)
+            time.sleep(0.01)
+        live.wait_for_status("joints", 1, "stamp zero")
+        assert live.count(topics.VALID) == 0
+        robot.joints_on = True
+        live.wait_for_more(topics.TIP_POSE, 50)
+        assert live.stamps(topics.TIP_POSE)[0] >= robot.joint_stamps[0]
+        log = live.process.output()
+        assert " s behind" not in log, log
+        assert "stamp ahead" not in str(live.status("joints").values)
+
+
 def test_undecodable_messages_are_counted(start):
     with start() as live:
         robot = live.resting_robot()
