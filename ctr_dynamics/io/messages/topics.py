@@ -39,6 +39,7 @@ BACKBONE_FIELDS = ("s", "x", "y", "z", "qx", "qy", "qz", "qw", "vx", "vy", "vz",
 AXES = ("x", "y", "z", "rx", "ry", "rz")  # order of every six-vector and covariance
 
 PER_STEP = "every model step (3 ms, 333.3 Hz)"
+ONCE_COMPUTED = f"{PER_STEP}, once computed in idle time after a start"
 
 
 @dataclass(frozen=True)
@@ -96,6 +97,7 @@ _BASE = "`ctr_base` (parameter `output.frame_id`) or empty"
 _POSITION = "position of the tip in the base frame"
 _ORIENTATION = "orientation of the tip frame in the base frame, unit quaternion in ROS order x, y, z, w"
 _NOT_INVALID = "Not published for a step whose `/ctr/estimator/valid` is false."
+_TOO_OLD = "Where a step exceeds `output.max_age_s` while its messages go out, `false` follows those that are out already."
 
 TOPICS: tuple[Topic, ...] = (
     Topic(
@@ -285,7 +287,7 @@ TOPICS: tuple[Topic, ...] = (
         "sensor_msgs/msg/JointState",
         "out",
         OUTPUT_QOS,
-        PER_STEP,
+        ONCE_COMPUTED,
         "The slowest vibration modes, for a controller that damps vibration.",
         (
             _STAMP,
@@ -320,7 +322,7 @@ TOPICS: tuple[Topic, ...] = (
         "sensor_msgs/msg/JointState",
         "out",
         OUTPUT_QOS,
-        PER_STEP,
+        ONCE_COMPUTED,
         "Static Jacobian of the tip against actuators, and its compliance, for a controller.",
         (
             _STAMP,
@@ -415,10 +417,11 @@ TOPICS: tuple[Topic, ...] = (
         "Whether the outputs of this step can be used.",
         (
             Field(
-                "data", "true: the step's outputs are published; false: they are not, `/diagnostics` says why"
+                "data",
+                "true: the step's outputs are published; false: they are not, or not all of them; `/diagnostics` says why",
             ),
         ),
-        ("It has no header. It is published after the other topics of its step.",),
+        ("It has no header. It is published after the other topics of its step.", _TOO_OLD),
     ),
     Topic(
         DIAGNOSTICS,
