@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from ctr_dynamics.calibration.static_tips import NODES, StaticTips, Tips
 from ctr_dynamics.calibration.tip_samples import TipSamples
-from ctr_dynamics.effects import EffectQuantity, Plant, apply_effects, make_plant
+from ctr_dynamics.effects import EffectQuantity, Plant, make_plant
 from ctr_dynamics.errors import InputError
 from ctr_dynamics.kernels.rotations import conjugate, from_vector, multiply, multiply_rows
 from ctr_dynamics.robot import Robot
@@ -114,13 +114,11 @@ class TipModel:
 
     def plant(self, point: Mapping[Key, float]) -> Plant:
         """The robot at ``point``."""
-        plant = make_plant(self.robot)
         grouped: dict[str, dict[str, float]] = {}
         for (effect, name), value in point.items():
             if effect != MOUNT[0][0]:
                 grouped.setdefault(effect, {})[name] = value
-        apply_effects(plant, grouped)
-        return plant
+        return make_plant(self.robot, grouped)
 
     def tips(self, point: Mapping[Key, float], start: Tips | None = None) -> Tips:
         """Static tips at ``point``."""

@@ -19,7 +19,7 @@ from ctr_dynamics.diagnosis.diagnosis_options import ForwardModelOptions
 from ctr_dynamics.diagnosis.recording import Recording
 from ctr_dynamics.diagnosis.run_context import count_workers, run_jobs
 from ctr_dynamics.diagnosis.time_steps import TimeSteps
-from ctr_dynamics.effects import EFFECTS, EffectQuantity, Plant, apply_effects, make_plant
+from ctr_dynamics.effects import EFFECTS, EffectQuantity, Plant, make_plant
 from ctr_dynamics.errors import InputError
 from ctr_dynamics.kernels.kinds import SIMD_WIDTH
 from ctr_dynamics.kernels.rotations import conjugate_rows, multiply_rows, to_vector_rows
@@ -37,7 +37,7 @@ MANY = 8  # columns from which two simulations are worth the second one's run
 Key = tuple[str, str]
 """Effect and name of a quantity."""
 Point = Mapping[Key, float]
-"""Coordinates of quantities that are not at their off-values."""
+"""Coordinates of quantities that are not at their off-values, on top of the extensions of the robot file."""
 
 
 @dataclass(frozen=True)
@@ -123,12 +123,7 @@ class ForwardModel:
 
     def plant(self, point: Point) -> Plant:
         """Plant at ``point``."""
-        plant = self.nominal.copy()
-        values: dict[str, dict[str, float]] = {}
-        for (effect, name), coordinate in point.items():
-            values.setdefault(effect, {})[name] = EFFECTS[effect].find(name).value(coordinate)
-        apply_effects(plant, values)
-        return plant
+        return make_plant(self.robot, values_at(point))
 
     def inputs(self, plant: Plant, extended: bool) -> InputRows:
         """Actuators and load at any times, as the model takes them."""
@@ -308,6 +303,14 @@ def _parts(numbers: list[int], several: bool) -> list[list[int]]:
         return [numbers] if numbers else []
     middle = (len(numbers) + 2) // 4 * 2
     return [numbers[:middle], numbers[middle:]]
+
+
+def values_at(point: Point) -> dict[str, dict[str, float]]:
+    """Values by effect and parameter of the coordinates of ``point``."""
+    values: dict[str, dict[str, float]] = {}
+    for (effect, name), coordinate in point.items():
+        values.setdefault(effect, {})[name] = EFFECTS[effect].find(name).value(coordinate)
+    return values
 
 
 def moved(point: Point, quantity: EffectQuantity, fraction: float) -> dict[Key, float]:

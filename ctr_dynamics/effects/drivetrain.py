@@ -14,6 +14,7 @@ from ctr_dynamics.effects.registry import EffectParameter, Values, effect, per_t
     text="A tube stands further out or in than its translation reads.",
     source="Till et al. (2020), fig. 2: beta",
     large_sizes=(-1.5, -0.7, 0.7, 1.5),
+    combine="add",
 )
 def exposed_length(plant: Plant, values: Values) -> None:
     before = plant.actuators.beta_offset
@@ -32,6 +33,7 @@ def exposed_length(plant: Plant, values: Values) -> None:
     ),
     text="A tube's true angle differs from its reading by a constant.",
     source="reading model: alpha = gain * reading + offset",
+    combine="add",
 )
 def encoder_offset(plant: Plant, values: Values) -> None:
     plant.change_actuators(offset=plant.actuators.offset + per_tube(plant, values, "offset_rad"))
@@ -42,6 +44,7 @@ def encoder_offset(plant: Plant, values: Values) -> None:
     EffectParameter("tubeN.gain", "1", 1.0, 0.015, text="true angle's change over the reading's"),
     text="A tube turns more or less than its encoder says.",
     source="reading model: alpha = gain * reading + offset",
+    combine="multiply",
 )
 def encoder_gain(plant: Plant, values: Values) -> None:
     plant.change_actuators(gain=plant.actuators.gain * per_tube(plant, values, "gain"))
@@ -55,6 +58,7 @@ def encoder_gain(plant: Plant, values: Values) -> None:
     text="A tube follows its drive only after the dead zone of a reversal.",
     source="Nordin and Gutman (2002): the play operator",
     finite_sizes=(0.7, 2.0),
+    combine="add",
 )
 def backlash(plant: Plant, values: Values) -> None:
     plant.change_actuators(backlash=plant.actuators.backlash + per_tube(plant, values, "width_rad"))
@@ -98,6 +102,7 @@ def drivetrain_compliance(plant: Plant, values: Values) -> None:
     text="The tubes turn later than the encoders report.",
     source="alpha(t) = reading(t - delay)",
     large_sizes=(-2.0, -1.0, 1.0, 2.0),
+    combine="add",
 )
 def actuator_latency(plant: Plant, values: Values) -> None:
     plant.change_actuators(delay=plant.actuators.delay + values["delay_s"])

@@ -27,6 +27,7 @@ from ctr_dynamics.kernels.rotations import from_vector, matrix
     text="Gravity does not point where the robot file says.",
     source="g = R g of the robot file",
     joint=True,
+    combine="turn",
 )
 def gravity_direction(plant: Plant, values: Values) -> None:
     turn = np.array([values["rx_rad"], values["ry_rad"], values["rz_rad"]])
@@ -44,6 +45,7 @@ def gravity_direction(plant: Plant, values: Values) -> None:
     text="A constant force acts on the tip.",
     source="Till et al. (2020), (21): F",
     joint=True,
+    combine="add",
 )
 def tip_force(plant: Plant, values: Values) -> None:
     plant.tip_force += np.array([values["Fx_N"], values["Fy_N"], values["Fz_N"]])
@@ -110,6 +112,7 @@ def contact(plant: Plant, values: Values) -> None:
     text="Event times, such as the cut of a string, are known to about a millisecond.",
     source="docs/diagnosis.md",
     nuisance=True,
+    combine="add",
 )
 def load_time(plant: Plant, values: Values) -> None:
     plant.load_delay += values["delay_s"]

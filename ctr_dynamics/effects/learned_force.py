@@ -18,7 +18,6 @@ import numpy as np
 from ctr_dynamics.effects.plant import Plant
 from ctr_dynamics.effects.registry import EffectParameter, Values, effect
 from ctr_dynamics.kernels.layout import LEARNED_DEGREE
-from ctr_dynamics.robot import Robot
 
 AXES = "xyz"
 MATRIX = ("xx", "yy", "zz", "xy", "xz", "yz")  # of a symmetric matrix, as the kernels have it
@@ -50,12 +49,8 @@ def _each(name: str, text: str) -> list[EffectParameter]:
 def _shape(
     name: str, unit: str, off: float, scale: float, text: str, low: float = -math.inf
 ) -> EffectParameter:
-    """A parameter of the features; where a robot file gives it, that is where it stands."""
-
-    def start(robot: Robot, tube: int) -> float:
-        return float(robot.extensions.get("learned_force", {}).get(name, off))
-
-    return EffectParameter(name, unit, start, scale, low=low, shape=True, text=text)
+    """A parameter of the features."""
+    return EffectParameter(name, unit, off, scale, low=low, shape=True, text=text)
 
 
 @effect(

@@ -11,12 +11,13 @@ import math
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ctr_dynamics.effects.plant import Plant
+from ctr_dynamics.kernels.rotations import from_vector, multiply, to_vector
 from ctr_dynamics.robot import Robot
 
 Floats = NDArray[np.float64]
@@ -98,6 +99,8 @@ class Effect:
         searched: whether diagnosis looks for it among the causes; what is learned from the rest only is not.
         form: nuisances that are free only beside this effect, for what is uncertain in its form; presets may name their parameters.
         form_error: largest part of what it does that its law may miss whatever its parameters are, rms. 0: the law is exact.
+        combine: what a value makes with one that the robot file has under ``extensions``: it is put in its place, added to it or multiplied with it.
+            ``turn``: the parameters are a rotation vector about x, y and z, and it turns further.
     """
 
     name: str
@@ -115,6 +118,7 @@ class Effect:
     searched: bool = True
     form: tuple[str, ...] = ()
     form_error: float = 0.0
+    combine: Literal["put", "add", "multiply", "turn"] = "put"
 
     def accepts(self, name: str) -> bool:
         """Whether ``name`` is one of its parameters."""
@@ -163,8 +167,8 @@ class EffectQuantity:
     """One parameter of one effect for one robot: what diagnosis estimates.
 
     Attributes:
-        effect: ID. name: parameter, tube expanded. off: coordinate at which nothing happens. tolerance, scale: 1-sigma in the coordinate.
-        low, high: bounds of the coordinate.
+        effect: ID. name: parameter, tube expanded. off: coordinate at which the robot is as its file says. tolerance, scale: 1-sigma in the
+            coordinate. low, high: bounds of the coordinate.
     """
 
     effect: str
@@ -203,7 +207,7 @@ def _expanded(p: EffectParameter, robot: Robot) -> list[tuple[str, int]]:
 
 
 def effect_quantities(robot: Robot) -> list[EffectQuantity]:
-    """Every parameter of every registered effect for ``robot``, tubes expanded."""
+    """Every parameter of every registered effect for ``robot``, tubes expanded; coordinates are on top of the robot file's extensions."""
     found = []
     for entry in EFFECTS.values():
         for p in entry.parameters:
@@ -212,21 +216,60 @@ def effect_quantities(robot: Robot) -> list[EffectQuantity]:
                 if scale <= 0.0:
                     continue
                 off = p.coordinate(_number(p.off, robot, tube))
+                low, high = p.lowest(robot, tube), p.high
+                before = robot.extensions.get(entry.name, {}).get(name)
+                if before is not None:
+                    off, low, high = _on_top(entry, p, float(before), off, low, high)
                 tolerance = p.tolerance(robot, tube) if p.tolerance else 0.0
-                lowest = p.lowest(robot, tube)
-                found.append(EffectQuantity(entry.name, name, off, tolerance, scale, lowest, p.high, p))
+                found.append(EffectQuantity(entry.name, name, off, tolerance, scale, low, high, p))
     return found
 
 
+def _on_top(
+    entry: Effect, p: EffectParameter, before: float, off: float, low: float, high: float
+) -> tuple[float, float, float]:
+    """Off-value and bounds of a coordinate where the robot file has the value ``before``: bounds hold for what both make together."""
+    if entry.combine == "put":
+        return p.coordinate(before), low, high
+    if entry.combine == "add":
+        return off, low - before, high - before
+    if entry.combine == "multiply" and before > 0.0:
+        return off, low / before, high / before
+    return off, low, high
+
+
+def combined(robot: Robot, given: Mapping[str, Mapping[str, float]]) -> dict[str, dict[str, Any]]:
+    """The extensions of ``robot`` with values ``given`` on top, by effect and parameter; each effect says what the two make together."""
+    out = {name: dict(values) for name, values in robot.extensions.items()}
+    for name, values in given.items():
+        before = out.setdefault(name, {})
+        kind = EFFECTS[name].combine
+        if kind == "turn" and before:
+            keys = [p.name for p in EFFECTS[name].parameters]
+            first, second = (
+                from_vector(np.array([float(v.get(key, 0.0)) for key in keys])) for v in (before, values)
+            )
+            before.update(zip(keys, to_vector(multiply(second, first)).tolist(), strict=True))
+            continue
+        for key, value in values.items():
+            if key in before and kind == "add":
+                value = float(before[key]) + value
+            elif key in before and kind == "multiply":
+                value = float(before[key]) * value
+            before[key] = value
+    return out
+
+
 def apply_effects(plant: Plant, given: Mapping[str, Mapping[str, Any]]) -> None:
-    """Change ``plant`` by effects and values by name; parameters that are not given stay at their off-values.
+    """Change ``plant`` by effects and values by name, in the order of the catalogue; parameters that are not given stay at their off-values.
 
     Raises:
         KeyError: no such effect or parameter (robot files are checked when they are loaded).
     """
+    place = {name: i for i, name in enumerate(EFFECTS)}
     # what is uncertain in an effect's form comes after the effect
-    for name, values in sorted(given.items(), key=lambda item: EFFECTS[item[0]].nuisance):
-        entry = EFFECTS[name]
+    for name in sorted(given, key=lambda one: (EFFECTS[one].nuisance, place[one])):
+        entry, values = EFFECTS[name], given[name]
         full = {
             expanded: _number(p.off, plant.robot, tube)
             for p in entry.parameters
@@ -239,10 +282,10 @@ def apply_effects(plant: Plant, given: Mapping[str, Mapping[str, Any]]) -> None:
         entry.apply(plant, full)
 
 
-def make_plant(robot: Robot) -> Plant:
-    """Plant of a robot file with the effects that it names under ``extensions``."""
+def make_plant(robot: Robot, given: Mapping[str, Mapping[str, float]] | None = None) -> Plant:
+    """Plant of a robot file with the effects that it names under ``extensions``, and with values ``given`` on top of these."""
     plant = Plant.of_robot(robot)
-    apply_effects(plant, robot.extensions)
+    apply_effects(plant, combined(robot, given or {}))
     return plant
 
 

@@ -58,6 +58,7 @@ _YOUNGS = "Young's modulus; G follows where the robot file gives none"
     text="A tube is stiffer or softer than the robot file says.",
     source="Till et al. (2020), (16): E I",
     large_sizes=(-2.0, -1.0, 1.0, 2.0),
+    combine="multiply",
 )
 def youngs_modulus(plant: Plant, values: Values) -> None:
     for i, tube in enumerate(plant.robot.tubes):
@@ -75,6 +76,7 @@ def youngs_modulus(plant: Plant, values: Values) -> None:
     text="A tube is stiffer or softer in torsion.",
     source="Till et al. (2020), (16): G J",
     large_sizes=(-2.0, 2.0),
+    combine="multiply",
 )
 def shear_modulus(plant: Plant, values: Values) -> None:
     _scale(plant, values, "torsional_stiffness")
@@ -85,6 +87,7 @@ def shear_modulus(plant: Plant, values: Values) -> None:
     _one_tube(0.03, "precurvature", lambda robot, i: robot.tubes[i].precurvature_tolerance),
     text="A tube is more or less curved at rest.",
     source="Till et al. (2020), (16): u*",
+    combine="multiply",
 )
 def precurvature(plant: Plant, values: Values) -> None:
     _scale(plant, values, "precurvature")
@@ -97,6 +100,7 @@ def precurvature(plant: Plant, values: Values) -> None:
     text="The tubes are heavier or lighter.",
     source="Till et al. (2020), (13): rho A, rho I",
     large_sizes=(-2.0, 2.0),
+    combine="multiply",
 )
 def density(plant: Plant, values: Values) -> None:
     _scale(plant, values, "mass_per_length", "inertia_per_length")
@@ -116,6 +120,7 @@ def density(plant: Plant, values: Values) -> None:
     text="The payload is heavier or lighter, as by a point mass at the tip.",
     source="Till et al. (2020), (21)",
     large_sizes=(-2.0, -1.0, 1.0, 2.0),
+    combine="add",
 )
 def payload_mass(plant: Plant, values: Values) -> None:
     if values["added_kg"] != 0.0:
@@ -135,6 +140,7 @@ def payload_mass(plant: Plant, values: Values) -> None:
     text="The payload resists rotation more or less than its mass says.",
     source="Till et al. (2020), (21): H",
     large_sizes=(-0.9, -0.5, 0.5, 0.9, 1.4),
+    combine="multiply",
 )
 def payload_inertia(plant: Plant, values: Values) -> None:
     if values["scale"] != 1.0:

@@ -25,6 +25,7 @@ from ctr_dynamics.kernels.rotations import from_vector, matrix, multiply
     text="The tracker's frame is turned against the base frame.",
     source="reading = R p + t",
     joint=True,
+    combine="turn",
 )
 def registration_rotation(plant: Plant, values: Values) -> None:
     turn = np.array([values["rx_rad"], values["ry_rad"], values["rz_rad"]])
@@ -52,6 +53,7 @@ def registration_rotation(plant: Plant, values: Values) -> None:
     text="The tracker's frame is shifted against the base frame.",
     source="reading = R p + t",
     joint=True,
+    combine="add",
 )
 def registration_translation(plant: Plant, values: Values) -> None:
     shift = [values["tx_m"], values["ty_m"], values["tz_m"]]
@@ -74,6 +76,7 @@ def registration_translation(plant: Plant, values: Values) -> None:
     text="The sensor does not sit where the robot file says.",
     source="reading = p + R lever",
     joint=True,
+    combine="add",
 )
 def tracker_lever_arm(plant: Plant, values: Values) -> None:
     plant.change_tracker(lever=plant.tracker.lever + [values["x_m"], values["y_m"], values["z_m"]])
@@ -93,6 +96,7 @@ def tracker_lever_arm(plant: Plant, values: Values) -> None:
     text="Tracker poses are older than their stamps.",
     source="reading(stamp) = pose(stamp - delay)",
     large_sizes=(-2.0, -1.0, 1.0, 2.0),
+    combine="add",
 )
 def tracker_latency(plant: Plant, values: Values) -> None:
     plant.change_tracker(delay=plant.tracker.delay + values["delay_s"])
@@ -105,6 +109,7 @@ def tracker_latency(plant: Plant, values: Values) -> None:
     text="The tracker averages over a time before its stamp: delay and loss of amplitude.",
     source="moving average",
     large_sizes=(1.0,),
+    combine="add",
 )
 def tracker_averaging(plant: Plant, values: Values) -> None:
     plant.change_tracker(averaging=plant.tracker.averaging + values["window_s"])
@@ -116,6 +121,7 @@ def tracker_averaging(plant: Plant, values: Values) -> None:
     text="The tracker's clock runs at another rate.",
     source="linear clock model",
     large_sizes=(-1.0, 1.0),
+    combine="add",
 )
 def clock_skew(plant: Plant, values: Values) -> None:
     plant.change_tracker(skew=plant.tracker.skew + values["rate"])
@@ -133,6 +139,7 @@ def clock_skew(plant: Plant, values: Values) -> None:
     ),
     text="The tracker reports all positions too large or too small.",
     source="reading = scale * p",
+    combine="multiply",
 )
 def tracker_scale(plant: Plant, values: Values) -> None:
     plant.change_tracker(scale=plant.tracker.scale * values["scale"])
@@ -144,6 +151,7 @@ def tracker_scale(plant: Plant, values: Values) -> None:
     text="The tracker's readings wander off steadily, whatever the robot does.",
     source="reading = p + drift * t",
     joint=True,
+    combine="add",
 )
 def drift(plant: Plant, values: Values) -> None:
     speed = [values["x_m_per_s"], values["y_m_per_s"], values["z_m_per_s"]]
