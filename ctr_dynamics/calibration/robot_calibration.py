@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -35,8 +34,6 @@ from ctr_dynamics.diagnosis.output.robot_export import robot_with
 from ctr_dynamics.effects import effect_quantities
 from ctr_dynamics.errors import InputError
 from ctr_dynamics.robot import Robot
-from ctr_dynamics.robot_files import robot_to_dict
-from ctr_dynamics.robot_files.loader import robot_from_dict
 
 Floats = NDArray[np.float64]
 FITTED = 2.0 / 3.0  # of the tips; the rest judges
@@ -155,16 +152,4 @@ def calibrated_robot(robot: Robot, fit: TipFit, note: str) -> Robot:
         cost=0.0,
         inflation=1.0,
     )
-    found = robot_with(robot, exported, robot.name, note)
-    return _with_former_offsets(found, robot.extensions.get("encoder_offset", {}))
-
-
-def _with_former_offsets(found: Robot, former: Mapping[str, float]) -> Robot:
-    """Offsets that the file had before are part of the new ones: what was fitted comes on top."""
-    if not former:
-        return found
-    data = robot_to_dict(found)
-    offsets = data["extensions"].setdefault("encoder_offset", {})
-    for name, value in former.items():
-        offsets[name] = offsets.get(name, 0.0) + float(value)
-    return robot_from_dict(data, found.name)
+    return robot_with(robot, exported, robot.name, note)

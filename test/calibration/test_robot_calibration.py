@@ -11,7 +11,6 @@ from ctr_dynamics.calibration.robot_calibration import calibrate, calibrated_rob
 from ctr_dynamics.calibration.tip_fit import Coordinate, TipFit, TipModel, fit_tips
 from ctr_dynamics.cli.main import main
 from ctr_dynamics.diagnosis.inference.calibration import nuisances_of
-from ctr_dynamics.effects import effect_quantities
 from ctr_dynamics.errors import InputError
 from ctr_dynamics.robot_files import load_robot, robot_from_dict, robot_to_dict, robot_to_yaml
 from test.calibration.calibration_cases import tips_of
@@ -71,18 +70,21 @@ def test_the_file_holds_what_was_fitted(found, tmp_path):
     assert new.tracker.delay.value == pytest.approx(found.fit.point["tracker_latency", "delay_s"])
 
 
-def test_offsets_of_the_file_before_are_kept(robot):
-    """An offset that the file has already is part of the new one: a fit that changes nothing must keep it."""
+@pytest.mark.parametrize("tolerance", [0.0, 0.02])
+def test_offsets_of_the_file_before_are_kept(robot, tolerance):
+    """An offset that the file has already is part of the new one: a fit that changes nothing, or has no offset free, must keep it."""
     data = robot_to_dict(robot)
     data["extensions"]["encoder_offset"] = {"tube2.offset_rad": 0.02}
+    data["encoders"]["offset"]["tolerance"] = tolerance
     with_offset = robot_from_dict(data)
-    quantities = [q for q in effect_quantities(with_offset) if q.effect == "encoder_offset"]
+    quantities = [q for q in nuisances_of(with_offset) if q.effect == "encoder_offset"]
+    count = len(quantities)
     none = TipFit(
-        tuple(Coordinate.of(q) for q in quantities), np.zeros(3), 1e-4 * np.eye(3), np.zeros((0, 6)), np.ones(2), 1.0, None
+        tuple(Coordinate.of(q) for q in quantities), np.zeros(count), 1e-4 * np.eye(count), np.zeros((0, 6)), np.ones(2), 1.0, None
     )  # fmt: skip
     new = calibrated_robot(with_offset, none, "")
     assert new.extensions["encoder_offset"]["tube2.offset_rad"] == pytest.approx(0.02)
-    assert new.extensions["encoder_offset"]["tube1.offset_rad"] == 0.0
+    assert new.extensions["encoder_offset"].get("tube1.offset_rad", 0.0) == 0.0
 
 
 def test_errors_that_last_count_for_less(robot, true):

@@ -1,20 +1,20 @@
 """Robot export: the robot file with what a fit has found.
 
 In: a robot and a fit. Out: a robot with the fit's values and posterior deviations, in the file's own fields where it has them, and under
-`extensions` else.
+`extensions` else. What the file had under `extensions` before is part of the new values.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
-from ctr_dynamics.diagnosis.forward_model import Key
+from ctr_dynamics.diagnosis.forward_model import Key, values_at
 from ctr_dynamics.diagnosis.inference.map_fit import Fit
-from ctr_dynamics.effects import EFFECTS
+from ctr_dynamics.effects import EFFECTS, combined
 from ctr_dynamics.kernels.rotations import from_vector, matrix, multiply, to_vector
 from ctr_dynamics.robot import Robot
 from ctr_dynamics.robot_files import robot_from_dict, robot_to_dict
@@ -25,6 +25,8 @@ _PLAIN = {
     ("tube_coulomb", "mu"): ("friction", "tubes", "coulomb"),
     ("tube_viscous", "nu"): ("friction", "tubes", "viscous"),
 }
+_GRAVITY = "gravity_direction"
+_REGISTRATION = ("registration_rotation", "registration_translation")
 _VECTORS = {
     "registration_rotation": ("registration_rotation", ("rx_rad", "ry_rad", "rz_rad")),
     "registration_translation": ("registration_translation", ("tx_m", "ty_m", "tz_m")),
@@ -33,28 +35,34 @@ _VECTORS = {
 
 
 def robot_with(robot: Robot, fit: Fit, name: str, note: str) -> Robot:
-    """``robot`` with the values and posterior deviations of ``fit``; ``note`` goes into its description."""
+    """``robot`` with the values and posterior deviations of ``fit``; ``note`` goes into its description.
+
+    What belongs to a recording rather than the robot, such as the time of its loads, is left out.
+    """
     data = robot_to_dict(robot)
-    values = {q.key: float(v) for q, v in zip(fit.active, fit.values, strict=True)}
-    sigma = {q.key: float(s) for q, s in zip(fit.active, fit.sigma, strict=True)}
-    causes = {q.effect for q in fit.causes}
     data["name"], data["description"] = name, f"{robot.description} ({note})".strip()
-    for key in list(values):
-        if EFFECTS[key[0]].nuisance or not _into_field(data, key, values[key], sigma[key]):
-            continue
-        values.pop(key)
-    _vectors(data, values, sigma)
-    extensions: dict[str, dict[str, float]] = data.setdefault("extensions", {})
-    for (effect, parameter), coordinate in values.items():
-        if EFFECTS[effect].nuisance or effect in ("gravity_direction",):
-            continue
-        if effect == "encoder_offset" or effect in causes:
-            value = EFFECTS[effect].find(parameter).value(coordinate)
-            if math.isfinite(value):
-                extensions.setdefault(effect, {})[parameter] = value
-    if any(key[0] == "encoder_offset" for key in values):
-        found = [sigma[key] for key in values if key[0] == "encoder_offset"]
-        data["encoders"]["offset"]["tolerance"] = max(found)
+    forms = {form for q in fit.causes for form in EFFECTS[q.effect].form}
+    kept = {key: value for key, value in fit.point.items() if not EFFECTS[key[0]].nuisance or key[0] in forms}
+    sigma = {q.key: float(s) for q, s in zip(fit.active, fit.sigma, strict=True)}
+    extensions = data["extensions"] = combined(robot, values_at(kept))
+    moved = {effect for effect, _ in kept if effect in (*_VECTORS, _GRAVITY)}
+    if moved.intersection(_REGISTRATION):  # one moves the other
+        moved.update(_REGISTRATION)
+    further = [(effect, name) for effect in sorted(moved) for name in extensions.get(effect, ())]
+    taken = list(dict.fromkeys([*kept, *further]))
+    own = {(effect, parameter): float(extensions[effect][parameter]) for effect, parameter in taken}
+    offsets = [sigma[key] for key in kept if key[0] == "encoder_offset"]
+    if offsets:
+        data["encoders"]["offset"]["tolerance"] = max(offsets)
+    _vectors(data, own, sigma)
+    for key, value in list(own.items()):
+        if _into_field(data, key, value, sigma[key]) or not math.isfinite(value):
+            own.pop(key)
+    for effect, parameter in taken:
+        if (effect, parameter) not in own:
+            extensions[effect].pop(parameter, None)
+            if not extensions[effect]:
+                extensions.pop(effect)
     return robot_from_dict(data, name)
 
 
@@ -71,9 +79,12 @@ def _into_field(data: dict[str, Any], key: Key, value: float, sigma: float) -> b
     number = int(name[4]) - 1 if name.startswith("tube") else None
     if effect in ("bending_damping", "torsion_damping") and number is not None:
         tubes[number][effect].update(value=max(value, 0.0), tolerance=sigma)
-    elif effect == "youngs_modulus":
-        for tube in tubes if number is None else [tubes[number]]:
-            own = tube["youngs_modulus"]
+    elif effect in ("youngs_modulus", "shear_modulus", "density"):
+        chosen = tubes if number is None else [tubes[number]]
+        if any(tube.get(effect) is None for tube in chosen):  # a shear modulus that follows Young's
+            return False
+        for tube in chosen:
+            own = tube[effect]
             own["value"] *= value
             own["tolerance"] = sigma * own["value"]
     elif effect == "precurvature" and number is not None:
@@ -86,11 +97,6 @@ def _into_field(data: dict[str, Any], key: Key, value: float, sigma: float) -> b
                 own = segment["curvature_polynomial"]
                 own["value"] = [[v * value for v in row] for row in own["value"]]
                 own["tolerance_percent"] = 100.0 * sigma
-    elif effect == "density":
-        for tube in tubes if number is None else [tubes[number]]:
-            own = tube["density"]
-            own["value"] *= value
-            own["tolerance"] = sigma * own["value"]
     elif effect == "payload_mass" and tubes[0].get("end_body"):
         tubes[0]["end_body"]["mass"]["value"] += value
         tubes[0]["end_body"]["mass"]["tolerance"] = sigma
@@ -103,13 +109,13 @@ def _into_field(data: dict[str, Any], key: Key, value: float, sigma: float) -> b
 
 
 def _vectors(data: dict[str, Any], values: dict[Key, float], sigma: Mapping[Key, float]) -> None:
-    """Registration, lever arm and gravity: three coordinates each; taken out of ``values``."""
-    tracker = data["tracker"]
+    """Registration, lever arm and gravity: three coordinates each; taken out of ``values``. A tolerance stays where there is no ``sigma``."""
+    tracker, gravity = data["tracker"], data["gravity"]
     for effect, (field, names) in _VECTORS.items():
         keys = [(effect, n) for n in names]
-        if not all(k in values for k in keys):
+        if not any(k in values for k in keys):
             continue
-        change = np.array([values.pop(k) for k in keys])
+        change = np.array([values.pop(k, 0.0) for k in keys])
         own = tracker[field]
         if effect == "registration_rotation":
             turned = multiply(from_vector(change), from_vector(np.array(own["value"])))
@@ -118,11 +124,15 @@ def _vectors(data: dict[str, Any], values: dict[Key, float], sigma: Mapping[Key,
             shift["value"] = (matrix(from_vector(change)) @ np.array(shift["value"])).tolist()
         else:
             own["value"] = (np.array(own["value"]) + change).tolist()
-        own["tolerance"] = [sigma[k] for k in keys]
-    keys = [("gravity_direction", f"r{a}_rad") for a in "xyz"]
-    if all(k in values for k in keys):
-        change = np.array([values.pop(k) for k in keys])
-        gravity = data["gravity"]
+        own["tolerance"] = _deviations(sigma, keys, own["tolerance"])
+    keys = [(_GRAVITY, f"r{a}_rad") for a in "xyz"]
+    if any(k in values for k in keys):
+        change = np.array([values.pop(k, 0.0) for k in keys])
         gravity["value"] = (matrix(from_vector(change)) @ np.array(gravity["value"])).tolist()
-        spread = np.sort([sigma[k] for k in keys])
+        spread = np.sort([sigma.get(k, 0.0) for k in keys])
         gravity["direction_tolerance"] = float(np.mean(spread[:2]))
+
+
+def _deviations(sigma: Mapping[Key, float], keys: Sequence[Key], before: Sequence[float]) -> list[float]:
+    """Deviations of three coordinates, those ``before`` where there are none."""
+    return [sigma.get(k, b) for k, b in zip(keys, before, strict=True)]
