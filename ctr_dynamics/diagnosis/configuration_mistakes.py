@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ctr_dynamics.diagnosis.diagnosis_options import DiagnosisOptions, ForwardModelOptions
 from ctr_dynamics.diagnosis.forward_model import ForwardModel, Point
@@ -122,13 +123,14 @@ MISTAKES: dict[str, Callable[[Recording, Robot], Pair]] = {
 def misfit(
     recording: Recording,
     robot: Robot,
+    mask: NDArray[np.bool_],
     resolution: ForwardModelOptions,
     steps: TimeSteps | None = None,
     point: Point | None = None,
 ) -> float:
     """3-D rms in m of the measurement against the model at ``point``, the nominal one without; infinity where it fails.
 
-    Measured rotations count by the ratio of the noise of positions to theirs.
+    Rotations that the ``mask`` (6,) of measured axes holds count by the ratio of the noise of positions to theirs.
     """
     try:
         forward_model = ForwardModel(recording, robot, resolution, steps)
@@ -139,28 +141,32 @@ def misfit(
         return math.inf
     residual = forward_model.residual(prediction)
     noise = robot.tracker.noise
-    rotation = residual[:, 3:] * recording.axes[3:] * (noise.position.value / max(noise.rotation.value, 1e-6))
+    rotation = residual[:, 3:] * mask[3:] * (noise.position.value / max(noise.rotation.value, 1e-6))
     squares = np.sum(residual[:, :3] ** 2, axis=1) + np.sum(rotation**2, axis=1)
     return math.sqrt(float(np.nanmean(squares)))
 
 
 def find_mistake(
-    recording: Recording, robot: Robot, options: DiagnosisOptions, context: RunContext
+    recording: Recording,
+    robot: Robot,
+    mask: NDArray[np.bool_],
+    options: DiagnosisOptions,
+    context: RunContext,
 ) -> FoundMistake | None:
-    """The mistake that leaves least when it is undone, where the misfit is gross and it explains nearly all."""
+    """The mistake that leaves least when it is undone, where the misfit is gross and it explains nearly all; ``mask``: (6,) measured axes."""
     o, fine = options.configuration, options.forward_model.fine
     recording = beginning(recording, options)
-    before = misfit(recording, robot, fine)
+    before = misfit(recording, robot, mask, fine)
     if before < o.gross * noise_floor(robot) * math.sqrt(2.0):
         return None
     context.report("gross misfit: trying mistakes of units, signs and orders")
     used = np.asarray(np.isfinite(recording.position).all(axis=1))
-    whiten = Whitener(robot, recording.stamps, np.array(recording.axes), used)
+    whiten = Whitener(robot, recording.stamps, mask, used)
     steps = with_chosen_steps(ForwardModel(recording, robot, fine), whiten, {}, options.steps).steps
     after: dict[str, float] = {}
     for name, undo in MISTAKES.items():
         try:
-            after[name] = misfit(*undo(recording, robot), fine, steps)
+            after[name] = misfit(*undo(recording, robot), mask, fine, steps)
         except InputError:
             continue
     best = min(after, key=lambda name: after[name])

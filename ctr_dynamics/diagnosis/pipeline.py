@@ -73,11 +73,11 @@ def diagnose_recordings(
     context.report("nominal model")
     problem = make_problem(robot, recordings, nuisances_of(robot), mask, options)
     problem.workers = context.workers
-    mistake = find_mistake(recordings[0], robot, options, context)
+    mistake = find_mistake(recordings[0], robot, mask, options, context)
     result.tested.append("config_mistake")
     if mistake is not None and not _tolerances_explain(problem, mistake, context):
         result.mistake = mistake
-        return _mistaken(result, mistake.misfit, context.elapsed_s - begin)
+        return _mistaken(result, problem, context.elapsed_s - begin)
 
     # forward model: the nominal robot on every recording
     result.problem = problem
@@ -196,15 +196,20 @@ def _tolerances_explain(problem: Problem, mistake: FoundMistake, context: RunCon
     except InputError:
         return False
     recording, fine = beginning(model.recording, options), options.forward_model.fine
-    return misfit(recording, problem.robot, fine, model.steps, fit.point) < mistake.misfit_undone
+    mask = problem.whiteners[0].mask
+    return misfit(recording, problem.robot, mask, fine, model.steps, fit.point) < mistake.misfit_undone
 
 
-def _mistaken(result: Diagnosis, misfit: float, seconds: float) -> Diagnosis:
+def _mistaken(result: Diagnosis, problem: Problem, seconds: float) -> Diagnosis:
     """A mistake of the configuration ends the diagnosis: everything else would be fitted to it."""
     result.verdict = "named"
     result.causes = [Cause(None, "config_mistake", None)]
     result.cause_sets = [(("config_mistake",), None)]
-    result.nominal_rms, result.seconds = misfit, seconds
+    result.seconds = seconds
+    try:
+        result.nominal_rms = rms(np.concatenate(problem.residuals({}))[:, :3])
+    except InputError:  # no equilibrium to start from
+        result.nominal_rms = math.nan
     return result
 
 
