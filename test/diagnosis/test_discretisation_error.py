@@ -40,6 +40,19 @@ def test_more_nodes_where_the_data_can_see_them(recording, robot):
     assert finer["time_error_m"] == pytest.approx(errors["time_error_m"], rel=0.2)
 
 
+def test_a_pose_that_was_not_measured_hides_no_error(recording, robot):
+    """A whole row that is not a number, or its rotation only."""
+    position, quaternion = recording.position.copy(), recording.quaternion.copy()
+    position[3], quaternion[[3, 7]] = np.nan, np.nan
+    gappy = replace(recording, position=position, quaternion=quaternion)
+    whole, found = (
+        differences(make_problem(robot, [r], [], np.ones(6, bool)), {}, SILENT) for r in (recording, gappy)
+    )
+    assert found.directions.shape[0] == whole.directions.shape[0] - 12
+    assert found.rms == pytest.approx(whole.rms, rel=0.1)
+    assert np.isfinite([found.first, found.second, found.misfit]).all()
+
+
 def test_errors_far_below_the_misfit_need_no_finer_solution(recording, robot):
     """Beside a misfit of many times the noise nothing sees them; where causes explain the data, they are looked at again."""
     wrong = {("payload_mass", "added_kg"): 1.5e-3}

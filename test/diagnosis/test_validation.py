@@ -36,11 +36,18 @@ def test_a_validation_confirms_what_removes_most_of_a_visible_misfit(before, aft
 
 
 def errors_of(sizes):
-    """A model whose tip errs by ``sizes[point]`` m along x at every pose; None where it cannot be simulated with finer steps, NaN at all."""
+    """A model whose tip errs by ``sizes[point]`` m along x at every pose; None where it cannot be simulated with finer steps, NaN at all.
+
+    The tracker has measured no pose at one stamp.
+    """
 
     def at(point):
         size = sizes[point["which"] if point else "nominal"]
-        return None if size is None else np.tile([size, 0.0, 0.0, 0.0, 0.0, 0.0], (80, 1))
+        if size is None:
+            return None
+        rows = np.tile([size, 0.0, 0.0, 0.0, 0.0, 0.0], (80, 1))
+        rows[7] = np.nan
+        return rows
 
     return at
 
@@ -66,7 +73,10 @@ def errors_of(sizes):
 def test_errors_of_nominal_recalibrated_and_extended_model(coarse, finer, expected):
     recording = SimpleNamespace(name="held", stamps=np.arange(80) / 40.0, duration=2.0)
     model = SimpleNamespace(recording=recording, predict=lambda point: point, residual=errors_of(coarse))
-    whiten = type("Whiten", (), {"size": 240, "__call__": lambda self, r: r[:, :3].ravel() / 1e-3})()
+    used = np.arange(80) != 7
+    whiten = type(
+        "Whiten", (), {"size": 237, "used": used, "__call__": lambda self, r: r[used, :3].ravel() / 1e-3}
+    )()
     held_out = SimpleNamespace(
         forward_models=[model],
         finer=SimpleNamespace(forward_models=[SimpleNamespace(residual_at=errors_of(finer))]),
@@ -81,3 +91,5 @@ def test_errors_of_nominal_recalibrated_and_extended_model(coarse, finer, expect
     assert found.gain == pytest.approx(1.0 - (extended / recalibrated) ** 2)
     assert found.gain_over_nominal == pytest.approx(1.0 - (extended / nominal) ** 2, nan_ok=True)
     assert found.bags[0] == pytest.approx(("held", recalibrated, extended, nominal), nan_ok=True)
+    assert found.nis_before == pytest.approx((recalibrated / 1e-3) ** 2 / 3)
+    assert found.nis_after == pytest.approx((extended / 1e-3) ** 2 / 3)

@@ -190,16 +190,18 @@ def differences(problem: Problem, point: Mapping[Key, float], context: RunContex
             last = [_difference(f, x, 1.0) for (f, _), x in zip(half, quarter, strict=True)]
             further = _whitened(problem, last)
             total, second = total + further, float(np.linalg.norm(further))
-    rows = max(sum(len(w.used) for w in whiteners), 1)
-    rms = [
-        np.sqrt(sum(np.nan if d is None else float(np.sum(d[:, :3] ** 2)) for d in parts) / rows)
-        for parts in (last, space)
-    ]
+    rows = max(sum(int(w.used.sum()) for w in whiteners), 1)
+
+    def rms(parts: list[Floats | None]) -> float:
+        pairs = zip(parts, whiteners, strict=True)
+        squares = (np.nan if d is None else float(np.sum(d[w.used][:, :3] ** 2)) for d, w in pairs)
+        return math.sqrt(sum(squares) / rows)
+
     left = _whitened(problem, base)
     misfit = max(1.0, float(np.linalg.norm(left)) / math.sqrt(len(left)))
     return Differences(
         np.stack([total, _whitened(problem, space)], axis=1),
-        np.array(rms, dtype=float),
+        np.array([rms(last), rms(space)]),
         first,
         second,
         misfit,

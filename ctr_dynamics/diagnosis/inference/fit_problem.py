@@ -144,6 +144,8 @@ def make_problem(
     whiteners = []
     for r in recordings:
         used = np.isfinite(r.position).all(axis=1) & (r.stamps >= 0.0)
+        if mask[3:].any():
+            used &= np.isfinite(r.quaternion).all(axis=1)
         whiteners.append(Whitener(robot, r.stamps, mask, used))
     size = sum(w.size for w in whiteners)
     return Problem(

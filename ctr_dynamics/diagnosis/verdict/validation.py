@@ -84,7 +84,7 @@ def validate(held_out: Problem, recalibrated: Fit, extended: Fit) -> Validation 
         stamps.append(recording.stamps[good] + shift)
         shift += recording.duration + 1.0
         bags.append(BagErrors(recording.name, *(math.sqrt(one[-1].mean()) for one in squares)))
-        if good.all():
+        if good[whiten.used].all():
             for i, r in enumerate(fitted):
                 w = whiten(r)
                 nis[i] += float(w @ w)
