@@ -258,7 +258,7 @@ def test_a_further_cause_gains_more_than_the_law_of_the_first_may_miss(made, mon
             e.score = e.fitted_score = score
         found = WeighedHypotheses([pair, single, none], np.array([0.98, 0.02, 0.0]), none, None, [], [])
         assert needed_hypothesis(found.hypotheses, problem) is needed
-        assert found.cause_sets(problem, needed)[0][0] == needed.effects
+        assert found.pooled(problem, needed)[0][0] == needed.effects
 
 
 @pytest.mark.parametrize(("probability", "clean"), [(0.95, False), (0.85, True)])

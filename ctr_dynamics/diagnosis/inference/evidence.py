@@ -15,7 +15,7 @@ from joblib import delayed
 from numpy.typing import NDArray
 from scipy.special import logsumexp
 
-from ctr_dynamics.diagnosis.diagnosis_options import DiagnosisOptions
+from ctr_dynamics.diagnosis.diagnosis_options import DiagnosisOptions, EvidenceOptions
 from ctr_dynamics.diagnosis.forward_model import Key
 from ctr_dynamics.diagnosis.inference.candidates import Candidate, log_prior
 from ctr_dynamics.diagnosis.inference.discrepancy import (
@@ -67,8 +67,8 @@ class WeighedHypotheses:
         """The likeliest."""
         return self.hypotheses[0]
 
-    def cause_sets(self, problem: Problem, needed: Hypothesis) -> list[tuple[tuple[str, ...], float]]:
-        """Sets of effects with their probabilities, likeliest first, as few as hold the probability of the options.
+    def pooled(self, problem: Problem, needed: Hypothesis) -> list[tuple[tuple[str, ...], float]]:
+        """All sets of effects with their probabilities, likeliest first.
 
         Args:
             needed: whose causes, if it has any, stand for those of every hypothesis that has more of them without need.
@@ -79,18 +79,25 @@ class WeighedHypotheses:
             without_need = needed.members and needed.keys < e.keys and e.gain_over(needed) < least
             effects = needed.effects if without_need else e.effects
             total[effects] = total.get(effects, 0.0) + float(p)
-        out, held = [], 0.0
-        for effects, p in sorted(total.items(), key=lambda item: -item[1]):
-            out.append((effects, p))
-            held += p
-            if held >= problem.options.evidence.set_probability:
-                break
-        return out
+        return sorted(total.items(), key=lambda item: -item[1])
 
     def probability_of(self, effect: str) -> float:
         """Sum of the probabilities of all hypotheses that hold ``effect``."""
         every = zip(self.hypotheses, self.probabilities, strict=True)
         return min(float(sum(p for e, p in every if effect in e.effects)), 1.0)
+
+
+def likeliest_sets(
+    pooled: Sequence[tuple[tuple[str, ...], float]], options: EvidenceOptions
+) -> list[tuple[tuple[str, ...], float]]:
+    """Of sets with their probabilities the likeliest, as few as hold the probability of the options."""
+    out, held = [], 0.0
+    for effects, p in sorted(pooled, key=lambda item: -item[1]):
+        out.append((effects, p))
+        held += p
+        if held >= options.set_probability:
+            break
+    return out
 
 
 def needed_gain(problem: Problem, fewer: Hypothesis) -> float:

@@ -11,7 +11,12 @@ from dataclasses import dataclass, field, replace
 
 from ctr_dynamics.diagnosis.diagnosis_options import DiagnosisOptions
 from ctr_dynamics.diagnosis.inference.discrepancy import CorrelatedProblem, Discrepancy, as_beside
-from ctr_dynamics.diagnosis.inference.evidence import WeighedHypotheses, WithDiscrepancy, needed_gain
+from ctr_dynamics.diagnosis.inference.evidence import (
+    WeighedHypotheses,
+    WithDiscrepancy,
+    likeliest_sets,
+    needed_gain,
+)
 from ctr_dynamics.diagnosis.inference.fit_problem import Problem
 from ctr_dynamics.diagnosis.inference.fit_quality import is_wrong
 from ctr_dynamics.diagnosis.inference.hypotheses import Hypothesis
@@ -129,13 +134,13 @@ def _without_remainder(
     o = problem.options
     is_noise = evidence.whiteness.p >= o.residual_tests.noise_p
     predicted = evidence.validation is not None and evidence.validation.confirms(o.validation)
-    sets = found.cause_sets(problem, best)
-    result = Verdict("clean", cause_sets=list(sets))
+    pooled = found.pooled(problem, best)
+    result = Verdict("clean", cause_sets=list(likeliest_sets(pooled, o.evidence)))
     if best.members:
         _separate(result, problem, found, best, context)
     apart = all(cause.is_apart(o.verdict) for cause in result.causes)
     # who names more names these too
-    probability = sum(p for effects, p in sets if set(best.effects) <= set(effects))
+    probability = sum(p for effects, p in pooled if set(best.effects) <= set(effects))
     needed = needed_hypothesis(found.hypotheses, problem)
     sure = probability >= o.verdict.named and bool(needed.members or not best.members)
     if not evidence.excited and not (best.members and apart and sure):
@@ -225,14 +230,7 @@ def _with_remainder(
 def _sets(weighed: WithDiscrepancy, options: DiagnosisOptions) -> CauseSets:
     """Sets of causes, `unknown` among them where there is a discrepancy, as few as hold the probability of the options."""
     every = [*weighed.alone, *(((*effects, "unknown"), p) for effects, p in weighed.beside)]
-    out: CauseSets = []
-    held = 0.0
-    for effects, p in sorted(every, key=lambda item: -item[1]):
-        out.append((effects, p))
-        held += p
-        if held >= options.evidence.set_probability:
-            break
-    return out
+    return list(likeliest_sets(every, options.evidence))
 
 
 def _unknown(problem: Problem, found: WeighedHypotheses, weighed: WithDiscrepancy | None) -> Verdict:
