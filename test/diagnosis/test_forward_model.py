@@ -1,5 +1,6 @@
 """Predictions and derivatives of one second of a motion: interpolation, columns, smoothness."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -8,6 +9,7 @@ from ctr_dynamics.diagnosis import forward_model as forward_model_module
 from ctr_dynamics.diagnosis.diagnosis_options import DiagnosisOptions
 from ctr_dynamics.diagnosis.forward_model import ForwardModel, at_times, smooth
 from ctr_dynamics.diagnosis.inference.fit_problem import make_problem
+from ctr_dynamics.diagnosis.learned.learn import on_robot
 from ctr_dynamics.diagnosis.recording import Recording
 from ctr_dynamics.kernels.rotations import from_vector, multiply_rows
 from ctr_dynamics.model.trajectory import Trajectory
@@ -89,6 +91,21 @@ def test_a_recording_without_measurements_yet_adds_nothing(recording, robot, kno
         found.append((*linear, residual))
     for both, alone in zip(*found, strict=True):
         np.testing.assert_array_equal(both, alone)
+
+
+def test_limits_of_nuisances_are_the_same_on_parts_and_other_recordings(recording, robot, known):
+    """A search with nuisances that may go as far as they like fits growing parts too, and a learned force has a robot of its own."""
+    problem = make_problem(robot, [recording], (known[STIFFNESS],), np.ones(6, bool))
+    free = replace(problem, reach=math.inf, tolerance_factor=3.0, workers=2)
+    other = robot.model_copy(update={"name": "other"})
+    for part in (
+        free.until([0.4]),
+        free.on([recording]),
+        on_robot(free, other),
+        on_robot(free, other, [recording]),
+    ):
+        assert (part.reach, part.tolerance_factor, part.workers) == (math.inf, 3.0, 2)
+    assert on_robot(free, other).robot.name == "other"
 
 
 def test_the_misfit_is_a_smooth_function_of_delays(robot, known):

@@ -88,11 +88,13 @@ class Problem:
         pairs = zip(shorter.forward_models, self.forward_models, strict=True)
         return replace(shorter, forward_models=[e.with_steps(whole.steps) for e, whole in pairs])
 
-    def on(self, recordings: Sequence[Recording]) -> Problem:
-        """The same robot, nuisances, axes and resolution on other recordings, before any correction."""
+    def on(self, recordings: Sequence[Recording], robot: Robot | None = None) -> Problem:
+        """The same nuisances with their limits, axes and resolution on other recordings, of another ``robot`` where one is given, before any
+        correction."""
         options = replace(self.options, forward_model=self.forward_models[0].options)
-        other = make_problem(self.robot, recordings, self.nuisances, self.whiteners[0].mask, options)
-        return replace(other, workers=self.workers)
+        mask = self.whiteners[0].mask
+        other = make_problem(robot or self.robot, recordings, self.nuisances, mask, options)
+        return replace(other, workers=self.workers, reach=self.reach, tolerance_factor=self.tolerance_factor)
 
     def residual(self, point: Mapping[Key, float]) -> Floats | None:
         """(m,) whitened residual at ``point``; None where a simulation fails."""

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from ctr_dynamics.diagnosis.forward_model import Key
 from ctr_dynamics.diagnosis.inference.discrepancy import CorrelatedNoise
-from ctr_dynamics.diagnosis.inference.fit_problem import Problem, make_problem
+from ctr_dynamics.diagnosis.inference.fit_problem import Problem
 from ctr_dynamics.diagnosis.inference.gaussian_posterior import variances
 from ctr_dynamics.diagnosis.inference.map_fit import Fit, fit
 from ctr_dynamics.diagnosis.inference.sensitivities import off_nominal
@@ -152,21 +152,12 @@ def _robot(problem: Problem, base: Fit) -> Robot:
 
 def on_robot(problem: Problem, robot: Robot, recordings: Sequence[Recording] | None = None) -> Problem:
     """The problem of ``robot`` on ``recordings``; None stands for those of ``problem``, with its steps and the error of the solver."""
-    same = [m.recording for m in problem.forward_models]
-    options = replace(problem.options, forward_model=problem.forward_models[0].options)
-    other = make_problem(
-        robot,
-        same if recordings is None else recordings,
-        problem.nuisances,
-        problem.whiteners[0].mask,
-        options,
-    )
-    other.workers = problem.workers
-    if recordings is None:
-        pairs = zip(other.forward_models, problem.forward_models, strict=True)
-        other.forward_models = [m.with_steps(before.steps) for m, before in pairs]
-        other.numerics, other.offset, other.reach = problem.numerics, problem.offset, problem.reach
-    return other
+    if recordings is not None:
+        return problem.on(recordings, robot)
+    other = problem.on([m.recording for m in problem.forward_models], robot)
+    pairs = zip(other.forward_models, problem.forward_models, strict=True)
+    models = [m.with_steps(before.steps) for m, before in pairs]
+    return replace(other, forward_models=models, numerics=problem.numerics, offset=problem.offset)
 
 
 def _terms(
