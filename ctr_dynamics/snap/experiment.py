@@ -139,7 +139,7 @@ class Trajectory:
         inner_tip, outer_tip: (k, 3) m in ``ctr_base``.
         iterations, jacobians: (k,) of each step.
         frame_t: (f,) s, positions: (f, nodes, 3) m and quaternions: (f, nodes, 4) wxyz of the kept backbones.
-        theta_f_rest: rad, at t = 0; wall_s, cpu_s: s by the clock and on the processor, of all steps;
+        theta_b_rest, theta_f_rest: rad, at t = 0; wall_s, cpu_s: s by the clock and on the processor, of all steps;
         failure: why the run ended before its time, else empty.
     """
 
@@ -154,6 +154,7 @@ class Trajectory:
     frame_t: np.ndarray
     positions: np.ndarray
     quaternions: np.ndarray
+    theta_b_rest: float
     theta_f_rest: float
     unknowns: int
     cells: tuple[int, ...]
@@ -250,6 +251,7 @@ def run(robot: Robot, plan: Plan, progress: Callable[[float], None] | None = Non
         frame_t=np.array([f[0] for f in log.frames]),
         positions=np.array([f[1] for f in log.frames]),
         quaternions=np.array([f[2] for f in log.frames]),
+        theta_b_rest=plan.start,
         theta_f_rest=rest,
         unknowns=solver.grid.unknowns,
         cells=solver.grid.cells,

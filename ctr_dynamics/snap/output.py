@@ -78,6 +78,7 @@ def write_backbones(file: Path, run: Trajectory, slower: float, metadata: Mappin
         Template(stamped_numbers(INNER, FRAME, 7)),
         Template(stamped_numbers(OUTER, FRAME, 7)),
     )
+    theta_b = np.concatenate([[run.theta_b_rest], run.theta_b])
     theta_f = np.concatenate([[run.theta_f_rest], run.theta_f])
     marker = np.concatenate([[run.theta_f_rest], run.marker_angle])
     steps = np.concatenate([[0.0], run.t])
@@ -103,11 +104,7 @@ def write_backbones(file: Path, run: Trajectory, slower: float, metadata: Mappin
                     encode_joint_state(
                         stamp,
                         ["theta_b", "theta_f", "marker_angle"],
-                        [
-                            float(run.theta_b[0] if k == 0 else run.theta_b[k - 1]),
-                            float(theta_f[k]),
-                            float(marker[k]),
-                        ],
+                        [float(theta_b[k]), float(theta_f[k]), float(marker[k])],
                     ),
                 ),
             ]

@@ -16,17 +16,21 @@ from ctr_dynamics.robot import Robot
 from ctr_dynamics.snap.grid import Grid, build_grid, default_cells
 
 TOLERANCE = 1e-9  # of ||E||^2, SI units (section III-F)
-# Effects on the mechanics that (25) does not hold; those of encoders and tracker do not concern it: its actuator angles are the true ones.
-ABSENT = {
-    "air_drag",
-    "clearance",
-    "contact",
-    "exposed_length",
-    "ovality",
-    "softening",
-    "tip_force",
-    "tip_spring",
-}
+# Effects on what (25) holds.
+HELD = frozenset(
+    (
+        "base_coulomb", "base_viscous", "tube_coulomb", "tube_viscous", "stribeck", "distributed_friction", "youngs_modulus", "shear_modulus",
+        "precurvature", "density", "payload_mass", "payload_inertia", "bending_damping", "torsion_damping", "gravity_direction",
+        "drivetrain_compliance",
+    )
+)  # fmt: skip
+# Those that do not concern it: its actuator angles are the true ones, its translations stand still, and nothing is measured.
+OUTSIDE = frozenset(
+    (
+        "encoder_offset", "encoder_gain", "backlash", "actuator_latency", "insertion_velocity", "load_time", "registration_rotation",
+        "registration_translation", "tracker_lever_arm", "tracker_latency", "tracker_averaging", "clock_skew", "tracker_scale", "drift",
+    )
+)  # fmt: skip
 EQUATIONS = {"derived": 1.0, "printed": 0.0}
 """Factor of each form, for the last row of the parameters (docs/model.md, *Gyroscopic term of (12)*)."""
 OUTCOMES = {
@@ -72,7 +76,7 @@ class SnapSolver:
         problem = robot.actuator_problem(np.asarray(beta, float))
         if problem:
             raise InputError(problem, do="mend beta", where=f"robot {robot.name}")
-        absent = ABSENT.intersection(robot.extensions)
+        absent = set(robot.extensions) - HELD - OUTSIDE
         if absent:
             raise InputError(
                 f"extension '{min(absent)}' is not in the finite-difference solver",

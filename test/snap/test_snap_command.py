@@ -173,6 +173,17 @@ def test_failed_step_is_named_and_exit_code_1(tmp_path, capsys, monkeypatch):
     assert "step to 0.000050 s failed" in capsys.readouterr().err
 
 
+def test_a_first_step_that_fails_leaves_the_start(tmp_path, capsys, monkeypatch):
+    from ctr_dynamics.snap.solver import SnapSolver, Solved
+
+    monkeypatch.setattr(SnapSolver, "step", lambda *_: Solved(False, "Newton's method gave up", 1, 1, 1.0))
+    assert main(["snap", "--robot", EXAMPLE, "--output", str(tmp_path), "--start", "3.0", *SHORT]) == 1
+    assert "Newton's method gave up" in capsys.readouterr().err
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert (summary["steps"], summary["theta_b_start"]) == (0, 3.0)
+    assert columns(tmp_path / "trajectory.csv")[1] == []
+
+
 def test_a_step_that_cannot_be_solved_ends_the_run():
     robot = load_robot(EXAMPLE)
     found = run(robot, Plan(3.0, rate=1e4, dt=1e-3, duration=0.1, cells=(2, 2, 2, 2, 2, 2)))

@@ -4,13 +4,14 @@ import numpy as np
 import pytest
 from model_cases import many_tubes
 
+from ctr_dynamics.effects import EFFECTS
 from ctr_dynamics.errors import InputError
 from ctr_dynamics.model.model import Model
 from ctr_dynamics.model.simulator import Inputs, Simulator
 from ctr_dynamics.model.statics import Statics
 from ctr_dynamics.model.time_scheme import make_scheme
 from ctr_dynamics.robot_files import load_robot, robot_with
-from ctr_dynamics.snap.solver import SnapSolver
+from ctr_dynamics.snap.solver import HELD, OUTSIDE, SnapSolver
 
 
 def cells_for(robot, beta, spacing):
@@ -185,9 +186,28 @@ def test_soft_drive_is_a_rigid_one_turned_by_torque_over_stiffness():
     np.testing.assert_allclose(yielding.tube_end(0), rigid.tube_end(0), atol=1e-8)
 
 
-def test_extensions_that_the_equations_lack_are_refused():
-    robot = with_extensions(load_robot("till2020_snap"), {"clearance": {"play_rad": 0.01}})
-    with pytest.raises(InputError, match="clearance"):
+def test_every_effect_is_in_the_equations_or_outside_them_or_refused():
+    """An effect that nobody has placed is refused; those of the first two kinds are mechanics and measurement."""
+    assert not HELD & OUTSIDE
+    assert set(EFFECTS) >= HELD | OUTSIDE
+    refused = {
+        "air_drag", "clearance", "contact", "exposed_length", "learned_force", "oval_mean", "ovality", "play_kinematics", "softening", "tip_force",
+        "tip_spring",
+    }  # fmt: skip
+    assert set(EFFECTS) - HELD - OUTSIDE == refused
+
+
+@pytest.mark.parametrize(
+    ("name", "values"),
+    [
+        ("clearance", {"play_rad": 0.01}),
+        ("learned_force", {"constant_x_N": 0.1}),
+        ("of_your_own", {"size": 1.0}),
+    ],
+)
+def test_extensions_that_the_equations_lack_are_refused(name, values):
+    robot = with_extensions(load_robot("till2020_snap"), {"stribeck": {"static_ratio": 1.2}, name: values})
+    with pytest.raises(InputError, match=f"extension '{name}' is not in the finite-difference solver"):
         SnapSolver(robot, robot.rest.beta.value)
 
 
