@@ -17,6 +17,7 @@ from ctr_dynamics.diagnosis.forward_model import ForwardModel, Point
 from ctr_dynamics.effects import effect_quantities
 
 Floats = NDArray[np.float64]
+BELOW_ALIASES = 0.45  # of the rate of the samples: the highest frequency that is looked for
 
 
 @dataclass(frozen=True)
@@ -85,8 +86,14 @@ def unexplained_force(
 
 
 def _frequency(t: Floats, x: Floats, options: UnexplainedForceOptions) -> float | None:
-    """Hz of the frequency that dominates ``x`` (k,) at ``t`` (k,) s; None where none does."""
-    frequencies = np.linspace(options.lowest_hz, options.highest_hz, options.frequencies)
+    """Hz of the frequency that dominates ``x`` (k,) at ``t`` (k,) s; None where none does.
+
+    Beyond half of the rate of the samples, frequencies repeat those below.
+    """
+    highest = min(options.highest_hz, BELOW_ALIASES / float(np.median(np.diff(t))))
+    if highest <= options.lowest_hz:
+        return None
+    frequencies = np.linspace(options.lowest_hz, highest, options.frequencies)
     spectrum = lombscargle(t, x - x.mean(), 2.0 * np.pi * frequencies, normalize=True)
     best = int(np.argmax(spectrum))
     return float(frequencies[best]) if spectrum[best] >= options.periodic else None
