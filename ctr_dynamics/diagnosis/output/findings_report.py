@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 from scipy.signal import periodogram
 
 from ctr_dynamics.diagnosis.diagnosis_result import Diagnosis
+from ctr_dynamics.diagnosis.inference.candidates import Candidate
 from ctr_dynamics.diagnosis.inference.map_fit import Fit
 from ctr_dynamics.diagnosis.inference.residual_tests import by_axis
 from ctr_dynamics.diagnosis.inference.separation import separation
@@ -196,21 +198,26 @@ def _evidence(page: Page, d: Diagnosis) -> None:
     page.table(linear, ("cause", "gain"))
 
 
-def _rivals(page: Page, d: Diagnosis) -> None:
-    if d.sensitivities is None or d.problem is None or d.search is None:
-        return
-    members = [c for e in d.search.hypotheses[:1] for c in e.members]
-    if not members:
-        return
-    best = d.search.hypotheses[0]
+def separations(d: Diagnosis) -> tuple[list[Candidate], list[str], Floats]:
+    """Candidates of the verdict's causes, effects, and the separation (causes, effects) of each from each where they differ; empty without causes."""
+    members = [c.candidate for c in d.causes if c.candidate is not None]
+    if not members or d.sensitivities is None or d.problem is None or d.extended is None:
+        return [], [], np.zeros((0, 0))
     names = sorted({c.effect for c in d.sensitivities.by_candidate})
     table = np.full((len(members), len(names)), np.nan)
     for i, member in enumerate(members):
         for rival in d.sensitivities.by_candidate:
             if rival.effect != member.effect:
                 k = names.index(rival.effect)
-                value = separation(d.problem, best.fit, (member,), rival, d.sensitivities)
+                value = separation(d.problem, d.extended, (member,), rival, d.sensitivities)
                 table[i, k] = np.nanmin([table[i, k], value])
+    return members, names, table
+
+
+def _rivals(page: Page, d: Diagnosis) -> None:
+    members, names, table = separations(d)
+    if not members:
+        return
     figure = Figure(figsize=(10, 2.6 + 0.3 * len(members)), layout="constrained")
     ax = figure.subplots()
     image = ax.imshow(np.log10(np.maximum(table, 0.1)), aspect="auto", cmap="viridis")
@@ -218,9 +225,10 @@ def _rivals(page: Page, d: Diagnosis) -> None:
     ax.set_yticks(range(len(members)), [m.label for m in members], fontsize=8)
     figure.colorbar(image, ax=ax).set_label("log10 of separation", fontsize=8)
     page.heading("What these data cannot tell apart")
+    limit = d.options.verdict.separation
     page.figure(
         to_svg(figure),
-        "Separation of each cause from every rival; below 5 (0.7 on this scale) the data do not decide.",
+        f"Separation of each cause from every rival; below {limit:g} ({np.log10(limit):.1f} on this scale) the data do not decide.",
     )
 
 
@@ -251,6 +259,11 @@ def _validation(page: Page, d: Diagnosis) -> None:
     page.table([("NIS per degree of freedom", v.nis_before, v.nis_after)], ("", "re-calibrated", "extended"))
 
 
+def noise_band(sequences: Sequence[Floats]) -> float:
+    """Two deviations of the mean over ``sequences`` of the autocorrelation of noise."""
+    return 2.0 * float(np.sqrt(sum(1.0 / max(len(x), 1) for x in sequences))) / len(sequences)
+
+
 def _whiteness(page: Page, d: Diagnosis, recalibrated: Fit, extended: Fit) -> None:
     assert d.problem is not None
     page.heading("Is what is left noise?")
@@ -264,7 +277,7 @@ def _whiteness(page: Page, d: Diagnosis, recalibrated: Fit, extended: Fit) -> No
         rate = 1.0 / np.median(np.diff(d.recordings[0].stamps))
         frequency, power = periodogram(sequences[1], rate)
         right.plot(frequency, np.cumsum(power) / max(power.sum(), 1e-30), color=colour, label=label)
-    bound = 2.0 / np.sqrt(len(by_axis(d.problem, extended.whitened)[0]) * 3)
+    bound = noise_band(by_axis(d.problem, extended.whitened))
     left.axhspan(-bound, bound, color="#8c959f", alpha=0.3)
     left.set_xlabel("lag (samples)")
     left.set_ylabel("autocorrelation")

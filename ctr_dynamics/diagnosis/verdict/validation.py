@@ -77,7 +77,7 @@ def validate(held_out: Problem, recalibrated: Fit, extended: Fit) -> Validation 
         if not all(np.isfinite(r).any() for r in fitted):
             continue
         nominal = _residuals(forward_model, finer, ({},))
-        good: NDArray[np.bool_] = np.isfinite(np.hstack(fitted)).all(axis=1)
+        good = np.asarray(np.isfinite(np.hstack(fitted)).all(axis=1))
         for one, r in zip(squares, (*fitted, *nominal), strict=True):
             one.append(np.sum(r[good, :3] ** 2, axis=1))
         recording = forward_model.recording
