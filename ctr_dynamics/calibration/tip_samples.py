@@ -34,11 +34,6 @@ class TipSamples:
     axes: NDArray[np.bool_]
     timed: bool = True
 
-    @property
-    def n(self) -> int:
-        """Number of tubes."""
-        return (self.joints.shape[1] - 1) // 2
-
     def encoders_at(self, times: Floats) -> Floats:
         """Readings (s, 2N) at ``times`` (s,), linear between joint states and held outside."""
         t = self.joints[:, 0]

@@ -26,9 +26,6 @@ def option(value: T, unit: str, reason: str) -> T:
 class RecordingOptions:
     """Data: what is used of a bag."""
 
-    time_left: float = option(
-        3.0, "whitened", "difference of a quarter of the step from half of it, likewise"
-    )
     shortest_s: float = option(2.0, "s", "joints and tracker together; less shows too little of a vibration")
     longest_s: float = option(1000.0, "s", "joints that fit into memory with all that is kept of them")
     gap_s: float = option(0.1, "s", "without joint states; the motion in a longer gap is unknown")

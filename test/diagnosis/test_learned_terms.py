@@ -32,7 +32,7 @@ def linear(seed, truth=None, correlated=0.0, count=400):
     for k, value in (truth or {}).items():
         residual += value * columns[:, k]
     variance, vectors = np.linalg.eigh(process)
-    noise = Noise(lambda x: vectors.T @ x, np.maximum(variance, 0.0), 0.3)
+    noise = Noise(lambda x: vectors.T @ x, np.maximum(variance, 0.0))
     return Data(residual, columns[:, 40:], np.zeros(2), np.ones(2), columns[:, :40], np.zeros(40, bool)), [
         noise
     ]
@@ -44,11 +44,9 @@ def test_terms_are_found_with_their_sizes(correlated):
     data, noises = linear(1, truth, correlated)
     found = choose_terms(data, noises, SIZES, WIDTHS)
     assert set(found.chosen) == set(truth)
-    sigma = np.sqrt(np.diag(found.covariance))
     expected = np.array([truth[k] for k in found.chosen])
-    assert np.all(np.abs(found.values - expected) < 4.0 * sigma)
+    assert np.abs(found.values - expected).max() < (0.05 if correlated else 0.01)
     assert np.abs(found.common - [0.5, -1.0]).max() < 0.1
-    assert found.log_posterior > 10.0
 
 
 @pytest.mark.parametrize("correlated", [0.0, 1.5])
@@ -65,11 +63,6 @@ def test_terms_that_must_not_be_negative_are_not():
     found = choose_terms(replace(data, positive=np.ones(40, bool)), noises, SIZES, WIDTHS)
     assert 17 not in found.chosen
     assert np.all(found.values >= 0.0)
-
-
-def test_correlated_noise_is_told_from_white():
-    size = {c: choose_terms(*linear(5, correlated=c), SIZES, WIDTHS).size for c in (0.0, 3.0)}
-    assert size[0.0] <= 0.3 < size[3.0]
 
 
 @pytest.mark.parametrize("columns", [1, 2, 6])

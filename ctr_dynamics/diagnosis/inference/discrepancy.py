@@ -44,7 +44,7 @@ class Discrepancy:
     """Posterior of a discrepancy beside one fit.
 
     Attributes:
-        log_evidence: with it, averaged over its sizes and correlation time. log_bayes: that over the one without.
+        log_evidence: with it, averaged over its sizes and correlation time.
         rms_m: 3-D, expected of its positions given the data. correlation_time_s: at which it has fallen to 1/e.
         covariance: (a, a) of the fit's coordinates, with it.
         process, sizes: the likeliest process, and its sizes in m and rad.
@@ -52,7 +52,6 @@ class Discrepancy:
     """
 
     log_evidence: float
-    log_bayes: float
     rms_m: float
     correlation_time_s: float
     covariance: Floats
@@ -217,13 +216,9 @@ def discrepancy_of(
     o = problem.options.discrepancy
     floors = np.array([max(noise.position.value, 1e-6), max(noise.rotation.value, 1e-6)])
     found = []
-    plain = None
     for process in processes:
         model = _Linear(problem, found_fit, process)
-        if plain is None:
-            plain = model.log_evidence((0.0, 0.0))[0] + model.wider_tolerances((0.0, 0.0))
         found.append((*_best_sizes(model, np.log(o.smallest * floors), np.log(o.largest * floors)), model))
-    assert plain is not None
     logs = np.array([log for log, _, _ in found])
     weights = np.exp(logs - logsumexp(logs))
     time = math.exp(float(weights @ np.log([p.time for p in processes])))
@@ -232,7 +227,6 @@ def discrepancy_of(
     average = float(logsumexp(logs)) - math.log(among or len(processes)) + model.wider_tolerances(sizes)
     return Discrepancy(
         average,
-        average - plain,
         model.process.rms_m(problem, model.left(sizes), sizes[0]),
         time,
         model.log_evidence(sizes)[1],

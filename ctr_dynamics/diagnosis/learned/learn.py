@@ -298,4 +298,4 @@ def _noises(problem: Problem) -> list[Noise]:
     turn = 1.5 / problem.robot.exposed_length  # rad at the tip of a cantilever for each m of its deflection
     processes = [CorrelatedNoise(problem, time) for time in problem.options.discrepancy.times_s]
     units = [np.where(p.of_position, unit, unit * turn) for p in processes]
-    return [Noise(p, each**2 * p.variance, p.time) for p, each in zip(processes, units, strict=True)]
+    return [Noise(p, each**2 * p.variance) for p, each in zip(processes, units, strict=True)]

@@ -1,9 +1,9 @@
 """Sparse terms: which columns of a dictionary explain a residual, by Bayesian evidence.
 
 In: a whitened residual, the columns of what is uncertain anyway and of the dictionary, and noise that is correlated. Out: the chosen columns
-with their coefficients and covariance. Coefficients have one Gaussian prior whose width the evidence chooses, and so does it choose size and
-correlation time of the noise. Before the data one term is expected, and every one is as likely as another: a larger dictionary makes each less
-likely, and no threshold is needed (Scott and Berger 2010 on that correction).
+with their coefficients. These have one Gaussian prior whose width the evidence chooses, and so does it choose size and correlation time of
+the noise. Before the data one term is expected, and every one is as likely as another: a larger dictionary makes each less likely, and no
+threshold is needed (Scott and Berger 2010 on that correction).
 """
 
 from __future__ import annotations
@@ -25,12 +25,10 @@ class Noise:
 
     Attributes:
         turn: takes whitened values (m, ...) to axes in which the noise is diagonal. variance: (m,) there, of unit size.
-        time: s, of correlation.
     """
 
     turn: Turn
     variance: Floats
-    time: float
 
 
 @dataclass(frozen=True)
@@ -38,18 +36,12 @@ class Terms:
     """The chosen columns.
 
     Attributes:
-        chosen: their numbers. values, covariance: of their coefficients. common: (f,) new departures of what is uncertain anyway.
-        log_posterior: over that of no term with the same freedom of the noise. width: of the prior. size: of the noise; time: s.
+        chosen: their numbers. values: of their coefficients. common: (f,) new departures of what is uncertain anyway.
     """
 
     chosen: tuple[int, ...]
     values: Floats
-    covariance: Floats
     common: Floats
-    log_posterior: float
-    width: float
-    size: float
-    time: float
 
 
 @dataclass(frozen=True)
@@ -99,18 +91,17 @@ class _Reduced:
         self.gram, self.right = left[:-1, :-1], left[:-1, -1]
         self.without = -0.5 * float(left[-1, -1]) - float(np.log(np.diag(self._factor)).sum()) + log_weight
 
-    def solve(self, chosen: Sequence[int] | NDArray[np.int_], width: float) -> tuple[Floats, Floats, float]:
-        """Coefficients, covariance and log evidence of the ``chosen``."""
+    def solve(self, chosen: Sequence[int] | NDArray[np.int_], width: float) -> tuple[Floats, float]:
+        """Coefficients and log evidence of the ``chosen``."""
         if len(chosen) == 0:
-            return np.zeros(0), np.zeros((0, 0)), self.without
+            return np.zeros(0), self.without
         at = np.asarray(chosen)
         information = np.eye(len(at)) + width**2 * self.gram[np.ix_(at, at)]
         factor = np.linalg.cholesky(information)
         half = np.linalg.solve(factor, width * self.right[at])
-        inverse = np.linalg.inv(factor)
-        values = width * (inverse.T @ half)
+        values = width * (np.linalg.inv(factor).T @ half)
         evidence = self.without + 0.5 * float(half @ half) - float(np.log(np.diag(factor)).sum())
-        return values, width**2 * inverse.T @ inverse, evidence
+        return values, evidence
 
     def common(self, chosen: Sequence[int], values: Floats) -> Floats:
         """Departures (f,) of what is uncertain anyway beside ``values`` of the ``chosen``."""
@@ -159,7 +150,7 @@ def _greedy(
             value -= float(loss.min())
             trial.pop(int(np.argmin(loss)))
         # anew, for sums of small changes of large numbers drift
-        value = reduced.solve(columns[trial], width)[2] + log_choice(len(trial), total)
+        value = reduced.solve(columns[trial], width)[1] + log_choice(len(trial), total)
         waited += 1
         feasible = np.all(np.linalg.solve(S[np.ix_(trial, trial)], b[trial])[positive[trial]] >= 0.0)
         if feasible and value > top + 1e-9:
@@ -196,22 +187,13 @@ def choose_terms(
         for _ in range(rounds):
             found = [(*reversed(_greedy(reduced[place], columns, w, patience)), w) for w in widths]
             _, chosen, width = max(found, key=lambda item: item[0])
-            place = max(reduced, key=lambda key: reduced[key].solve(chosen, width)[2])
-            score = reduced[place].solve(chosen, width)[2] + log_choice(len(chosen), total)
+            place = max(reduced, key=lambda key: reduced[key].solve(chosen, width)[1])
+            score = reduced[place].solve(chosen, width)[1] + log_choice(len(chosen), total)
             if score <= top + 1e-6:
                 break
             top = score
             if score > best[0]:
                 best = (score, chosen, place, float(width))
-    score, chosen, place, width = best
-    values, covariance, _ = reduced[place].solve(chosen, width)
-    return Terms(
-        tuple(chosen),
-        values,
-        covariance,
-        reduced[place].common(chosen, values),
-        score - nothing,
-        width,
-        float(sizes[place[1]]),
-        noises[place[0]].time,
-    )
+    _, chosen, place, width = best
+    values = reduced[place].solve(chosen, width)[0]
+    return Terms(tuple(chosen), values, reduced[place].common(chosen, values))
