@@ -148,26 +148,26 @@ class Contrast:
         self._others = tuple(others.values())
         self._point = {**fit.point, **{key: value for rival in rivals for key, value in rival.start}}
         a, places = len(fit.active), list(others)
-        self._scales, self._departure = prior_scales(fit, (own,)), departures(fit, (own,))
-        # of each rival: its columns among all, and the products of those of the bags at hand with the errors of the solver
-        self._rivals: list[tuple[list[int], Floats]] = []
+        self._departure = departures(fit, (own,))
+        # of each rival: prior deviations beside it, its columns among all, and the products of those of these bags with the errors of the solver
+        self._rivals: list[tuple[Floats, list[int], Floats]] = []
         for rival in rivals:
             free = [i for i, q in enumerate(rival.quantities) if q.key not in active]
             against = sensitivities.by_candidate[rival][:, free] * [rival.quantities[i].scale for i in free]
             columns = np.hstack([fit.columns, against, problem.numerics])
             own_columns = [*range(a), *(a + places.index(rival.quantities[i].key) for i in free)]
-            self._rivals.append((own_columns, columns.T @ columns))
+            self._rivals.append((prior_scales(fit, (own,), rival), own_columns, columns.T @ columns))
         self.nothing = np.zeros((a + len(others), a + len(others)))
 
     def smallest(self, told: Floats) -> float:
         """The separation from the nearest rival by the bags at hand and what else is ``told``: products of columns, of :meth:`told` or sums."""
-        return min(self._separation(columns, products, told) for columns, products in self._rivals)
+        return min(self._separation(*rival, told) for rival in self._rivals)
 
-    def _separation(self, columns: list[int], products: Floats, told: Floats) -> float:
-        a, n = len(self._scales), len(columns)
+    def _separation(self, prior: Floats, columns: list[int], products: Floats, told: Floats) -> float:
+        a, n = len(prior), len(columns)
         total = products.copy()
         total[:n, :n] += told[np.ix_(columns, columns)]
-        scales = np.concatenate([self._scales, np.ones(len(total) - a)])
+        scales = np.concatenate([prior, np.ones(len(total) - a)])
         cause = total[:, :a] @ self._departure
         square = self._departure @ cause[:a]
         found = left_over_products(

@@ -7,7 +7,7 @@ import pytest
 
 from ctr_dynamics.diagnosis import next_experiment
 from ctr_dynamics.diagnosis.diagnosis_options import DiagnosisOptions
-from ctr_dynamics.diagnosis.inference.candidates import candidates
+from ctr_dynamics.diagnosis.inference.candidates import Candidate, candidates
 from ctr_dynamics.diagnosis.inference.separation import separation, separation_in
 from ctr_dynamics.effects import effect_quantities
 from ctr_dynamics.robot_files import load_robot
@@ -76,3 +76,18 @@ def test_what_is_told_is_that_of_more_rows(case):
     numerics = np.vstack([problem.numerics, np.zeros((ROWS, 1))])
     whole = separation_in(fit, columns, (own,), against, numerics)
     assert case.after() == pytest.approx(whole, rel=1e-9)
+
+
+def test_a_rival_that_has_a_tolerance_may_leave_it_as_any_other(case):
+    """Its column is among those of the fit, with the tolerance for its prior; as a cause it is as wide as causes are."""
+    fit, problem, own = case.fit, case.problem, case.own
+    stiffness = fit.active[1]
+    rival = Candidate("youngs_modulus", (stiffness,))
+    sensitivities = SimpleNamespace(by_candidate={rival: fit.columns[:, 1:]})
+    # what a stiffness that is off by many tolerances does as well
+    fit.columns[:, 0] += 30.0 * stiffness.tolerance / fit.values[0] * fit.columns[:, 1]
+    contrast = next_experiment.Contrast(problem, fit, sensitivities, own, [rival])
+    before = separation(problem, fit, (own,), rival, sensitivities)
+    assert stiffness.scale > stiffness.tolerance > 0.0
+    assert before < 0.9 * separation(problem, fit, (own,))
+    assert contrast.smallest(contrast.nothing) == pytest.approx(before, rel=1e-9)

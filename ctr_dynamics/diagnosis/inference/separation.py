@@ -57,9 +57,9 @@ def departures(fit: Fit, members: Sequence[Candidate]) -> Floats:
     return np.array([v - q.off if q.key in own else 0.0 for q, v in zip(fit.active, fit.values, strict=True)])
 
 
-def prior_scales(fit: Fit, members: Sequence[Candidate]) -> Floats:
-    """(a,) prior deviations of the active values; 0 of those that are gone with ``members``."""
-    gone, wide = keys_of(members), {q.key for q in fit.causes}
+def prior_scales(fit: Fit, members: Sequence[Candidate], rival: Candidate | None = None) -> Floats:
+    """(a,) prior deviations of the active values; 0 of those that are gone with ``members``, as of a cause for those of a ``rival``."""
+    gone, wide = keys_of(members), {q.key for q in (*fit.causes, *(rival.quantities if rival else ()))}
     return np.array(
         [
             0.0 if q.key in gone else math.sqrt(prior_variance(q, q.key in wide, fit.tolerance_factor))
