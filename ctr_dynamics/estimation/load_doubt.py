@@ -30,7 +30,7 @@ class LoadDoubtOptions:
 
     Attributes:
         least: by the tracker's noise; a load that moves the resting tip by less is within what is published anyway.
-        misfit: by which the movement of a load may differ from the model's, as a fraction: payloads and stiffnesses of a file that is not calibrated.
+        relative_error: of the model in the movement by a load: payloads and stiffnesses of a file that is not calibrated.
         prior: probability that a load that jumps is wrong. believed: probability from which on it is confirmed, or left out.
         followed: mean square of what remains of the measurements without the load, in its deviations, up to which the robot does not bear it.
         longest_s: s, by which a tracker may be late. For so long a robot that bears the load may seem to stand still.
@@ -38,7 +38,7 @@ class LoadDoubtOptions:
     """
 
     least: float = 3.0
-    misfit: float = 0.3
+    relative_error: float = 0.3
     prior: float = 0.01
     believed: float = 0.99
     followed: float = 2.0
@@ -170,7 +170,7 @@ class LoadDoubt:
             return
         moved = position - found[0].position
         with_load = residual - self._before
-        square = 2.0 * self._noise**2 + options.misfit**2 * float(moved @ moved)
+        square = 2.0 * self._noise**2 + options.relative_error**2 * float(moved @ moved)
         by_load = float(with_load @ with_load) / square
         remains = with_load + moved
         by_none = float(remains @ remains) / square
