@@ -2,9 +2,12 @@
 
 import pytest
 
+from ctr_dynamics.estimation.estimator import Estimator
 from ctr_dynamics.estimation.monitoring.health import RECENT_S, Health
 from ctr_dynamics.estimation.monitoring.statuses import all_statuses
 from ctr_dynamics.io.messages.topics import STEP_NS
+from ctr_dynamics.parameters import Settings
+from ctr_dynamics.robot_files import load_robot
 
 RECENT_STEPS = round(RECENT_S * 1e9 / STEP_NS)
 
@@ -79,6 +82,18 @@ def test_slow_joint_states_are_named(period_ms, slow):
     assert ("limit 0.05 s" in found.message) == slow
     health.reinitialise()
     assert status(health, "joints").message == "ok"
+
+
+def test_the_estimator_tells_the_period_of_its_joint_states():
+    robot = load_robot("till2020_tissue")
+    made = Estimator(robot, Settings({"input_timeout_s": 0.5}))
+    names = [f"tube{i}_{kind}" for kind in ("rotation", "translation") for i in (1, 2)]
+    rest = [*robot.rest.alpha.value, *robot.rest.beta.value]
+    for k in range(8):
+        made.add_joint_state(1_000_000_000 + k * 200_000_000, names, rest)
+    assert "joint states come every 0.2 s" in status(made.health, "joints").message
+    made.reset()
+    assert status(made.health, "joints").message == "ok"
 
 
 def test_one_gap_does_not_make_joint_states_slow():
