@@ -23,6 +23,7 @@ from ctr_dynamics.estimation.monitoring.health import Health
 from ctr_dynamics.estimation.monitoring.innovation_log import InnovationLog
 from ctr_dynamics.estimation.open_loop import OpenLoopRun
 from ctr_dynamics.estimation.step_output import (
+    DOUBTED_LOAD,
     FUSION_OFF,
     Innovation,
     MotionPoint,
@@ -115,11 +116,15 @@ class FusedRun:
     ) -> None:
         """Compare the measurements that have come ``due`` after step ``k`` with the tips of their times, and fuse them."""
         assert self.state is not None
-        not_fused = self.alternatives.not_fused
+        tracker = self.ekf.tracker
         for measurement, time_s, position, quaternion in due:
             measurement.fused_k = k
             given = time_s, position, quaternion, measurement.stamp_error_s
             motion, residual = self.residuals(time_s, position, quaternion, open_loop)
+            if motion is not None:
+                own_s = time_s - tracker.delay - self.ekf.expected.delay
+                load_doubt.take(measurement.stamp_ns, own_s, motion.residual, motion.position, tracker)
+            not_fused = self.alternatives.not_fused or (DOUBTED_LOAD if load_doubt.seems_wrong else "")
             if self._inputs.missing_at(time_s - self.ekf.expected.age):
                 update = Update.impossible("no joint states at its time")
             elif self._health.fusing and not not_fused:
@@ -128,10 +133,6 @@ class FusedRun:
                 update = self.ekf.compare(*given)
                 if not_fused:
                     update = update._replace(reason=update.reason.replace(FUSION_OFF, not_fused))
-            if motion is not None:
-                tracker = self.ekf.tracker
-                own_s = time_s - tracker.delay - self.ekf.expected.delay
-                load_doubt.take(measurement.stamp_ns, own_s, motion.residual, motion.position, tracker)
             if motion is not None and residual is not None:
                 seen = motion.position + motion.residual
                 self.disagreement.add(measurement.stamp_ns, seen, motion.position, residual)

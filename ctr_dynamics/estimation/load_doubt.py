@@ -183,9 +183,14 @@ class LoadDoubt:
 
     @property
     def seems_wrong(self) -> bool:
-        """Whether the robot moves as without the load so far, and no better as with it. Nothing else is concluded from such measurements."""
+        """Whether the robot moves as without the load so far. Such measurements are not fused, and nothing else is concluded from them."""
         squares = [square for _, square in self._taken.values()]
-        return bool(squares) and self._right < 0.0 and sum(squares) <= self.options.followed * len(squares)
+        return self._right < -self._sure and sum(squares) <= self.options.followed * len(squares)
+
+    @property
+    def _sure(self) -> float:
+        """Logarithm of the odds that are believed."""
+        return math.log(self.options.believed / (1.0 - self.options.believed))
 
     def wrong(self, stamp_ns: int) -> bool:
         """Whether the load is wrong by what is known up to ``stamp_ns``; a load that is right is in doubt no more.
@@ -195,10 +200,9 @@ class LoadDoubt:
         if self.begin_ns is None:
             return False
         options, right = self.options, self._right
-        sure = math.log(options.believed / (1.0 - options.believed))
-        if right > sure or stamp_ns - self._jump_ns > options.expires_s * 1e9:
+        if right > self._sure or stamp_ns - self._jump_ns > options.expires_s * 1e9:
             self.clear()
             return False
         shown = stamp_ns - self.begin_ns > options.longest_s * 1e9
         unlikely = math.log((1.0 - options.prior) / options.prior)
-        return shown and self.seems_wrong and right < -sure - unlikely
+        return shown and self.seems_wrong and right < -self._sure - unlikely

@@ -14,7 +14,9 @@ Floats = NDArray[np.float64]
 OK, WARN, ERROR = 0, 1, 2
 FUSION_OFF = "fusion is off"
 UNKNOWN_DELAY = "the tracker is late by a time that is not known yet"
+DOUBTED_LOAD = "the robot does not seem to bear the known load"
 MOVING_FRAME = "the frame of the tracker moves"
+NOT_FUSED = FUSION_OFF, UNKNOWN_DELAY, MOVING_FRAME, DOUBTED_LOAD  # reasons that are no outliers
 
 
 class Modes(NamedTuple):

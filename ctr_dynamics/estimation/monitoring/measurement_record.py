@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ctr_dynamics import chi_square
-from ctr_dynamics.estimation.step_output import FUSION_OFF, MOVING_FRAME, UNKNOWN_DELAY, Innovation
+from ctr_dynamics.estimation.step_output import NOT_FUSED, Innovation
 
 RECENT = 40  # measurements that the tracker is judged by: one second at 40 Hz
 FEWEST_RECENT = 20  # of them, below which nothing is said of a contradiction
@@ -79,9 +79,7 @@ class MeasurementRecord:
             fusing: whether measurements are fused at all.
             again: its time has been published before the clock was set back; its step is in no output, and neither is it in the totals.
         """
-        within = innovation.reason in (FUSION_OFF, MOVING_FRAME, UNKNOWN_DELAY) or (
-            innovation.accepted and not innovation.reason
-        )
+        within = innovation.reason in NOT_FUSED or (innovation.accepted and not innovation.reason)
         if innovation.dof:
             self.recent.append((innovation.nis, innovation.dof, within))
         if innovation.fused_residual is not None:
