@@ -184,15 +184,15 @@ class FusedRun:
         self.start(open_loop.state.copy(), seconds(k), vibrating)
 
     def with_alternatives(self, tip: TipEstimate, open_loop: OpenLoopRun, farthest: float) -> State:
-        """Have ``tip`` hold what else may be right; returns the state that it belongs to. ``farthest``: see :meth:`inflate_covariance`."""
-        self.inflate_covariance(tip, open_loop, farthest)
+        """Have ``tip`` hold what else may be right; returns the state that it belongs to. ``farthest``: see :meth:`_inflate_covariance`."""
+        self._inflate_covariance(tip, open_loop, farthest)
         if self.alternatives.doubted:
-            self.withdraw(tip, open_loop)
+            self._withdraw(tip, open_loop)
         state = open_loop.state if self.alternatives.doubted else self.state
         assert state is not None
         return state
 
-    def inflate_covariance(self, tip: TipEstimate, open_loop: OpenLoopRun, farthest: float) -> None:
+    def _inflate_covariance(self, tip: TipEstimate, open_loop: OpenLoopRun, farthest: float) -> None:
         """Have the covariance of ``tip`` hold what else may be right: the open-loop run where the tracker may be late, its frame may move, or the
         model may err more than the filter counts on, the tracker where it is not fused, has been shifted since the start, or lies apart without
         having jumped.
@@ -216,7 +216,7 @@ class FusedRun:
         apart = _apart(tip, open_loop.tips.last.mean)
         tip.covariance[:] += allowance(other) * np.multiply.outer(apart, apart)
 
-    def withdraw(self, tip: TipEstimate, open_loop: OpenLoopRun) -> None:
+    def _withdraw(self, tip: TipEstimate, open_loop: OpenLoopRun) -> None:
         """Have ``tip`` be that of the open-loop run, as where the latency has probably changed: what was fused since has led the filter astray.
 
         Its covariance holds the filter's tip, too.

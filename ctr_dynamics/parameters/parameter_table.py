@@ -196,7 +196,7 @@ PARAMETERS: tuple[Parameter, ...] = (
         "float",
         0.2,
         "s",
-        "Largest age at which a measurement is still fused at its own stamp.",
+        "Largest age at which a measurement is still fused at its own stamp, and at which joints and loads still count.",
         0.0,
         2.0,
     ),

@@ -197,7 +197,7 @@ class CovarianceFactor:
             )
         return self._coarse[key]
 
-    def _remap(self, key: Key, mesh: Mesh, beta: Floats) -> None:
+    def _remap(self, mesh: Mesh, beta: Floats) -> None:
         """Carry the fields' rows to another set of sections."""
         assert self.mesh is not None
         self.fields = remap_columns(self.model.n, self.fields[None], self.mesh, self.beta, mesh, beta)[0]
@@ -212,7 +212,7 @@ class CovarianceFactor:
         beta = record.inputs[-1, input_rows(model.n)["beta"]]
         key, mesh, interpolation = self._coarse_sections(record.key, record.mesh, beta)
         if key != self.key:
-            self._remap(key, mesh, beta)
+            self._remap(mesh, beta)
         self.key, self.mesh, self.interpolation, self.beta = key, mesh, interpolation, beta
         # copies: corrections write into what a record holds
         now = SolvedStage(

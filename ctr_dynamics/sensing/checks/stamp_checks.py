@@ -174,7 +174,7 @@ class StampChecks:
         if hurried and self._even:  # the rhythm is over: look at what follows by itself
             self._forget_steps()
             self._even = False
-        self._step(stamp_ns, step, pause, at)
+        self._step(step, pause, at)
         self.newest_ns = stamp_ns
         if self._taken % LOOK_EVERY == 0 or hurried or (self.mode and step > 0):
             self._look()
@@ -283,7 +283,7 @@ class StampChecks:
 
     # -- the pattern of the stamps --
 
-    def _step(self, stamp_ns: int, step: int, pause: int, at: int) -> None:
+    def _step(self, step: int, pause: int, at: int) -> None:
         """Note the step from the newest stamp."""
         if step > max(LEAP_S * 1e9, 20.0 * self._period_ns) and self._standing < STANDING:
             self._before_leap_ns, self._since_leap, self._resumes = self.newest_ns, 1, True
