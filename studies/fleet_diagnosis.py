@@ -36,8 +36,7 @@ from ctr_dynamics.diagnosis.pipeline import diagnose_recordings
 from ctr_dynamics.diagnosis.recording import read_recording
 from ctr_dynamics.diagnosis.run_context import RunContext
 from ctr_dynamics.effects import effect_quantities
-from ctr_dynamics.estimation.filter.parameter_priors import tip_compliance
-from ctr_dynamics.robot import Robot
+from ctr_dynamics.robot import Robot, cantilever
 from ctr_dynamics.robot_files import robot_from_dict, robot_to_dict
 from ctr_dynamics.simulation.scenario import Load, Scenario
 from studies.diagnosis_study import (
@@ -109,7 +108,7 @@ def extension(candidate: Candidate, departures: np.ndarray) -> dict[str, dict[st
 
 def pushed(scenario: Scenario, robot: Robot, rng: np.random.Generator) -> Scenario:
     """``scenario`` with pushes at the tip that its bag does not tell of, while the tubes turn."""
-    most = robot.exposed_length / tip_compliance(robot)
+    most = robot.exposed_length / cantilever(robot).deflection
     loads = list(scenario.loads)
     for _ in range(PUSHES):
         direction = rng.standard_normal(3)

@@ -88,7 +88,7 @@ class Estimator:
         self.discretisation = discretise(robot, int(settings["model.nodes"]), accuracy_m)
         self.model = Model(robot, nodes=self.discretisation.nodes)
         self.tracker = tracker_of(self.model, settings)
-        self.health = Health(consistency=consistency_monitor(settings, robot.tracker.noise.position.value))
+        self.health = Health(consistency=consistency_monitor(settings, robot))
         self.health.shortfall = self.discretisation.shortfall(accuracy_m)
         self.health.fusing = bool(settings["filter.enabled"])
         self.inputs = InputBuffer(self.model, self.tracker, settings, self.health)

@@ -17,6 +17,7 @@ from ctr_dynamics.kernels.rotations import from_vector, matrix
 
 INTERVAL_NS = 25_000_000
 NOISE = 0.35e-3
+GRAVITY = np.array([0.0, -9.81, 0.0])
 
 
 def innovation(i, white, point=None):
@@ -163,9 +164,9 @@ def motion(t):
     )
 
 
-def causes_of(residual_of, seconds=12.0, seed=0):
+def causes_of(residual_of, seconds=12.0, seed=0, gravity=GRAVITY):
     rng = np.random.default_rng(seed)
-    regression = CauseRegression(10.0, NOISE)
+    regression = CauseRegression(10.0, NOISE, gravity)
     for t in np.arange(0.0, seconds, 0.025):
         point = motion(t)
         residual = residual_of(t, point) + NOISE * rng.standard_normal(3)
@@ -195,6 +196,13 @@ def test_the_cause_that_made_the_residual_is_listed_first(effect, residual):
     assert len(found) <= 3
 
 
+@pytest.mark.parametrize("direction", [(0.0, -1.0, 0.0), (1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.0, 0.6, -0.8)])
+def test_a_payload_shows_along_gravity_wherever_that_points(direction):
+    gravity = 9.81 * np.array(direction)
+    found = causes_of(lambda t, m: 2e-4 * (gravity - m.acceleration), gravity=gravity)
+    assert found[0].effect == "payload_mass"
+
+
 def test_causes_that_this_motion_cannot_tell_apart_are_listed_together():
     found = causes_of(lambda t, m: 0.05 * np.sign(m.alpha_rate[1]) * turn(m))
     assert {cause.effect for cause in found if not cause.added} == {"backlash", "base_coulomb"}
@@ -208,7 +216,7 @@ def test_two_causes_are_both_listed():
 def test_noise_and_a_motion_of_its_own_have_no_cause():
     assert causes_of(lambda t, m: np.zeros(3)) == []
     assert causes_of(lambda t, m: 0.003 * np.array([0, 0, math.sin(40 * t)])) == []
-    assert CauseRegression(10.0, NOISE).causes() == []
+    assert CauseRegression(10.0, NOISE, GRAVITY).causes() == []
 
 
 def test_every_sensitivity_is_an_effect_of_the_catalogue():

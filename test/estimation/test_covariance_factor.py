@@ -8,7 +8,7 @@ import pytest
 import ctr_dynamics.estimation.filter.covariance_factor as factor_module
 from ctr_dynamics.estimation.energy_norm import energy_rows, field_weights
 from ctr_dynamics.estimation.filter.covariance_factor import CovarianceFactor
-from ctr_dynamics.estimation.filter.parameter_priors import force_range, model_uncertainty, tip_compliance
+from ctr_dynamics.estimation.filter.parameter_priors import force_range, model_uncertainty
 from ctr_dynamics.estimation.mode_tracker import ModeTracker
 from ctr_dynamics.kernels.layout import base_field_count
 from ctr_dynamics.model.mesh import build_mesh
@@ -17,6 +17,7 @@ from ctr_dynamics.model.model import Model
 from ctr_dynamics.model.simulator import Inputs, Simulator
 from ctr_dynamics.model.statics import Statics
 from ctr_dynamics.model.time_scheme import make_scheme
+from ctr_dynamics.robot import cantilever
 from ctr_dynamics.robot_files import load_robot, robot_from_dict, robot_to_dict
 from ctr_dynamics.sensing import TrackerModel
 from ctr_dynamics.sensing.tracker import DELAY
@@ -130,10 +131,12 @@ def test_the_force_s_range_follows_the_robot_s_compliance(robot, model):
     tips = [statics.solve(BETA, ALPHA, np.array([0.0, 0.0, f])).tip_position for f in (push, -push)]
     across = [statics.solve(BETA, ALPHA, np.array([f, 0.0, 0.0])).tip_position for f in (push, -push)]
     found = max(np.linalg.norm(a - b) for a, b in (tips, across)) / (2 * push)
-    assert tip_compliance(robot) == pytest.approx(found, rel=0.35)
+    assert cantilever(robot).deflection == pytest.approx(found, rel=0.35)
     least, most = force_range(robot, 0.0, 0.0)
-    assert least * tip_compliance(robot) == pytest.approx(0.005 * robot.tracker.noise.position.value)
-    assert most * tip_compliance(robot) == pytest.approx(0.1 * (robot.lengths[0] + robot.rest.beta.value[0]))
+    assert least * cantilever(robot).deflection == pytest.approx(0.005 * robot.tracker.noise.position.value)
+    assert most * cantilever(robot).deflection == pytest.approx(
+        0.1 * (robot.lengths[0] + robot.rest.beta.value[0])
+    )
     assert force_range(robot, 1e-3, 0.0) == (1e-3, most)
     assert force_range(robot, 0.0, 1e-6) == (1e-6, 1e-6)
 

@@ -9,10 +9,10 @@ from stream_cases import BETA, T0, PoseStream, joint_rows
 
 from ctr_dynamics.io.bag_reader import InputMessage, open_bag
 from ctr_dynamics.io.messages.cdr import JointStateIn, PoseIn
+from ctr_dynamics.robot import cantilever
 from ctr_dynamics.robot_files import load_robot
 from ctr_dynamics.sensing.checks import Findings, InputChecks, Kind, LoadChecks
 from ctr_dynamics.sensing.checks.input_checks import check_messages
-from ctr_dynamics.sensing.checks.load_checks import tip_compliance
 
 BAGS = Path(__file__).parents[1] / "data" / "bags"
 WEIGHT = 0.06 * 9.81  # N
@@ -122,7 +122,7 @@ def test_loads_of_other_frames_and_without_numbers_are_dropped(loads):
 def test_the_compliance_is_that_of_a_cantilever():
     robot = load_robot("till2020_tissue")
     inner = robot.tubes[0]
-    alone = tip_compliance(robot, (robot.rest.beta.value[0], -robot.tubes[1].length))
+    alone = cantilever(robot, (robot.rest.beta.value[0], -robot.tubes[1].length))
     length = inner.length + robot.rest.beta.value[0]
     stiffness = (
         inner.youngs_modulus.value
@@ -130,8 +130,8 @@ def test_the_compliance_is_that_of_a_cantilever():
         * (inner.outer_radius.value**4 - inner.inner_radius.value**4)
     )
     assert alone.length == pytest.approx(length)
-    assert alone.force == pytest.approx(length**2 / (2 * stiffness))
-    assert alone.moment == pytest.approx(length / stiffness)
+    assert alone.turn == pytest.approx(length**2 / (2 * stiffness))
+    assert alone.turn_by_moment == pytest.approx(length / stiffness)
 
 
 def test_findings_keep_the_worst_and_can_be_taken_back():

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from ctr_dynamics.kernels.factor_operations import leaves_range
 from ctr_dynamics.model.model import Model
-from ctr_dynamics.robot import Robot
+from ctr_dynamics.robot import Robot, cantilever
 
 Floats = NDArray[np.float64]
 
@@ -80,21 +80,9 @@ class ModelUncertainty:
 LEAST_MOVED, MOST_MOVED = 0.005, 0.1
 
 
-def tip_compliance(robot: Robot) -> float:
-    """m/N across the robot at its rest position: a cantilever of the tubes' summed bending stiffness, int (L - s)^2 / (E I) ds."""
-    ends = np.array(robot.lengths) + np.array(robot.rest.beta.value)
-    stiffness = np.array([tube.bending_stiffness for tube in robot.tubes])
-    exposed, compliance, begin = float(ends[0]), 0.0, 0.0
-    for end in sorted(e for e in ends if e > 0.0):
-        present = stiffness[ends > 0.5 * (begin + end)].sum()
-        compliance += ((exposed - begin) ** 3 - (exposed - end) ** 3) / (3.0 * present)
-        begin = end
-    return float(compliance)
-
-
 def force_range(robot: Robot, least: float, most: float) -> tuple[float, float]:
     """Deviations (N) between which that of the unknown tip force lies; those given as 0 come from the robot's compliance."""
-    compliance = tip_compliance(robot)
+    compliance = cantilever(robot).deflection
     most = most or max(MOST_MOVED * robot.exposed_length / compliance, least)
     return least or min(LEAST_MOVED * robot.tracker.noise.position.value / compliance, most), most
 

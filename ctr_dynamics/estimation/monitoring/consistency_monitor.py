@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from ctr_dynamics.estimation.monitoring.likely_causes import Cause, CauseRegression
 from ctr_dynamics.estimation.step_output import OK, WARN, Innovation, Status
+from ctr_dynamics.robot import Robot
 
 Floats = NDArray[np.float64]
 
@@ -65,16 +66,22 @@ class ConsistencyMonitor:
     Args:
         limits: when to alarm.
         noise: standard deviation of the tracker's position, m per axis.
+        gravity: (3,) m/s^2, ``ctr_base``; how a robot sags tells causes apart.
 
     Attributes:
         nis, cusum, whiteness: present values; NaN while there are too few measurements.
         alarm: whether one of them was above its limit within the last window. alarms: how often it rose.
     """
 
-    def __init__(self, limits: ConsistencyLimits | None = None, noise: float = 0.0) -> None:
+    def __init__(
+        self,
+        limits: ConsistencyLimits | None = None,
+        noise: float = 0.0,
+        gravity: Sequence[float] = (0.0, -9.81, 0.0),
+    ) -> None:
         self.limits = limits or ConsistencyLimits()
         self.alarms = 0
-        self._regression = CauseRegression(self.limits.window, noise)
+        self._regression = CauseRegression(self.limits.window, noise, gravity)
         self.clear()
 
     def clear(self) -> None:
@@ -174,8 +181,8 @@ class ConsistencyMonitor:
         return Status("misfit", WARN, f"{self._exceeded[1]}; {which}", values)
 
 
-def consistency_monitor(settings: Mapping[str, Any], noise: float) -> ConsistencyMonitor:
-    """The monitor with the parameter table's limits; ``noise``: standard deviation of the tracker's position, m per axis."""
+def consistency_monitor(settings: Mapping[str, Any], robot: Robot) -> ConsistencyMonitor:
+    """The monitor of ``robot`` with the parameter table's limits."""
     limits = ConsistencyLimits(
         window=float(settings["misfit.window_s"]),
         nis=float(settings["misfit.nis_limit"]),
@@ -183,4 +190,4 @@ def consistency_monitor(settings: Mapping[str, Any], noise: float) -> Consistenc
         cusum=float(settings["misfit.cusum_limit"]),
         whiteness=float(settings["misfit.whiteness_limit"]),
     )
-    return ConsistencyMonitor(limits, noise)
+    return ConsistencyMonitor(limits, robot.tracker.noise.position.value, robot.gravity.value)

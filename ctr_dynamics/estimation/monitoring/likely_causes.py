@@ -19,9 +19,9 @@ from ctr_dynamics.kernels.compiled_rotations import matrix
 
 Floats = NDArray[np.float64]
 
-GRAVITY = 9.81  # m/s^2, along -y of ctr_base
 # rad/s (and m/s times 100) above which an actuator counts as moving: five times what the encoders' noise looks like
 MOVING = 0.2
+UPRIGHT = 0.1  # part of gravity across the base's axis, below which a robot does not sag to one side
 
 
 @dataclass(frozen=True)
@@ -54,6 +54,7 @@ class MotionWindow(NamedTuple):
         residual, position, velocity, acceleration, alpha, alpha_rate, beta_rate: arrays (k, ...) of
             :class:`ctr_dynamics.estimation.step_output.MotionPoint`.
         frame: (k, 3, 3) of the tip. moving: (k,) from 0 at rest to 1. held: (k, n) sign of each tube's last motion.
+        gravity: (3,) m/s^2, ``ctr_base``.
     """
 
     residual: Floats
@@ -66,10 +67,11 @@ class MotionWindow(NamedTuple):
     frame: Floats
     moving: Floats
     held: Floats
+    gravity: Floats
 
 
-def motion_window(points: Sequence[MotionPoint], held: Floats) -> MotionWindow:
-    """The ``points`` as one window; ``held`` (n,): sign of each tube's motion before them."""
+def motion_window(points: Sequence[MotionPoint], held: Floats, gravity: Floats) -> MotionWindow:
+    """The ``points`` as one window; ``held`` (n,): sign of each tube's motion before them. ``gravity``: (3,) m/s^2."""
     every = [np.array(values) for values in zip(*points, strict=True)]
     residual, position, quaternion, velocity, acceleration, alpha, alpha_rate, beta_rate = every
     size = np.hypot.reduce(alpha_rate, axis=1) + 100.0 * np.hypot.reduce(beta_rate, axis=1)
@@ -78,7 +80,7 @@ def motion_window(points: Sequence[MotionPoint], held: Floats) -> MotionWindow:
         sign[:] = held = np.where(np.abs(rate) > MOVING, np.sign(rate), held)
     return MotionWindow(
         residual, position, velocity, acceleration, alpha, alpha_rate, beta_rate, np.array([matrix(q) for q in quaternion]),
-        size**2 / (size**2 + MOVING**2), signs,
+        size**2 / (size**2 + MOVING**2), signs, gravity,
     )  # fmt: skip
 
 
@@ -92,6 +94,19 @@ def _turn(c: MotionWindow, sizes: Floats) -> Floats:
     """Columns for turns by ``sizes`` (k, m) rad about the base's axis."""
     per_rad = np.stack([-c.position[:, 1], c.position[:, 0], np.zeros(len(c.position))], axis=1)
     return per_rad[:, :, None] * sizes[:, None, :]
+
+
+def _across_base(c: MotionWindow) -> Floats:
+    """Direction (3, 1) of gravity across the base's axis, in which a robot sags; none, (3, 0), where gravity is along it."""
+    across = c.gravity * [1.0, 1.0, 0.0]
+    size = float(np.linalg.norm(across))
+    return across[:, None] / size if size > UPRIGHT * float(np.linalg.norm(c.gravity)) else np.zeros((3, 0))
+
+
+def _turned_gravity(c: MotionWindow) -> Floats:
+    """Directions (3, m) across gravity and the base's axis, in which a tip moves when gravity turns."""
+    sag = _across_base(c)
+    return np.cross(sag[:, 0], [0.0, 0.0, 1.0])[:, None] if sag.shape[1] else np.eye(3)[:, :2]
 
 
 def _swinging(c: MotionWindow) -> Floats:
@@ -130,7 +145,7 @@ SENSITIVITIES: tuple[Sensitivity, ...] = (
     Sensitivity("tracker_averaging", lambda c: c.acceleration[:, :, None], "along the tip's acceleration"),
     Sensitivity("registration_translation", lambda c: _always(c, np.eye(3)), "constant"),
     Sensitivity("tip_force", lambda c: _always(c, np.eye(3)[:, :2]), "constant, across the base's axis"),
-    Sensitivity("gravity_direction", lambda c: _always(c, np.eye(3)[:, [0]]), "constant, across gravity"),
+    Sensitivity("gravity_direction", lambda c: _always(c, _turned_gravity(c)), "constant, across gravity"),
     Sensitivity("registration_rotation", _cross, "turn about the base"),
     Sensitivity("tracker_scale", lambda c: c.position[:, :, None], "grows with the distance from the base"),
     Sensitivity("tracker_lever_arm", lambda c: c.frame, "constant in the tip's frame"),
@@ -138,14 +153,14 @@ SENSITIVITIES: tuple[Sensitivity, ...] = (
     Sensitivity(
         "youngs_modulus",
         lambda c: np.concatenate(
-            [(c.position * [1.0, 1.0, 0.0])[:, :, None], _always(c, [[0.0], [1.0], [0.0]]), _swinging(c)],
+            [(c.position * [1.0, 1.0, 0.0])[:, :, None], _always(c, _across_base(c)), _swinging(c)],
             axis=2,
         ),
         "along the deflection from the base's axis, sag, and the lag of a swing",
     ),
     Sensitivity(
         "payload_mass",
-        lambda c: np.concatenate([(c.acceleration + [0.0, GRAVITY, 0.0])[:, :, None], _swinging(c)], axis=2),
+        lambda c: np.concatenate([(c.acceleration - c.gravity)[:, :, None], _swinging(c)], axis=2),
         "along gravity and the tip's acceleration together, and the lag of a swing",
     ),
     Sensitivity(
@@ -197,13 +212,14 @@ class CauseRegression:
     Args:
         memory: s, over which old residuals decay.
         noise: standard deviation of the tracker's position, m per axis.
+        gravity: (3,) m/s^2, ``ctr_base``.
 
     Attributes:
         seconds, count: weighted length of the motion in the sums, and number of its points.
     """
 
-    def __init__(self, memory: float, noise: float) -> None:
-        self.memory, self.noise = memory, noise
+    def __init__(self, memory: float, noise: float, gravity: ArrayLike) -> None:
+        self.memory, self.noise, self.gravity = memory, noise, np.asarray(gravity, float)
         self.options = RegressionOptions()
         self.clear()
 
@@ -231,7 +247,8 @@ class CauseRegression:
         if not waiting:
             return
         times = np.array([time for time, _ in waiting])
-        c = motion_window([point for _, point in waiting], np.zeros(1) if self._held is None else self._held)
+        held = np.zeros(1) if self._held is None else self._held
+        c = motion_window([point for _, point in waiting], held, self.gravity)
         self._held = c.held[-1]
         blocks = [s.columns(c) for s in SENSITIVITIES]
         X, y = np.concatenate(blocks, axis=2), c.residual

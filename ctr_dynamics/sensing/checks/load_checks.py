@@ -4,40 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from itertools import pairwise
-from typing import TYPE_CHECKING, NamedTuple
 
 from ctr_dynamics.io.messages.topics import accepts_frame
+from ctr_dynamics.robot import Cantilever, Robot, cantilever
 from ctr_dynamics.sensing.checks.check_limits import CheckOptions
 from ctr_dynamics.sensing.checks.verdicts import ACCEPT, Findings, Kind, Verdict
-
-if TYPE_CHECKING:
-    from ctr_dynamics.robot import Robot
-
-
-class TipCompliance(NamedTuple):
-    """Turn of the tip by a load on it, linear beam theory: rad/N of a force across the robot, rad/(N m) of a moment; and its length, m."""
-
-    force: float
-    moment: float
-    length: float
-
-
-def tip_compliance(robot: Robot, translations: Sequence[float]) -> TipCompliance:
-    """Compliance of the straight robot with its tubes at ``translations``: (N,) m.
-
-    A cantilever of piecewise constant stiffness: the tip turns by the integral of moment over E I along the exposed length; all tubes that
-    are there share the moment.
-    """
-    ends = [max(tube.length + beta, 0.0) for tube, beta in zip(robot.tubes, translations, strict=True)]
-    stiffness = [tube.bending_stiffness for tube in robot.tubes]
-    length = max(ends)
-    force = moment = 0.0
-    for start, end in pairwise(sorted({0.0, *ends})):
-        bending = sum(k for k, reach in zip(stiffness, ends, strict=True) if reach >= end)
-        force += 0.5 * ((length - start) ** 2 - (length - end) ** 2) / bending
-        moment += (end - start) / bending
-    return TipCompliance(force, moment, length)
 
 
 class LoadChecks:
@@ -51,7 +22,7 @@ class LoadChecks:
         self.robot, self.options = robot, options or CheckOptions()
         self.limits = self.options.limits
         self.findings = Findings("load")
-        self._compliance: TipCompliance | None = None
+        self._cantilever: Cantilever | None = None
         if robot is not None:
             self.follow_translations(robot.rest.beta.value)
         self.forget()
@@ -63,7 +34,7 @@ class LoadChecks:
     def follow_translations(self, translations: Sequence[float]) -> None:
         """Tell where the tubes are: (N,) m."""
         if self.robot is not None:
-            self._compliance = tip_compliance(self.robot, translations)
+            self._cantilever = cantilever(self.robot, translations)
 
     def check(
         self,
@@ -99,11 +70,11 @@ class LoadChecks:
 
     def _beyond_reason(self, at: int, size: float, moment: float) -> Verdict | None:
         """A load that would bend the robot beyond anything it bears."""
-        limits, compliance = self.limits, self._compliance
+        limits, beam = self.limits, self._cantilever
         force_limit, moment_limit = limits.force, math.inf
-        if compliance is not None:
-            force_limit = min(force_limit, limits.bending_rad / compliance.force)
-            moment_limit = min(limits.bending_rad / compliance.moment, limits.force * compliance.length)
+        if beam is not None:
+            force_limit = min(force_limit, limits.bending_rad / beam.turn)
+            moment_limit = min(limits.bending_rad / beam.turn_by_moment, limits.force * beam.length)
         if size <= force_limit and moment <= moment_limit:
             return None
         wrong, limit, unit = (size, force_limit, "N") if size > force_limit else (moment, moment_limit, "N m")
