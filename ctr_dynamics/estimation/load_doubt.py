@@ -1,7 +1,7 @@
 """A known load that has jumped and that nothing confirms: a sensor that sends nonsense bends the model, not the robot.
 
 From the jump on, a second open-loop run goes on without it. Measurements tell which of the two runs the robot follows, by their likelihoods. Until
-they do, two published deviations reach from one run to the other. A load that the robot does not follow is left out from the jump on.
+they do, two and a half published deviations reach from one run to the other. A load that the robot does not follow is left out from the jump on.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from ctr_dynamics.model.simulator import Inputs
 from ctr_dynamics.sensing import TrackerModel
 
 Floats = NDArray[np.float64]
-REACHED = 2.0  # published deviations, from one run to the other; three are the promise
+REACHED = 2.5  # published deviations, from one run to the other; three are the promise
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,8 @@ class LoadDoubtOptions:
     Attributes:
         least: by the tracker's noise; a load that moves the resting tip by less is within what is published anyway.
         relative_error: of the model in the movement by a load: payloads and stiffnesses of a file that is not calibrated.
-        prior: probability that a load that jumps is wrong. believed: probability from which on it is confirmed, or left out.
+        prior: probability that a load that jumps is wrong. believed: probability from which on it is left out.
+        confirmed: odds of the measurements for it, from which on it is in doubt no more; strong evidence after Jeffreys (1961).
         followed: mean square of what remains of the measurements without the load, in its deviations, up to which the robot does not bear it.
         longest_s: s, by which a tracker may be late. For so long a robot that bears the load may seem to stand still.
         expires_s: s after the last jump, from which on the load is taken as it is said.
@@ -41,6 +42,7 @@ class LoadDoubtOptions:
     relative_error: float = 0.3
     prior: float = 0.01
     believed: float = 0.99
+    confirmed: float = 10.0
     followed: float = 2.0
     longest_s: float = 0.3
     expires_s: float = 1.0
@@ -138,7 +140,7 @@ class LoadDoubt:
             self.clear()
 
     def inflate(self, covariance: Floats, mean: Floats) -> float:
-        """Have two deviations reach to the run without the load, which is (13,) ``mean`` of the tip with it; returns how far that is, m.
+        """Have two and a half deviations reach to the run without the load, which is (13,) ``mean`` of the tip with it; returns how far that is, m.
 
         ``covariance`` (12, 12) of the tip is changed in place.
         """
@@ -154,7 +156,7 @@ class LoadDoubt:
     def take(
         self, stamp_ns: int, own_s: float, residual: Floats, position: Floats, tracker: TrackerModel
     ) -> None:
-        """A measurement.
+        """A measurement; one that confirms the load ends the doubt.
 
         Args:
             stamp_ns: of its header. own_s: its own time, s.
@@ -175,6 +177,8 @@ class LoadDoubt:
         remains = with_load + moved
         by_none = float(remains @ remains) / square
         self._taken[stamp_ns] = 0.5 * (by_none - by_load), by_none
+        if self._right > math.log(options.confirmed):
+            self.clear()
 
     @property
     def _right(self) -> float:
@@ -193,14 +197,14 @@ class LoadDoubt:
         return math.log(self.options.believed / (1.0 - self.options.believed))
 
     def wrong(self, stamp_ns: int) -> bool:
-        """Whether the load is wrong by what is known up to ``stamp_ns``; a load that is right is in doubt no more.
+        """Whether the load is wrong by what is known up to ``stamp_ns``; one on which nothing is decided for long is in doubt no more.
 
         A robot that bears the load may not show it yet, as its tracker may be late. One that stands still for longer does not bear it.
         """
         if self.begin_ns is None:
             return False
         options, right = self.options, self._right
-        if right > self._sure or stamp_ns - self._jump_ns > options.expires_s * 1e9:
+        if stamp_ns - self._jump_ns > options.expires_s * 1e9:
             self.clear()
             return False
         shown = stamp_ns - self.begin_ns > options.longest_s * 1e9

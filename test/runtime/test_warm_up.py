@@ -31,6 +31,7 @@ def test_both_runs_step_together_and_each_by_itself(monkeypatch, name, policy):
     settings = Settings({"robot": name, "output.policy": policy})
     assert warm_up(load_robot(name), settings) > 100
     assert sum(result is not None for _, result in taken[CollocationPair]) > 100
-    assert len({id(simulator) for simulator, _ in taken[Simulator]}) == 2
+    both_and_that_without_a_load_in_doubt = 3
+    assert len({id(simulator) for simulator, _ in taken[Simulator]}) == both_and_that_without_a_load_in_doubt
     assert all(result.ok for _, result in taken[Simulator])
     assert [result.ok for result in rescued[-2:]] == [True, True]
