@@ -7,6 +7,7 @@ they do, two and a half published deviations reach from one run to the other. A 
 from __future__ import annotations
 
 import math
+from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,6 +22,7 @@ from ctr_dynamics.model.simulator import Inputs
 from ctr_dynamics.sensing import TrackerModel
 
 Floats = NDArray[np.float64]
+SEEN = 400  # measurements: those of as long as a load may come late
 REACHED = 2.5  # published deviations, from one run to the other; three are the promise
 
 
@@ -95,7 +97,10 @@ class LoadDoubt:
             modes,
             noise,
         )
-        self._before = np.zeros(3)  # m, the last measurement before the jump from the open-loop run
+        self._seen: deque[tuple[float, Floats]] = deque(
+            maxlen=SEEN
+        )  # own time (ns) of the last measurements, and m from the open-loop run
+        self._before = np.zeros(3)  # the last of them before the jump
         self.clear()
 
     def clear(self) -> None:
@@ -115,6 +120,8 @@ class LoadDoubt:
             self.clear()
             self.begin_ns = change.begin_ns
             self._held.held = self._inputs.load.at(change.begin_ns)[0]
+            before = [residual for own_ns, residual in self._seen if own_ns <= change.begin_ns]
+            self._before = before[-1] if before else np.zeros(3)
         self._jump_ns = change.end_ns
 
     # -- the run without the load --
@@ -164,8 +171,10 @@ class LoadDoubt:
             tracker: as the filter counts on it.
         """
         begin_ns, options = self.begin_ns, self.options
-        if begin_ns is None or self._inputs.timeline.stamp(0) + own_s * 1e9 <= begin_ns:
-            self._before = residual
+        own_ns = self._inputs.timeline.stamp(0) + own_s * 1e9
+        if begin_ns is None:
+            self._seen.append((own_ns, residual))
+        if begin_ns is None or own_ns <= begin_ns:
             return
         found = self._without.observed(tracker, own_s) if self._k is not None else None
         if found is None:
