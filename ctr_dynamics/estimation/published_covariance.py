@@ -65,7 +65,9 @@ class PublishedCovariance:
         self._twist_error.inflate(tip, stamp, runs.open_loop.tips.last, fused.ekf, periods_s, modes)
         if (apart := settling.unseen(stamp)) is not None:
             self.unseen_vibration.inflate(covariance, apart)
-        alive = inputs.health.tracker_alive  # else nothing will tell
+        told = (
+            inputs.health.fusing and inputs.health.tracker_alive
+        )  # else nothing tells whether a load is right
         mean = runs.open_loop.tips.last.mean
-        self.by_load_m = runs.load_doubt.inflate(covariance, mean) if alive else 0.0
+        self.by_load_m = runs.load_doubt.inflate(covariance, mean) if told else 0.0
         self.driven_m = inputs.actuator_error.inflate(covariance, tip.position, self._length, stamp, lag_ns)

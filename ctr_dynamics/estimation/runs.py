@@ -171,7 +171,7 @@ class Runs:
         """Stamp (ns) from which on the known load is left out, as the tracker shows that the robot does not bear it; None where it is not."""
         doubt, taken_ns = self.load_doubt, self._inputs.timeline.taken_ns
         begin_ns = doubt.begin_ns
-        if begin_ns is None or taken_ns is None or not doubt.wrong(taken_ns):
+        if begin_ns is None or taken_ns is None or not doubt.wrong(taken_ns) or not self._health.fusing:
             return None
         doubt.clear()
         self._inputs.leave_load_out(begin_ns)
