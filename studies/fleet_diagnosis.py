@@ -41,6 +41,8 @@ from ctr_dynamics.robot_files import robot_from_dict, robot_to_dict
 from ctr_dynamics.simulation.scenario import Load, Scenario
 from studies.diagnosis_study import (
     fraction,
+    hidden_effects,
+    in_set,
     interval_hits,
     is_sure,
     likeliest_is_right,
@@ -172,7 +174,7 @@ def table(rows: list[dict[str, Any]]) -> str:
         return {
             "clean: called clean": fraction(r["verdict"] == "clean" for r in by["clean"]),
             "clear singles: likeliest is right": fraction(
-                truth_of(r) == r["probabilities"][0]["effects"] for r in clear
+                hidden_effects(r) == r["probabilities"][0]["effects"] for r in clear
             ),
             "in the set of 95 %": fraction(in_set(r) for r in clear),
             "all singles in the set": fraction(in_set(r) for r in by["single"]),
@@ -195,16 +197,6 @@ def table(rows: list[dict[str, Any]]) -> str:
             lines += ["| robot | " + " | ".join(found) + " |", "|" + "---|" * (len(found) + 1)]
         lines.append(f"| {robot} | " + " | ".join(found.values()) + " |")
     return "\n".join(lines)
-
-
-def truth_of(row: dict[str, Any]) -> list[str]:
-    """IDs of what was hidden."""
-    return sorted(h["effect"] for h in row["hidden"])
-
-
-def in_set(row: dict[str, Any]) -> bool:
-    """Whether what was hidden is among the listed sets of causes."""
-    return truth_of(row) in [sorted(s) for s in row["cause_set95"]]
 
 
 def is_unknown(row: dict[str, Any]) -> bool:
@@ -247,7 +239,7 @@ def main() -> None:
                     rows.append(row)
                     with options.output.open("a") as stream:
                         stream.write(json.dumps(row) + "\n")
-                    print(f"{robot} {'lab' if lab else 'file'} {stratum} {number}: {truth_of(row)} -> {row['verdict']} "
+                    print(f"{robot} {'lab' if lab else 'file'} {stratum} {number}: {hidden_effects(row)} -> {row['verdict']} "
                           f"{named_effects(row)}, {row['cpu_s']:.0f} s", flush=True)  # fmt: skip
     if rows:
         print(table(rows))

@@ -122,7 +122,7 @@ class FusedRun:
             given = time_s, position, quaternion, measurement.stamp_error_s
             motion, residual = self.residuals(time_s, position, quaternion, open_loop)
             if motion is not None:
-                own_s = time_s - tracker.delay - self.ekf.expected.delay
+                own_s = self._own_time(time_s)
                 load_doubt.take(measurement.stamp_ns, own_s, motion.residual, motion.position, tracker)
             not_fused = self.alternatives.not_fused or (DOUBTED_LOAD if load_doubt.seems_wrong else "")
             if self._inputs.missing_at(time_s - self.ekf.expected.age):
@@ -157,12 +157,16 @@ class FusedRun:
         self._health.force_sigma = self.ekf.adapted.sigma
         self._health.shift_m, self._health.noise_ratio = self.ekf.tracker_fault()
 
+    def _own_time(self, time_s: float) -> float:
+        """When a measurement of the stamp ``time_s`` (s) was taken, by the delay that the filter counts on, s."""
+        return time_s - self.ekf.tracker.delay - self.ekf.expected.delay
+
     def residuals(
         self, time_s: float, position: Floats, quaternion: Floats, open_loop: OpenLoopRun
     ) -> tuple[MotionPoint | None, Floats | None]:
         """How far a measurement lies from both runs, before its update: the open-loop run there, and the residual (3,) m of the fused tip."""
         tracker, inputs, n = self.ekf.tracker, self._inputs, self.ekf.model.n
-        own_s = time_s - tracker.delay - self.ekf.expected.delay
+        own_s = self._own_time(time_s)
         fused = tracker.observed_tip(lambda s: self.ekf.tips.at(s, DT, columns=False), own_s)
         found = open_loop.observed(tracker, own_s)
         if fused is None or found is None:

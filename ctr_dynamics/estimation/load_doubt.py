@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from ctr_dynamics.estimation.discretisation import VibrationErrors
 from ctr_dynamics.estimation.inputs.input_buffer import InputBuffer, LoadChange
 from ctr_dynamics.estimation.inputs.run_inputs import InterpolatedInputs, RunInputs
+from ctr_dynamics.estimation.monitoring.delay_search import DelaySearchOptions
 from ctr_dynamics.estimation.open_loop import OpenLoopRun
 from ctr_dynamics.estimation.timeline import seconds
 from ctr_dynamics.model.simulator import Inputs
@@ -46,7 +47,7 @@ class LoadDoubtOptions:
     believed: float = 0.99
     confirmed: float = 10.0
     followed: float = 2.0
-    longest_s: float = 0.3
+    longest_s: float = DelaySearchOptions.longest_s
     expires_s: float = 1.0
 
 
@@ -65,9 +66,8 @@ class HeldLoad(RunInputs):
         """Inputs at all stages of a step."""
         rows, inputs = super().stages(times)
         wrench = slice(3 * self.interpolated.n, 3 * self.interpolated.n + 6)
-        rows[:, wrench] = (
-            self.load[wrench] + self.held
-        )  # those at the last stage are the wrench of ``inputs``
+        # those at the last stage are the wrench of ``inputs``, too
+        rows[:, wrench] = self.load[wrench] + self.held
         return rows, inputs
 
 
@@ -90,17 +90,11 @@ class LoadDoubt:
         options: LoadDoubtOptions | None = None,
     ) -> None:  # fmt: skip
         self.options = options or LoadDoubtOptions()
-        self._without, self._held, self._inputs, self._modes, self._noise = (
-            without,
-            held,
-            inputs,
-            modes,
-            noise,
-        )
-        self._seen: deque[tuple[float, Floats]] = deque(
-            maxlen=SEEN
-        )  # own time (ns) of the last measurements, and m from the open-loop run
-        self._before = np.zeros(3)  # the last of them before the jump
+        self._without, self._held, self._inputs = without, held, inputs
+        self._modes, self._noise = modes, noise
+        # own times (ns) of the last measurements, and how far they lay from the open-loop run (3,) m; the last one before the jump
+        self._seen: deque[tuple[float, Floats]] = deque(maxlen=SEEN)
+        self._before = np.zeros(3)
         self.clear()
 
     def clear(self) -> None:
@@ -108,9 +102,8 @@ class LoadDoubt:
         self.begin_ns: int | None = None
         self._jump_ns = 0  # of the last jump
         self._k: int | None = None  # the last step of the run without the load; None before its first
-        self._taken: dict[
-            int, tuple[float, float]
-        ] = {}  # by stamp: log likelihood ratio, and square without the load
+        # by stamp (ns): log likelihood ratio of the load to none, and the square without it
+        self._taken: dict[int, tuple[float, float]] = {}
 
     def load_changed(self, change: LoadChange) -> None:
         """The known load has changed; a jump that moves the tip is in doubt."""

@@ -92,10 +92,9 @@ class StateHistory:
             self.checkpoints.pop()  # the filter has been reinitialised or reduced since
         self.checkpoints.append(self.checkpoint(k))
         oldest = k - self._inputs.window_ns // STEP_NS
-        if (
-            self._runs.load_doubt.begin_ns is not None
-        ):  # what comes after may have to be taken again without the load
-            oldest = min(oldest, (self._runs.load_doubt.begin_ns - self._inputs.timeline.stamp(0)) // STEP_NS)
+        doubted_ns = self._runs.load_doubt.begin_ns
+        if doubted_ns is not None:  # what comes after may have to be taken again without the load
+            oldest = min(oldest, (doubted_ns - self._inputs.timeline.stamp(0)) // STEP_NS)
         oldest -= self._every + 1
         # while joints are missing, the last checkpoint that they cover stays: what comes after is taken again when they come back
         covered = self._inputs.covered_step(k)

@@ -65,9 +65,8 @@ class PublishedCovariance:
         self._twist_error.inflate(tip, stamp, runs.open_loop.tips.last, fused.ekf, periods_s, modes)
         if (apart := settling.unseen(stamp)) is not None:
             self.unseen_vibration.inflate(covariance, apart)
-        told = (
-            inputs.health.fusing and inputs.health.tracker_alive
-        )  # else nothing tells whether a load is right
+        # without measurements nothing tells whether a load is right
+        told = inputs.health.fusing and inputs.health.tracker_alive
         mean = runs.open_loop.tips.last.mean
         self.by_load_m = runs.load_doubt.inflate(covariance, mean) if told else 0.0
         self.driven_m = inputs.actuator_error.inflate(covariance, tip.position, self._length, stamp, lag_ns)

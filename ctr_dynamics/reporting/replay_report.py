@@ -82,7 +82,7 @@ class ReplayLog:
             if not whole:
                 t = float(self.tracker.observed_times(np.array(stamp)))
                 q = self.turned[min(int(np.searchsorted(self.t, t)), len(self.t) - 1)]
-            if np.isfinite(q).all() and np.isfinite(pose.position).all() and is_unit(norm(q)):
+            if np.isfinite(pose.position).all() and is_unit(norm(q)):
                 time, point, _ = self.tracker.inverse(stamp, np.array(pose.position), q, q)
                 times.append(time)
                 points.append(point)

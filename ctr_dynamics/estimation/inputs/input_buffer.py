@@ -28,9 +28,9 @@ from ctr_dynamics.sensing.interpolation import Signal
 
 Floats = NDArray[np.float64]
 LOAD_GRACE_NS = 100_000_000  # a first load that comes this soon after the joints is there from the start: nodes start one after another
-
-
 RETURNED = 0.1  # of a jump, within which a load has returned
+
+
 LONGEST_BRIDGE = 1000  # steps that are taken again where joints come back after a gap
 
 
@@ -101,9 +101,8 @@ class InputBuffer:
         self._opening: int | None = None  # ns of the value without load that was put before the first load
         self.measurements.clear()
         self.backwards = 0
-        self._left_out: tuple[Floats, float] | None = (
-            None  # load that holds instead, and the size of the wrong jump from it
-        )
+        # the load that holds instead of those that are left out, and the size of their jump from it
+        self._left_out: tuple[Floats, float] | None = None
         self.gap: JointGap | None = None
         self._after_gap: KnownActuators | None = None
         self._gaps: deque[tuple[int, int]] = deque(maxlen=20)  # the last ones, ns
@@ -283,10 +282,8 @@ class InputBuffer:
     def leave_load_out(self, from_ns: int) -> None:
         """Have the known load stay as it was at ``from_ns``: what came then contradicts the tracker. It counts again once it returns there."""
         load = self.load
-        held, wrong = (
-            load.at(from_ns)[0],
-            [v for s, v in zip(load.stamps, load.values, strict=True) if s > from_ns],
-        )
+        held = load.at(from_ns)[0]
+        wrong = [value for stamp, value in zip(load.stamps, load.values, strict=True) if stamp > from_ns]
         while len(load.stamps) > 1 and load.stamps[-1] > from_ns:
             del load.stamps[-1], load.values[-1]
         jump = max(float(np.linalg.norm(value - held)) for value in wrong)

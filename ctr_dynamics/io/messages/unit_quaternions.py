@@ -17,5 +17,5 @@ def norm(quaternion: Iterable[float]) -> float:
 
 
 def is_unit(size: float, within: float = MEASURED_WITHIN) -> bool:
-    """Whether a quaternion of that norm is a unit quaternion but for rounding."""
+    """Whether a quaternion of that norm is a unit quaternion but for rounding; not where the norm is nan or infinite."""
     return abs(size - 1.0) <= within

@@ -26,9 +26,8 @@ RHYTHM_FROM = 10  # steps from which the shortest usual one is first taken
 RHYTHM_STEP = (
     0.0025  # of itself, by which a longer step raises it; a shorter one lowers it by four times as much
 )
-WALL_NS = (
-    100_000_000 * 1_000_000_000
-)  # later times (1973) are of a wall clock, and no simulation has run for so long
+# later times (1973) are of a wall clock, and no simulation has run for so long
+WALL_NS = 100_000_000 * 1_000_000_000
 LOOK_EVERY = 4  # messages between two looks at the window
 Mode = Literal["", "bursts", "grid", "unusable"]
 
@@ -130,10 +129,8 @@ class StampChecks:
         """
         at = stamp_ns if arrival_ns is None else arrival_ns
         if stamp_ns == 0:
-            if (
-                self._taken or zero_is_wrong or self._zero_held
-            ):  # a simulation's clock may begin at zero, once
-                return self._zero(at)
+            if self._taken or zero_is_wrong or self._zero_held:
+                return self._zero(at)  # a simulation's clock may begin at zero, once
             if hold_zero and arrival_ns is not None and arrival_ns > WALL_NS:
                 self._zero_held = True
                 return Verdict("drop", Kind.STAMP_ZERO, self._zero_text)
