@@ -1,4 +1,5 @@
-"""What is not known of the actuators that a step was driven by: they are extrapolated, or were and the step is not corrected yet."""
+"""What is not known of the actuators that a step was driven by: they lie between joint states, are extrapolated, or were and the step is not corrected
+yet."""
 
 from __future__ import annotations
 
@@ -18,6 +19,8 @@ SMOOTHED_NS, INTERVALS = (
     40_000_000,
     4,
 )  # accelerations are looked for in the last 0.16 s; encoder noise is small in rates over 40 ms
+
+COARSE_NS = 20_000_000  # of joint states this close, a line between them errs by no more than an encoder: 50 urad at 1 rad/s^2
 
 
 def largest_acceleration(stamps: Sequence[int], values: Sequence[Floats]) -> Floats:
@@ -63,14 +66,20 @@ class ActuatorError:
         self._uncorrected[:] = 0.0
 
     def at(self, time_ns: int) -> Floats:
-        """Of the step to that time: by the accelerations that the actuators have had of late, and by what is not corrected."""
-        stamps, values = self._joints.stamps, self._joints.values
-        age = (time_ns - stamps[-1]) * 1e-9
-        if age <= 0.0:
+        """Of the step to that time: by the accelerations that the actuators have had of late, and by what is not corrected.
+
+        Actuators are taken to go on a straight line between joint states, and on that of the last two after them.
+        """
+        stamps = self._joints.stamps
+        i = min(max(bisect.bisect_left(stamps, time_ns), 1), len(stamps) - 1)
+        if i < 1:
+            return self._uncorrected
+        since, before = (time_ns - stamps[i]) * 1e-9, (time_ns - stamps[i - 1]) * 1e-9
+        if since <= 0.0 and stamps[i] - stamps[i - 1] < COARSE_NS:
             return self._uncorrected
         if self._accelerations is None or self._accelerations[0] != stamps[-1]:
-            self._accelerations = stamps[-1], largest_acceleration(stamps, values)
-        return np.hypot((0.5 * age**2) * self._accelerations[1], self._uncorrected)
+            self._accelerations = stamps[-1], largest_acceleration(stamps, self._joints.values)
+        return np.hypot((0.5 * abs(since * before)) * self._accelerations[1], self._uncorrected)
 
     def inflate(
         self, covariance: Floats, position: Floats, length: float, time_ns: int, open_ns: int
@@ -86,6 +95,7 @@ class ActuatorError:
             time_ns: of the step. open_ns: how long its input has been without correction.
         """
         error, joints = self.at(time_ns), self._joints
-        duration = max(time_ns - joints.stamps[-1], open_ns) * 1e-9
+        interval = joints.stamps[-1] - joints.stamps[-2] if len(joints.stamps) > 1 else 0
+        duration = max(time_ns - joints.stamps[-1], interval, open_ns) * 1e-9
         moved = add_actuator_error(error, length, joints.values[-1], position, duration, covariance)
         return math.sqrt(3.0 * moved)
