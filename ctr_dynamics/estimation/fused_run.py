@@ -136,7 +136,7 @@ class FusedRun:
             if motion is not None and residual is not None:
                 seen = motion.position + motion.residual
                 self.disagreement.add(measurement.stamp_ns, seen, motion.position, residual)
-            if motion is not None and update.predictive is not None:
+            if motion is not None and update.predictive is not None and not load_doubt.pending:
                 self._apart = motion.residual
                 tips = open_loop.tips.positions()
                 compared = Compared(

@@ -24,6 +24,7 @@ from ctr_dynamics.sensing import TrackerModel
 
 Floats = NDArray[np.float64]
 SEEN = 400  # measurements: those of as long as a load may come late
+AXES = 3  # of a position
 REACHED = 2.5  # published deviations, from one run to the other; three are the promise
 
 
@@ -36,7 +37,8 @@ class LoadDoubtOptions:
         relative_error: of the model in the movement by a load: payloads and stiffnesses of a file that is not calibrated.
         prior: probability that a load that jumps is wrong. believed: probability from which on it is left out.
         confirmed: odds of the measurements for it, from which on it is in doubt no more; strong evidence after Jeffreys (1961).
-        followed: mean square of what remains of the measurements without the load, in its deviations, up to which the robot does not bear it.
+        followed: mean square of what remains of the measurements without the load, per axis and by its variance, up to which the robot does not
+            bear it. It is 1 where that is so, and 4 where the load moves the robot as far as the model says.
         longest_s: s, by which a tracker may be late. For so long a robot that bears the load may seem to stand still.
         expires_s: s after the last jump, from which on the load is taken as it is said.
     """
@@ -46,7 +48,7 @@ class LoadDoubtOptions:
     prior: float = 0.01
     believed: float = 0.99
     confirmed: float = 10.0
-    followed: float = 2.0
+    followed: float = 1.5
     longest_s: float = DelaySearchOptions.longest_s
     expires_s: float = 1.0
 
@@ -95,6 +97,7 @@ class LoadDoubt:
         # own times (ns) of the last measurements, and how far they lay from the open-loop run (3,) m; the last one before the jump
         self._seen: deque[tuple[float, Floats]] = deque(maxlen=SEEN)
         self._before = np.zeros(3)
+        self._variance = noise**2  # m^2 per axis, of a residual of the open-loop run before the jump
         self.clear()
 
     def clear(self) -> None:
@@ -115,6 +118,7 @@ class LoadDoubt:
             self._held.held = self._inputs.load.at(change.begin_ns)[0]
             before = [residual for own_ns, residual in self._seen if own_ns <= change.begin_ns]
             self._before = before[-1] if before else np.zeros(3)
+            self._variance = max(float(np.mean(np.var(before, axis=0))) if before else 0.0, self._noise**2)
         self._jump_ns = change.end_ns
 
     # -- the run without the load --
@@ -174,13 +178,18 @@ class LoadDoubt:
             return
         moved = position - found[0].position
         with_load = residual - self._before
-        square = 2.0 * self._noise**2 + options.relative_error**2 * float(moved @ moved)
+        square = 2.0 * self._variance + options.relative_error**2 * float(moved @ moved)
         by_load = float(with_load @ with_load) / square
         remains = with_load + moved
         by_none = float(remains @ remains) / square
         self._taken[stamp_ns] = 0.5 * (by_none - by_load), by_none
         if self._right > math.log(options.confirmed):
             self.clear()
+
+    @property
+    def pending(self) -> bool:
+        """Whether the known load is in doubt. What measurements tell of anything else meanwhile would be of a model that may be bent."""
+        return self.begin_ns is not None
 
     @property
     def _right(self) -> float:
@@ -191,7 +200,7 @@ class LoadDoubt:
     def seems_wrong(self) -> bool:
         """Whether the robot moves as without the load so far. Such measurements are not fused, and nothing else is concluded from them."""
         squares = [square for _, square in self._taken.values()]
-        return self._right < -self._sure and sum(squares) <= self.options.followed * len(squares)
+        return self._right < -self._sure and sum(squares) <= self.options.followed * AXES * len(squares)
 
     @property
     def _sure(self) -> float:

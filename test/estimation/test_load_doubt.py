@@ -42,6 +42,20 @@ def test_a_load_that_the_robot_does_not_bear_is_left_out(sweep, size_N, policy):
     assert not run.estimator.inputs.load.values[-1].any()
 
 
+@pytest.mark.parametrize("policy", ["wait", "predict"])
+def test_of_two_publishers_in_turn_the_one_that_the_robot_follows_counts(sweep, policy):
+    """One sends the load that is there, none, and the other one that is not."""
+    turns = [load(BEGIN_S + 0.05 * i, -0.1 * (i % 2)) for i in range(20)]
+    run = play([*sweep, *turns], {"output.policy": policy})
+    error, steps = truth_error(run, "clean_sweep", "p_trk")
+    after = run.t[steps] > BEGIN_S + 0.5
+    assert run.column("valid")[steps][after].all()
+    assert np.linalg.norm(error, axis=1)[after].max() < 1e-3
+    assert run.estimator.health.load["contradicted"].count > 5
+    assert not run.estimator.inputs.load.values[-1].any()
+    assert run.estimator.runs.fused.ekf.expected.delay == 0.0
+
+
 def test_a_load_counts_again_once_it_has_returned(sweep):
     run = play([*sweep, *wrong_load(1.0)])
     change = run.estimator.inputs.add_load(run.outputs[-1].stamp_ns, (0.0, -0.02, 0.0), NO_TORQUE, "")

@@ -1,5 +1,4 @@
-"""What is not known of the actuators that a step was driven by: they lie between joint states, are extrapolated, or were and the step is not corrected
-yet."""
+"""What is not known of the actuators that a step was driven by: between joint states, after them, or where the step is not corrected yet."""
 
 from __future__ import annotations
 

@@ -29,7 +29,7 @@ from ctr_dynamics.sensing.interpolation import Signal
 Floats = NDArray[np.float64]
 LOAD_GRACE_NS = 100_000_000  # a first load that comes this soon after the joints is there from the start: nodes start one after another
 RETURNED = 0.1  # of a jump, within which a load has returned
-
+QUIET_NS = 1_000_000_000  # a load that was wrong is trusted again when it has been back for so long: two publishers take turns
 
 LONGEST_BRIDGE = 1000  # steps that are taken again where joints come back after a gap
 
@@ -58,6 +58,23 @@ class LoadChange(NamedTuple):
     begin_ns: int
     end_ns: int
     difference: Floats
+
+
+class LeftOutLoad(NamedTuple):
+    """Loads that are left out: the one that ``held`` (6,) N, N m before them, the size of their ``jump`` from it, and the stamp (ns) since when they
+    are back at it, None where they are not."""
+
+    held: Floats
+    jump: float
+    back_ns: int | None
+
+    def after(self, stamp_ns: int, value: Floats) -> LeftOutLoad | None:
+        """With another load; None where loads have been back for long."""
+        if self.back_ns is not None and stamp_ns - self.back_ns > QUIET_NS:
+            return None
+        if float(np.linalg.norm(value - self.held)) > RETURNED * self.jump:
+            return self._replace(back_ns=None)
+        return self if self.back_ns is not None else self._replace(back_ns=stamp_ns)
 
 
 class InputBuffer:
@@ -101,8 +118,7 @@ class InputBuffer:
         self._opening: int | None = None  # ns of the value without load that was put before the first load
         self.measurements.clear()
         self.backwards = 0
-        # the load that holds instead of those that are left out, and the size of their jump from it
-        self._left_out: tuple[Floats, float] | None = None
+        self._left_out: LeftOutLoad | None = None
         self.gap: JointGap | None = None
         self._after_gap: KnownActuators | None = None
         self._gaps: deque[tuple[int, int]] = deque(maxlen=20)  # the last ones, ns
@@ -234,11 +250,10 @@ class InputBuffer:
         stamp_ns += self._load_delay_ns
         load, taken = self.load, self.timeline.taken_ns
         if self._left_out is not None:
-            held, jump = self._left_out
-            if float(np.linalg.norm(value - held)) > RETURNED * jump:
-                self.health.note("load", "contradicted", "")
-                return None
-            self._left_out = None
+            self._left_out = self._left_out.after(stamp_ns, value)
+        if self._left_out is not None and self._left_out.back_ns is None:
+            self.health.note("load", "contradicted", "")
+            return None
         if load.stamps and taken is not None and stamp_ns < min(load.stamps[-1], taken - self.window_ns):
             late = (taken - stamp_ns) * 1e-9
             self.health.note(
@@ -283,12 +298,12 @@ class InputBuffer:
         """Have the known load stay as it was at ``from_ns``: what came then contradicts the tracker. It counts again once it returns there."""
         load = self.load
         held = load.at(from_ns)[0]
-        wrong = [value for stamp, value in zip(load.stamps, load.values, strict=True) if stamp > from_ns]
+        after = [each for each in zip(load.stamps, load.values, strict=True) if each[0] > from_ns]
+        wrong = [value for _, value in after]
         while len(load.stamps) > 1 and load.stamps[-1] > from_ns:
             del load.stamps[-1], load.values[-1]
         jump = max(float(np.linalg.norm(value - held)) for value in wrong)
-        returned = float(np.linalg.norm(wrong[-1] - held)) <= RETURNED * jump
-        self._left_out = None if returned else (held, jump)
+        self._left_out = LeftOutLoad(held, jump, None).after(*after[-1])
         most, before = (max(math.hypot(*v[:3].tolist()) for v in values) for values in (wrong, [held]))
         self.health.note(
             "load",
