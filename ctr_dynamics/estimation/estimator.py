@@ -19,16 +19,13 @@ from numpy.typing import NDArray
 from ctr_dynamics.estimation.backbone import Backbone
 from ctr_dynamics.estimation.discretisation import discretise
 from ctr_dynamics.estimation.estimator_options import EstimatorOptions
-from ctr_dynamics.estimation.filter.covariance_factor import Vibrating
 from ctr_dynamics.estimation.filter.filter_records import TipEstimate
 from ctr_dynamics.estimation.inputs.input_buffer import InputBuffer
 from ctr_dynamics.estimation.inputs.measurement_queue import tracker_of
-from ctr_dynamics.estimation.inputs.unseen_load import UnseenLoad
 from ctr_dynamics.estimation.mode_tracker import ModeTracker
 from ctr_dynamics.estimation.monitoring.consistency_monitor import consistency_monitor
 from ctr_dynamics.estimation.monitoring.health import Health
 from ctr_dynamics.estimation.monitoring.innovation_log import InnovationLog
-from ctr_dynamics.estimation.monitoring.settling import Settling
 from ctr_dynamics.estimation.monitoring.statuses import all_statuses
 from ctr_dynamics.estimation.out_of_sequence import OutOfSequence
 from ctr_dynamics.estimation.published_covariance import PublishedCovariance
@@ -37,6 +34,7 @@ from ctr_dynamics.estimation.step_output import Innovation, SolverStats, StepOut
 from ctr_dynamics.estimation.step_schedule import StepSchedule
 from ctr_dynamics.estimation.timeline import seconds
 from ctr_dynamics.estimation.tip_jacobian import JacobianTracker
+from ctr_dynamics.estimation.unknown_motion import UnknownMotion
 from ctr_dynamics.io.messages.topics import STEP_NS
 from ctr_dynamics.model.model import Model
 from ctr_dynamics.model.simulator import StepResult
@@ -100,11 +98,11 @@ class Estimator:
         self.late = OutOfSequence(self.runs, self.inputs, self.health, self.innovations)
         self.step_times_s: array[float] | None = None
         self._backbone = Backbone(self.model, self.runs.fused.ekf)
+        self._motion = UnknownMotion(self.model, self.options, self.inputs, self.runs, self.late, modes)
         self._clear()
 
     def _clear(self) -> None:
-        noise = self.robot.tracker.noise.position.value
-        self._settling = Settling(noise, self.robot.encoders.noise.value)
+        self._motion.clear()
         self._no_start: tuple[int, str] | None = None  # step and reason of a start that found no equilibrium
         self._stability = StabilityWatch(self.model)
         self._stability_due = False
@@ -114,7 +112,6 @@ class Estimator:
         largest = self._largest_deviation
         unseen = self.options.unseen_fraction * largest
         self._covariance = PublishedCovariance(self.discretisation, self.robot, largest, unseen)
-        self._unseen_load = UnseenLoad(self.discretisation.vibration, noise)
 
     # -- inputs --
 
@@ -142,7 +139,7 @@ class Estimator:
             self.health.restarts += 1
         if from_ns is not None:
             self.late.changed(from_ns)
-        self._look_for_motion()
+        self._motion.look()
 
     def add_tracker_pose(
         self, stamp_ns: int, position: Sequence[float], quaternion_xyzw: Sequence[float], frame_id: str = "", stamp_error_s: float = 0.0,
@@ -175,7 +172,7 @@ class Estimator:
             self.runs.load_doubt.load_changed(change)
             self.late.load_changed(change.from_ns, change.jumped)
             self._covariance.load_changed(change)
-            self._unseen_load.look(self._settling, change=change)
+            self._motion.load_changed(change)
 
     # -- time --
 
@@ -299,12 +296,7 @@ class Estimator:
         if self.late.correct(spare_s):
             self._modes.clear()
             self._jacobian.clear()
-            self._watch_start(self.timeline.stamp(0))
-
-    def _watch_start(self, stamp: int) -> None:
-        """The model has started at rest at ``stamp`` (ns): joints and measurements tell whether the robot did."""
-        self._settling.start(stamp, self.inputs.joints.at(stamp)[0])
-        self._look_for_motion()
+            self._motion.watch_start(self.timeline.stamp(0))
 
     def _step(self, k: int, too_old: Callable[[int], str]) -> StepOutput:
         """Take step ``k`` and describe it."""
@@ -333,20 +325,12 @@ class Estimator:
     def _conclude(self) -> None:
         """Have the filter count on something else, if the measurements up to the last step show that it is right."""
         runs, late, stamp = self.runs, self.late, self.timeline.stamp(self.runs.k)
-        moves_as_modelled = not self._settling.lacks_vibration(stamp)
+        moves_as_modelled = not self._motion.settling.lacks_vibration(stamp)
         if late.lag <= late.options.reuse_lag and runs.conclude(moves_as_modelled):
-            vibrating = self._vibrating(runs.fused.alternatives.timing.lacking_m)
+            vibrating = self._motion.vibrations(self._modes, runs.fused.alternatives.timing.lacking_m)
             runs.fused.reinitialise(runs.open_loop, runs.k, vibrating)
             self.health.restarts += 1
             late.history.restart(runs.k)
-
-    def _vibrating(self, deviation: float) -> Vibrating | None:
-        """How the robot may vibrate about the open-loop run, which moves its tip by ``deviation`` (m); None where it is less than is measured."""
-        state = self.runs.open_loop.state
-        if state is None or deviation < self.robot.tracker.noise.position.value:
-            return None
-        deviation = min(deviation, self.options.vibrating_fraction * self._length)
-        return self._modes.vibrating(state, self.model.parameters, deviation)
 
     def _start(self, k: int) -> StepOutput:
         """Both runs at rest at step ``k``, unless there is no equilibrium."""
@@ -362,7 +346,7 @@ class Estimator:
         self.inputs.actuator_error.corrected()
         self._modes.clear()
         self._jacobian.clear()
-        self._watch_start(self.timeline.stamp(k))
+        self._motion.watch_start(self.timeline.stamp(k))
         return self._output(k, StepResult(True, "at rest", 0, 0, 0))
 
     # -- outputs --
@@ -376,11 +360,12 @@ class Estimator:
             self.health.restarts += 1
             return self._invalid(k, lost)
         innovations = self.innovations.take()
-        self._settling.take(innovations, fused.ekf.tracker_fault()[0] > 0.0)
         self.health.refutation = fused.ekf.refutation()
-        unsettled = self._settling.problem(stamp, fused.on_time)
-        if self._settling.begun:
-            return self._begin_vibrating(k, unsettled, innovations)
+        unsettled = self._motion.problem(stamp, innovations)
+        if self._motion.settling.begun:
+            self._motion.begin_again(k, self._modes, apart=self._largest_deviation)
+            self.health.restarts += 1
+            return self._invalid(k, unsettled, innovations)
         confirmed = fused.agreed or bool(unsettled) or not self.health.fusing
         self._covariance.take(innovations, fused.ekf.refuted, confirmed)
         if unsettled:  # measurements tell nothing of the model's error either
@@ -424,26 +409,13 @@ class Estimator:
         self.health.tracker_age_s = max(0.0, (stamp - since) * 1e-9)
         modes = self._modes.measure(state, k)
         lag_ns = self.late.lag * STEP_NS
-        self._covariance.inflate(tip, stamp, self.runs, self.inputs, self._settling, modes, lag_ns)
+        self._covariance.inflate(tip, stamp, self.runs, self.inputs, self._motion.settling, modes, lag_ns)
         problem = self.health.problem = self._problem(stamp, tip.position_deviation, unsettled)
         return StepOutput(
             stamp, k, not problem, problem, tip.position, tip.quaternion, tip.covariance[:6, :6], tip.twist, tip.covariance[6:, 6:],
             predicted[:3], predicted[3:], self._backbone.rows(shown), modes, fused.ekf.force, tip.force_sigma, innovations, solver,
             state.inputs.beta.tolist(), self._jacobian.measure(state),
         )  # fmt: skip
-
-    def _begin_vibrating(self, k: int, reason: str, innovations: Sequence[Innovation]) -> StepOutput:
-        """Begin again at step ``k`` from the open-loop run, about which the robot may vibrate in a way that is not known."""
-        open_loop, fused, settling, vibrating = self.runs.open_loop, self.runs.fused, self._settling, None
-        settling.begun = False
-        if settling.vibrates:
-            vibrating = self._vibrating(max(self._largest_deviation, settling.apart))
-        fused.reinitialise(open_loop, k, vibrating)
-        self.health.restarts += 1
-        fused.alternatives.starts_in_motion(self.discretisation.vibration)
-        self.late.repeated = k, lambda: fused.reinitialise(open_loop, k, vibrating)
-        self.late.history.record(k, always=True)
-        return self._invalid(k, reason, innovations)
 
     def _invalid(self, k: int, reason: str, taken: Sequence[Innovation] = ()) -> StepOutput:
         self.health.problem = reason
@@ -462,18 +434,6 @@ class Estimator:
             return unsettled
         deviations = self._covariance.deviations(deviation)
         return deviations.problem(self.health, self.runs.fused.alternatives.late_by_m)
-
-    def _look_for_motion(self) -> None:
-        """Have outputs wait after a gap of the joints, or after a start, in which the robot moved."""
-        gap, settling = self.inputs.gap, self._settling
-        if gap is not None:
-            self.inputs.gap = None
-            if self.runs.running:
-                self._unseen_load.look(settling, gap=gap)
-                if settling.moved(gap.change.tolist()):
-                    settling.begin(gap.until_ns, f"{gap.words} while the robot moved", vibrating=False)
-        if self.inputs.joints.stamps:
-            settling.watch(self.inputs.joints.stamps[-1], self.inputs.joints.values[-1])
 
     # -- reports --
 
