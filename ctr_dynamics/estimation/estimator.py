@@ -141,6 +141,12 @@ class Estimator:
             self.late.changed(from_ns)
         self._motion.look()
 
+    def retract_joint_state(self, stamp_ns: int) -> None:
+        """Leave the joint state of that stamp out, which the one after it has shown to be wrong; steps that used it are corrected."""
+        from_ns = self.inputs.retract_joints(stamp_ns)
+        if from_ns is not None:
+            self.late.changed(from_ns)
+
     def add_tracker_pose(
         self, stamp_ns: int, position: Sequence[float], quaternion_xyzw: Sequence[float], frame_id: str = "", stamp_error_s: float = 0.0,
     ) -> None:  # fmt: skip
@@ -155,6 +161,10 @@ class Estimator:
         """
         joints_ns = next(reversed(self.inputs.joints.stamps), None)
         self.inputs.measurements.add(stamp_ns, position, quaternion_xyzw, frame_id, joints_ns, stamp_error_s)
+
+    def retract_tracker_pose(self, stamp_ns: int) -> None:
+        """Leave the tracker pose of that stamp out, which the one after it has shown to be wrong, unless it has been fused."""
+        self.inputs.measurements.retract(stamp_ns)
 
     def add_tip_load(
         self, stamp_ns: int, force: Sequence[float], torque: Sequence[float], frame_id: str = ""

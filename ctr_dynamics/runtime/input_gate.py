@@ -59,6 +59,8 @@ class InputGate:
     def joint_state(self, message: JointStateIn, arrival_ns: int) -> JointStateIn | None:
         """The joint state to use, with its time and its angles as the checks want them; None where it is left out.
 
+        Where it shows that the one before was wrong, the estimator leaves that one out.
+
         Args:
             arrival_ns: time of arrival on one clock for all messages; 0 where there is none.
         """
@@ -72,6 +74,8 @@ class InputGate:
             return message
         if self._left_out(self.checks.joints.findings, verdict):
             return None
+        if verdict.retract_ns is not None:
+            self._estimator.retract_joint_state(verdict.retract_ns)
         if verdict.stamp_ns is None and verdict.rotations is None:
             return message
         positions = list(message.positions)
@@ -85,6 +89,8 @@ class InputGate:
         verdict = self._pose_verdict(message, arrival_ns)
         if verdict is None:
             return
+        if verdict.retract_ns is not None:
+            self._estimator.retract_tracker_pose(verdict.retract_ns)
         stamp_ns = message.stamp_ns if verdict.stamp_ns is None else verdict.stamp_ns
         quaternion = verdict.quaternion_xyzw or message.quaternion_xyzw
         # an error that is zero need not be known by other estimators of the same interface

@@ -154,6 +154,19 @@ class ActuatorSignal(Signal):
         self.values[first:] = list(self.actuators.behind_backlash(np.array(self._drive[first:]), before))
         return kind
 
+    def drop(self, stamp_ns: int) -> None:
+        """Take the drive position of that stamp away, if there is one; those after it pass the backlash again."""
+        if stamp_ns not in self.stamps:
+            return
+        first = self.stamps.index(stamp_ns)
+        super().drop(stamp_ns)
+        if not self._loose:
+            return
+        del self._drive[first]
+        if first < len(self._drive):
+            before = self.values[first - 1] if first else None
+            self.values[first:] = list(self.actuators.behind_backlash(np.array(self._drive[first:]), before))
+
     @property
     def drive_positions(self) -> list[Floats]:
         """Drive positions (2 N,) of all stamps, before the backlash."""

@@ -71,3 +71,41 @@ def test_a_tracker_without_noise_has_that_of_the_best():
     for k in range(20):
         joints(0.01 * k, REST).give(made)
     assert np.isfinite(made.advance()[-1].tip_covariance).all()
+
+
+def test_a_joint_state_that_is_taken_back_leaves_the_line_between_its_neighbours():
+    made = taken_at_rest(0.1)
+    assert add(made, 110, 0.12) == 100
+    made.advance(START_NS + 110 * MS)
+    made.retract_joint_state(START_NS + 110 * MS)
+    add(made, 120)
+    assert made.late.lag > 0, "steps that used it are corrected"
+    assert made.inputs.joints.at(START_NS + 110 * MS)[0] == pytest.approx(np.array(REST), abs=1e-12)
+    uncorrected = made.inputs.actuator_error.at(START_NS + 109 * MS)
+    assert uncorrected[0] > 0.09, "until then the covariance knows"
+
+
+def test_a_joint_state_is_not_taken_back_where_that_makes_a_gap_or_leaves_none():
+    made = estimator({"output.policy": "predict"})
+    for after_ms in (0, 60, 120):
+        add(made, after_ms)
+    assert made.inputs.retract_joints(START_NS) is None
+    assert made.inputs.retract_joints(START_NS + 60 * MS) is None
+    assert made.inputs.retract_joints(START_NS + 70 * MS) is None, "it never came"
+    assert len(made.inputs.joints.stamps) == 3
+
+
+def test_a_joint_state_ahead_that_is_taken_back_ends_no_gap():
+    made = taken_at_rest(0.02)
+    assert add(made, 920, 0.1) is None
+    assert made.inputs.retract_joints(START_NS + 920 * MS) is None
+    assert add(made, 30) == 20
+    assert made.inputs.joints.stamps[-1] == START_NS + 30 * MS
+
+
+def test_a_pose_that_is_taken_back_is_not_fused():
+    made = taken_at_rest(0.02)
+    made.add_tracker_pose(START_NS + 900 * MS, [0.0, 0.0, 0.2], [0.0, 0.0, 0.0, 1.0])
+    made.retract_tracker_pose(START_NS + 900 * MS)
+    assert made.inputs.measurements.measurements == []
+    assert made.health.measurements.dropped == 1

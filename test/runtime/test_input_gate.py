@@ -212,3 +212,23 @@ def test_a_reset_of_the_estimator_is_one_of_the_checks(clean):
     moved = joints[0]._replace(stamp_ns=earlier, positions=(-1.0, -0.25, -1.0, -0.19))
     assert gate.joint_state(moved, earlier) is moved
     assert problems(estimator, "joints") == {}
+
+
+def test_a_glitch_that_shows_one_joint_state_later_is_taken_back(clean, reference, play, monkeypatch):
+    """0.12 rad are within what an actuator does in 10 ms, and beyond what it does there and back."""
+    joints = [item for item in clean if isinstance(item.message, JointStateIn)]
+    off = joints[len(joints) // 2]
+
+    def glitch(item, _):
+        first, *rest = item.message.positions
+        wrong = item._replace(message=item.message._replace(positions=(first + 0.12, *rest)))
+        return [wrong if item is off else item]
+
+    estimator, outputs = play(changed(clean, JointStateIn, glitch), monkeypatch)
+    assert problems(estimator, "joints") == {"glitch": 1}
+    assert estimator.health.corrected_steps > 0
+    assert_as_good_as(estimator, outputs, reference, worse=1.01)
+    apart = [math.dist(a.tip_position, b.tip_position) for a, b in zip(outputs, reference[1], strict=True)]
+    used = [out.stamp_ns for out, m in zip(outputs, apart, strict=True) if m > 1e-4]
+    assert max(used) <= off.message.stamp_ns
+    assert apart[-1] < 1e-5

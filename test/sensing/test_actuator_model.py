@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
+from ctr_dynamics.robot_files import load_robot
 from ctr_dynamics.sensing import ActuatorModel, ActuatorSignal
 
 RNG = np.random.default_rng(2)
@@ -80,3 +81,18 @@ def test_backlash_of_rows_is_that_of_one_sample_after_another():
     for k, row in enumerate(drive):
         assert signal.add(k * 10_000_000, row) == "new"
     np.testing.assert_array_equal(np.array(signal.values), whole)
+
+
+def test_positions_after_one_that_is_dropped_pass_the_backlash_again():
+    actuators = ActuatorModel.of_robot(load_robot("till2020_tissue")).changed(backlash=np.array([0.2, 0.0]))
+    with_glitch, without = ActuatorSignal(actuators), ActuatorSignal(actuators)
+    for stamp, angle in enumerate([0.0, 0.1, 0.5, 0.2, 0.15]):
+        value = np.array([angle, angle, -0.2, -0.1])
+        with_glitch.add(stamp, value)
+        if stamp != 2:
+            without.add(stamp, value)
+    with_glitch.drop(2)
+    with_glitch.drop(7)
+    assert with_glitch.stamps == without.stamps
+    np.testing.assert_array_equal(with_glitch.values, without.values)
+    np.testing.assert_array_equal(with_glitch.drive_positions, without.drive_positions)

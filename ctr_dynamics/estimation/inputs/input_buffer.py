@@ -224,6 +224,30 @@ class InputBuffer:
         i = self.joints.stamps.index(stamp_ns) if kind == "late" else len(self.joints.stamps) - 1
         return (self.joints.stamps[i - 1] if i else stamp_ns) + min(self.joints.delay_ns, 0)
 
+    def retract_joints(self, stamp_ns: int) -> int | None:
+        """Leave a joint state out that has turned out wrong; returns as :meth:`add_joints` does.
+
+        The first one stays, as the time line begins with it. So does one whose place would be a gap: it is nearer the truth than nothing.
+        """
+        if self._after_gap is not None and self._after_gap.stamp_ns == stamp_ns:
+            self._after_gap = None  # no step has used it
+            return None
+        stamps = self.joints.stamps
+        i = bisect.bisect_left(stamps, stamp_ns)
+        if not 0 < i < len(stamps) or stamps[i] != stamp_ns:
+            return None
+        since_ns = stamp_ns - stamps[i - 1]
+        until_ns = stamps[i + 1] - stamp_ns if i + 1 < len(stamps) else since_ns
+        if since_ns + until_ns > self.timeout_ns:
+            return None
+        taken_ns = self.timeline.taken_ns
+        time_ns = stamp_ns if taken_ns is None else min(stamp_ns, taken_ns)
+        before = self._at(time_ns)
+        self.joints.drop(stamp_ns)
+        if time_ns > stamps[i - 1]:
+            self.actuator_error.revise(before, self._at(time_ns))
+        return stamps[i - 1] + min(self.joints.delay_ns, 0)
+
     def _driven(self, stamp_ns: int) -> tuple[int, Floats] | None:
         """Where a joint state of that stamp changes most what steps were driven by: the time (ns), and actuators as they are known without it."""
         taken = self.timeline.taken_ns

@@ -152,6 +152,14 @@ class MeasurementQueue:
             del self.measurements[0]
             self._drop("before the joints", "poses come, but no complete joint state has")
 
+    def retract(self, stamp_ns: int) -> None:
+        """Drop the pose of that stamp, if it still waits."""
+        for i, measurement in enumerate(self.measurements):
+            if measurement.stamp_ns == stamp_ns and measurement.fused_k is None:
+                del self.measurements[i]
+                self._health.measurements.dropped += 1
+                return
+
     def _drop(self, kind: str, text: str) -> None:
         self._health.measurements.dropped += 1
         self._health.note("tracker", kind, text)

@@ -338,7 +338,7 @@ class JointChecks:
         size = self._watch.glitch[1] * self.motion.scale[0]
         text = (
             f"one joint state was off by {size:.3g} rad (or as much for its unit) and back at once, "
-            f"limit {self.limits.rotation_acceleration:g} rad/s^2; noticed one message later; look at the encoder"
+            f"limit {self.limits.rotation_acceleration:g} rad/s^2; taken back; look at the encoder"
         )
         self.findings.add(Kind.GLITCH, at, size, "rad", text)
         return text

@@ -81,7 +81,8 @@ class Verdict:
         stamp_ns: the time to use instead of its stamp. error_s: 1-sigma of that, s.
         rotations: (N,) rad to use instead of its own.
         orientation: False where only the position of a pose is to be used. quaternion_xyzw: (4,) to use instead of its own.
-        retract_ns: stamp of a message accepted earlier that has turned out wrong; as it was given out, so corrected where it was.
+        retract_ns: stamp of a message accepted earlier that has turned out wrong and is not to count any more; as it was given out, so corrected
+            where it was.
     """
 
     use: Use
