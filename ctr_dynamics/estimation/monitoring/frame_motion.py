@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from ctr_dynamics.estimation.filter.adapted_variances import AdaptationOptions
 from ctr_dynamics.estimation.monitoring.densities import log_changed, log_density
+from ctr_dynamics.estimation.monitoring.prequential_evidence import DRIFT_S, MEMORY_S
 from ctr_dynamics.estimation.monitoring.taken_again import REMEMBERED, drop_from
 from ctr_dynamics.kernels.motion_regression import correct_motions
 
@@ -48,8 +49,8 @@ class FrameMotionOptions:
     steps: float = 10.0
     sound_s: float = AdaptationOptions.sound_s
     fault_s: float = AdaptationOptions.fault_s
-    drift_s: float = 1.0
-    memory_s: float = 10.0
+    drift_s: float = DRIFT_S
+    memory_s: float = MEMORY_S
     believed: float = 0.5
     doubted: float = 0.1
     lasts_s: float = 1.0

@@ -28,6 +28,7 @@ from ctr_dynamics.estimation.monitoring.densities import density_of_filter, log_
 from ctr_dynamics.estimation.monitoring.frame_motion import FrameMotion
 from ctr_dynamics.estimation.monitoring.moved_tracker import Moved, MovedTracker
 from ctr_dynamics.estimation.monitoring.noisy_tracker import NoisyTracker
+from ctr_dynamics.estimation.monitoring.prequential_evidence import MEMORY_S, PRIOR
 from ctr_dynamics.estimation.monitoring.smooth_departure import SmoothDeparture
 from ctr_dynamics.estimation.monitoring.stamp_jitter import StampJitter
 from ctr_dynamics.estimation.monitoring.taken_again import REMEMBERED, drop_from
@@ -45,7 +46,7 @@ class ModelErrorSearchOptions:
             3 % of it (Rucker et al. 2010, Dupont et al. 2010); what is farther is a wrong robot file or a fault of the tracker.
         steps: between one size and the next, as a factor.
         times_s: correlation times that are tried: of slow motion, not of a vibration.
-        prior: probability that a robot departs from its file beyond the tolerances. The file is trusted until evidence of a hundred to one.
+        prior: probability that a robot departs from its file beyond the tolerances.
         believed: probability from which on the estimate begins again with the model error.
         learning_s: s after a start that do not count: the filter learns the sizes of force, shift and noise by a factor of ten at each measurement.
         least_s: s of evidence before a model error is believed, ten of the shortest times and one of the longest. A deflection at rest or the
@@ -58,12 +59,12 @@ class ModelErrorSearchOptions:
     largest: float = 0.03
     steps: float = 1.6
     times_s: tuple[float, ...] = (0.3, 1.0, 3.0)
-    prior: float = 0.01
+    prior: float = PRIOR
     believed: float = 0.99
     learning_s: float = 0.5
     least_s: float = 3.0
     sound_s: float = AdaptationOptions.sound_s
-    memory_s: float = 10.0
+    memory_s: float = MEMORY_S
 
 
 class Evidence(NamedTuple):

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from ctr_dynamics.estimation.filter.adapted_variances import AdaptationOptions
 from ctr_dynamics.estimation.monitoring.densities import log_changed, log_density
+from ctr_dynamics.estimation.monitoring.prequential_evidence import DRIFT_S
 
 Floats = NDArray[np.float64]
 
@@ -31,7 +32,7 @@ class MovedTrackerOptions:
 
     sound_s: float = AdaptationOptions.sound_s
     found_s: float = AdaptationOptions.fault_s
-    drift_s: float = 1.0
+    drift_s: float = DRIFT_S
 
 
 class Moved(NamedTuple):

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctr_dynamics.estimation.monitoring.densities import student_peak
+from ctr_dynamics.estimation.monitoring.prequential_evidence import FREEDOM, MEMORY_S, PRIOR
 from ctr_dynamics.estimation.monitoring.taken_again import REMEMBERED, drop_from
 
 Floats = NDArray[np.float64]
@@ -27,16 +28,16 @@ class NoisyTrackerOptions:
     Attributes:
         smallest: by the stated noise; less is left to the filter. The largest is the robot's length. steps: between one size and the next, as a
             factor.
-        freedom: degrees of Student's distribution; 3 have the least tails for which the variance exists.
+        freedom: degrees of Student's distribution.
         prior: probability of a tracker that is noisier than its file says.
         memory_s: s, for which evidence counts.
     """
 
     smallest: float = 2.0
     steps: float = 1.6
-    freedom: float = 3.0
-    prior: float = 0.01
-    memory_s: float = 10.0
+    freedom: float = FREEDOM
+    prior: float = PRIOR
+    memory_s: float = MEMORY_S
 
 
 class Noise(NamedTuple):

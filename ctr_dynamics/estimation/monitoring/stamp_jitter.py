@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctr_dynamics.estimation.monitoring.densities import student_peak
+from ctr_dynamics.estimation.monitoring.prequential_evidence import DRIFT_S, FREEDOM, MEMORY_S, PRIOR
 from ctr_dynamics.estimation.monitoring.taken_again import REMEMBERED, drop_from
 from ctr_dynamics.kernels.jitter_update import correct_departures
 
@@ -31,18 +32,19 @@ class StampJitterOptions:
         prior: probability of a tracker whose stamps scatter.
         drifts_s: s, in which the open-loop run goes astray by about the tracker's noise, if the model is good, or less good.
         freedom: degrees of Student's distribution; outliers do not speak for or against jitter.
-        lasts_s: s, for which it has been likely before it is believed. Outliers look like it for a moment.
+        lasts_s: s, for which it has been likely before it is believed. Outliers look like it for a moment, no longer: some measurements
+            are enough.
         memory_s: s, for which evidence counts.
     """
 
     smallest_s: float = 0.001
     largest_s: float = 0.032
     steps: float = 2.0
-    prior: float = 0.01
-    drifts_s: tuple[float, ...] = (1.0, 0.1, 0.01)
-    freedom: float = 3.0
+    prior: float = PRIOR
+    drifts_s: tuple[float, ...] = (DRIFT_S, 0.1 * DRIFT_S, 0.01 * DRIFT_S)
+    freedom: float = FREEDOM
     lasts_s: float = 0.2
-    memory_s: float = 10.0
+    memory_s: float = MEMORY_S
 
 
 class Jitter(NamedTuple):

@@ -8,10 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctr_dynamics import chi_square
+from ctr_dynamics.estimation.monitoring.settling import SettlingOptions
 from ctr_dynamics.estimation.step_output import Innovation
 
 Floats = NDArray[np.float64]
-AFTER_JUMP_NS = 1_200_000_000  # in which the vibration of a jump dies down
+# in which the vibration of a jump dies down, as that of a start does
+AFTER_JUMP_NS = round(1e9 * SettlingOptions.longest_s)
 GROWS = 2.0  # periods of the tracker for which the distance grows on
 AGREEING = 4  # measurements in a row that end it, half a period of a slow vibration at 40 Hz: one agrees where the error swings through zero
 MEAN_OF = 12  # measurements that the mean remembers, 0.3 s at 40 Hz: some periods of a vibration
