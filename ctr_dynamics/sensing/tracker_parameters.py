@@ -6,31 +6,35 @@ from typing import Any
 
 import numpy as np
 
-from ctr_dynamics.kernels.rotations import from_vector, matrix, multiply, to_vector
+from ctr_dynamics.kernels.rotations import to_vector
 from ctr_dynamics.parameters import Settings, parameter
 from ctr_dynamics.robot import Robot
+from ctr_dynamics.sensing.tracker import TrackerModel
 
 LEAST_NOISE_M = 1e-6  # per axis, below that of any tracker
 
 
-def with_tracker_parameters(robot: Robot, settings: Settings) -> Robot:
-    """``robot`` with the delay, lever arm and registration of its tracker corrected by the parameters ``tracker.*``.
+def tracker_corrections(settings: Settings) -> dict[str, Any]:
+    """What the parameters ``tracker.*`` correct of a tracker: arguments of :meth:`TrackerModel.corrected`."""
+    return {
+        "delay": float(settings["tracker.delay_s"]),
+        "lever": np.array(settings["tracker.lever_arm_m"], float),
+        "rotation": np.array(settings["tracker.registration_rotation_rad"], float),
+        "translation": np.array(settings["tracker.registration_translation_m"], float),
+    }
 
-    Composed as :meth:`TrackerModel.corrected` does it.
-    """
-    names = ("delay_s", "lever_arm_m", "registration_rotation_rad", "registration_translation_m")
-    delay, lever, rotation, translation = (np.array(settings[f"tracker.{name}"], float) for name in names)
-    if not any(np.any(part) for part in (delay, lever, rotation, translation)):
+
+def with_tracker_parameters(robot: Robot, settings: Settings) -> Robot:
+    """``robot`` with the delay, lever arm and registration of its tracker corrected by the parameters ``tracker.*``."""
+    corrections = tracker_corrections(settings)
+    if not any(np.any(part) for part in corrections.values()):
         return robot
-    tracker = robot.tracker
-    extra = from_vector(rotation)
-    turned = multiply(extra, from_vector(np.array(tracker.registration_rotation.value)))
-    moved = matrix(extra) @ np.array(tracker.registration_translation.value) + translation
+    corrected = TrackerModel.of_robot(robot).corrected(**corrections)
     return robot.with_tracker(
-        registration_rotation=tuple(to_vector(turned).tolist()),
-        registration_translation=tuple(moved.tolist()),
-        lever_arm=tuple((np.array(tracker.lever_arm.value) + lever).tolist()),
-        delay=float(tracker.delay.value + delay),
+        registration_rotation=tuple(to_vector(corrected.rotation).tolist()),
+        registration_translation=tuple(corrected.translation.tolist()),
+        lever_arm=tuple(corrected.lever.tolist()),
+        delay=corrected.delay,
     )
 
 

@@ -22,6 +22,7 @@ from ctr_dynamics.io.messages.unit_quaternions import ROUNDED_WITHIN, is_unit
 from ctr_dynamics.model.model import Model
 from ctr_dynamics.parameters import Settings, axes_mask
 from ctr_dynamics.sensing import TrackerModel
+from ctr_dynamics.sensing.tracker_parameters import tracker_corrections
 
 Floats = NDArray[np.float64]
 
@@ -221,10 +222,5 @@ class MeasurementQueue:
 
 def tracker_of(model: Model, settings: Settings) -> TrackerModel:
     """The tracker of the robot file with the parameters' corrections."""
-    return model.plant.tracker.corrected(
-        delay=float(settings["tracker.delay_s"]),
-        lever=np.array(settings["tracker.lever_arm_m"]),
-        rotation=np.array(settings["tracker.registration_rotation_rad"]),
-        translation=np.array(settings["tracker.registration_translation_m"]),
-        mask=axes_mask(str(settings["tracker.axes"])),
-    )
+    mask = axes_mask(str(settings["tracker.axes"]))
+    return model.plant.tracker.corrected(**tracker_corrections(settings), mask=mask)
