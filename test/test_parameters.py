@@ -10,6 +10,7 @@ import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 
+from ctr_dynamics.cli.recording_options import settings_from
 from ctr_dynamics.errors import InputError
 from ctr_dynamics.parameters import (
     PARAMETERS,
@@ -49,6 +50,24 @@ def test_settings_are_defaults_then_file_then_overrides(tmp_path):
     assert values["tracker.lever_arm_m"] == (0.0, 0.0, 0.0025)
     assert values["model.scheme"] == parameter("model.scheme").default
     assert len(values) == len(PARAMETERS)
+
+
+def test_a_value_is_set_where_it_was_given_be_it_the_default(tmp_path):
+    settings = Settings({"tracker.axes": "xyzrpy"})
+    assert settings.was_set("tracker.axes")
+    assert not settings.was_set("tracker.delay_s")
+    assert settings == Settings(), "the values are the same"
+    later = settings.replace({"tracker.delay_s": 0.0})
+    assert later.was_set("tracker.axes")
+    assert later.was_set("tracker.delay_s")
+    assert Settings(later).was_set("tracker.delay_s")
+    assert not Settings(later).was_set("model.nodes")
+    # a file may hold every default; it sets what differs, and undoes what a command sets by itself
+    file = tmp_path / "all.yaml"
+    file.write_text("tracker.axes: xyzrpy\nmodel.nodes: 20\noutput.policy: predict\n")
+    found = settings_from(file, ["input_timeout_s=0.1"], {"output.policy": "wait"})
+    assert [name for name in found if found.was_set(name)] == ["input_timeout_s", "model.nodes"]
+    assert found["output.policy"] == "predict"
 
 
 def test_settings_cannot_be_changed():

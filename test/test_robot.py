@@ -465,6 +465,8 @@ def test_axes_mount_and_speeds(tissue):
     assert settings["tracker.mount_rotation_rad"] == (0.0, 1.5, 0.0)
     assert with_robot_file(settings, robot) == settings
     assert with_robot_file(Settings({"tracker.axes": "xyz"}), robot)["tracker.axes"] == "xyz"
+    told = {"tracker.axes": "xyzrpy", "tracker.mount_rotation_rad": (0.0, 0.0, 0.0)}
+    assert with_robot_file(Settings(told), robot) == Settings(), "the defaults, but set"
     motion = ActuatorMotion(2, CheckLimits(), robot)
     assert motion.speeds == (6.0, 6.0, CheckLimits().translation_speed, CheckLimits().translation_speed)
     tissue["tracker"]["axes"] = "zyx"

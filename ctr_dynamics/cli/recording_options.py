@@ -13,7 +13,13 @@ import typer
 
 from ctr_dynamics.io.bag_reader import Bag, open_bag
 from ctr_dynamics.io.inputs.input_mapping import InputMapping, parse_remap
-from ctr_dynamics.parameters import Settings, input_mapping, parse_assignments, read_parameter_file
+from ctr_dynamics.parameters import (
+    Settings,
+    input_mapping,
+    parse_assignments,
+    read_parameter_file,
+    without_defaults,
+)
 
 BAG_HELP = "A file (.mcap, .db3, .bag, also .zstd), or a folder with one bag."
 Remap = Annotated[
@@ -39,12 +45,16 @@ def settings_from(
 ) -> Settings:
     """Parameters: ``defaults`` that differ from the table's, then the file, then single values.
 
+    A value of the file that is the table's default does not count as set, as the shipped file holds them all; a single value always does.
+
     Raises:
         InputError: unreadable file, unknown name, wrong type or out of range.
     """
     values: dict[str, Any] = dict(defaults or {})
     if params is not None:
-        values.update(read_parameter_file(params))
+        given = read_parameter_file(params)
+        values = {name: value for name, value in values.items() if name not in given}
+        values.update(without_defaults(given))
     values.update(parse_assignments(assignments or []))
     return Settings(values)
 

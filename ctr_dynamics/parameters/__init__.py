@@ -4,7 +4,7 @@ from ctr_dynamics.parameters.input_parameters import input_mapping, pose_frame
 from ctr_dynamics.parameters.parameter_files import read_parameter_file
 from ctr_dynamics.parameters.parameter_table import PARAMETERS, RELIABILITY, parameter
 from ctr_dynamics.parameters.parameter_types import Parameter, Value, axes_mask
-from ctr_dynamics.parameters.settings import Settings, parse_assignments
+from ctr_dynamics.parameters.settings import Settings, parse_assignments, without_defaults
 
 __all__ = [
     "PARAMETERS",
@@ -18,4 +18,5 @@ __all__ = [
     "parse_assignments",
     "pose_frame",
     "read_parameter_file",
+    "without_defaults",
 ]

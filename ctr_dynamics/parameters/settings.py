@@ -19,7 +19,7 @@ class Settings(Mapping[str, Value]):
     """Every parameter of the estimator with its checked value; an immutable mapping. docs/parameters.md lists names, units and ranges.
 
     Args:
-        values: name to value; those not given have their default.
+        values: name to value; those not given have their default. One that is given counts as set, also where it equals the default.
 
     Raises:
         InputError: unknown name, wrong type or out of range.
@@ -31,13 +31,15 @@ class Settings(Mapping[str, Value]):
         (0.018, 12)
     """
 
-    __slots__ = ("_values",)
+    __slots__ = ("_set", "_values")
 
     def __init__(self, values: Mapping[str, Any] | None = None) -> None:
         checked = {p.name: p.default for p in PARAMETERS}
         for name, value in (values or {}).items():
             checked[name] = parameter(name).check(value)
         self._values = checked
+        names = values._set if isinstance(values, Settings) else values or ()
+        self._set: frozenset[str] = frozenset(names)
         least, most = self["filter.tip_force_sigma_N"], self["filter.tip_force_sigma_max_N"]
         if 0.0 < most < least:
             raise InputError(
@@ -46,8 +48,14 @@ class Settings(Mapping[str, Value]):
             )
 
     def replace(self, values: Mapping[str, Any]) -> Settings:
-        """A copy with some values changed; raises as the constructor does."""
-        return Settings({**self._values, **values})
+        """A copy with some values set; raises as the constructor does."""
+        changed = Settings({**self._values, **values})
+        changed._set = self._set | frozenset(values)
+        return changed
+
+    def was_set(self, name: str) -> bool:
+        """Whether somebody has set the value of ``name``, be it to the default: nothing else then takes its place."""
+        return parameter(name).name in self._set
 
     def as_dict(self) -> dict[str, Any]:
         """Plain dict for JSON and YAML; arrays are lists."""
@@ -69,6 +77,16 @@ class Settings(Mapping[str, Value]):
     def __repr__(self) -> str:
         changed = {p.name: self[p.name] for p in PARAMETERS if self[p.name] != p.default}
         return f"Settings({changed})"
+
+
+def without_defaults(values: Mapping[str, Any]) -> dict[str, Any]:
+    """The ``values`` that differ from their defaults, checked: those of a parameter file. The shipped one holds every default, and sets none.
+
+    Raises:
+        InputError: unknown name, wrong type or out of range.
+    """
+    checked = {name: parameter(name).check(value) for name, value in values.items()}
+    return {name: value for name, value in checked.items() if value != parameter(name).default}
 
 
 def parse_assignments(assignments: list[str]) -> dict[str, str]:

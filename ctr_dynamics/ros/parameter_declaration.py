@@ -13,7 +13,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter as RosParameter
 
 from ctr_dynamics.errors import InputError
-from ctr_dynamics.parameters import PARAMETERS, Parameter, Settings
+from ctr_dynamics.parameters import PARAMETERS, Parameter, Settings, without_defaults
 
 # Every rclpy node has these besides its own.
 _ROS_NAMES = ("use_sim_time", "start_type_description_service")
@@ -53,7 +53,8 @@ def declare(node: TableNode) -> Settings:
     Raises:
         InputError: as :func:`declare_table`.
     """
-    return _declare(node, PARAMETERS, Settings)
+    # ROS does not tell a parameter file, which may hold every default, from a single value
+    return _declare(node, PARAMETERS, lambda given: Settings(without_defaults(given)))
 
 
 def declared(node: Node) -> Settings:
@@ -62,7 +63,8 @@ def declared(node: Node) -> Settings:
     Raises:
         InputError: one that was set since cannot be used.
     """
-    return Settings({p.name: _plain(node.get_parameter(p.name).value) for p in PARAMETERS})
+    values = {p.name: _plain(node.get_parameter(p.name).value) for p in PARAMETERS}
+    return Settings(without_defaults(values))
 
 
 def declare_table(node: TableNode, table: Sequence[Parameter]) -> dict[str, Any]:

@@ -16,7 +16,7 @@ def with_joint_rate(bag: Bag, settings: Settings) -> tuple[Settings, str]:
     The parameter's default is the least.
     """
     name = "input_timeout_s"
-    if settings[name] != parameter(name).default:
+    if settings.was_set(name):
         return settings, ""
     stamps = np.unique([item.message.stamp_ns for item in bag.inputs({JOINT_STATES})])
     if len(stamps) < 3:

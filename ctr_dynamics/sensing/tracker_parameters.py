@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from ctr_dynamics.kernels.rotations import to_vector
-from ctr_dynamics.parameters import Settings, parameter
+from ctr_dynamics.parameters import Settings
 from ctr_dynamics.robot import Robot
 from ctr_dynamics.sensing.tracker import TrackerModel
 
@@ -49,12 +49,12 @@ def with_least_noise(robot: Robot) -> Robot:
 
 
 def with_robot_file(settings: Settings, robot: Robot) -> Settings:
-    """``settings`` with what the robot file says of the tracker's axes and mount, where a parameter is at its default."""
+    """``settings`` with what the robot file says of the tracker's axes and mount, where no parameter was set."""
     tracker = robot.tracker
     stated: dict[str, Any] = {}
     if tracker.axes is not None:
         stated["tracker.axes"] = tracker.axes
     if tracker.mount_rotation is not None:
         stated["tracker.mount_rotation_rad"] = list(tracker.mount_rotation.value)
-    stated = {k: v for k, v in stated.items() if settings[k] == parameter(k).default}
+    stated = {k: v for k, v in stated.items() if not settings.was_set(k)}
     return settings.replace(stated) if stated else settings
