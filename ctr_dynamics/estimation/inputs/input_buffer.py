@@ -24,6 +24,7 @@ from ctr_dynamics.io.messages.topics import STEP_NS
 from ctr_dynamics.model.model import Model
 from ctr_dynamics.parameters import Settings, pose_frame
 from ctr_dynamics.sensing import ActuatorSignal, TrackerModel
+from ctr_dynamics.sensing.checks import Kind, rejection_texts
 from ctr_dynamics.sensing.interpolation import Signal
 
 Floats = NDArray[np.float64]
@@ -207,9 +208,8 @@ class InputBuffer:
         revised = self._driven(stamp_ns)
         kind = self.joints.add(stamp_ns, value)
         if kind == "duplicate":
-            self.health.note(
-                "joints", "duplicate stamp", f"a second joint state of {stamp_ns} ns; the first one counts"
-            )
+            text = rejection_texts.second_of_stamp("joint state", stamp_ns)
+            self.health.note("joints", Kind.DUPLICATE.value, text)
             return None
         self.health.joint_stamps.append(stamp_ns)
         if self.t0_ns is None:
@@ -294,9 +294,7 @@ class InputBuffer:
             first = not load.stamps
         kind = load.add(stamp_ns, value)
         if kind == "duplicate":
-            self.health.note(
-                "load", "duplicate stamp", f"a second load of {stamp_ns} ns; the first one counts"
-            )
+            self.health.note("load", Kind.DUPLICATE.value, rejection_texts.second_of_stamp("load", stamp_ns))
             return None
         if self.t0_ns is None:
             load.forget(stamp_ns - self.window_ns)

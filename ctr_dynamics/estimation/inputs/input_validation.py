@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 
 from ctr_dynamics.effects import Plant
 from ctr_dynamics.io.messages.topics import accepts_frame
-from ctr_dynamics.io.messages.unit_quaternions import MEASURED_NORMS, is_unit, norm
+from ctr_dynamics.io.messages.unit_quaternions import is_unit, norm
+from ctr_dynamics.sensing.checks import Kind, rejection_texts
 from ctr_dynamics.sensing.interpolation import finite, joint_order
 
 Floats = NDArray[np.float64]
@@ -18,9 +19,10 @@ Floats = NDArray[np.float64]
 class Unusable(Exception):
     """A message that is left out: ``kind`` as the diagnostics count it, ``text`` with value, limit and what to do."""
 
-    def __init__(self, kind: str, text: str) -> None:
+    def __init__(self, kind: Kind | str, text: str) -> None:
         super().__init__(text)
-        self.kind, self.text = kind, text
+        self.kind = kind.value if isinstance(kind, Kind) else kind
+        self.text = text
 
 
 def joint_values(plant: Plant, stamp_ns: int, names: Sequence[str], positions: Sequence[float]) -> Floats:
@@ -39,14 +41,12 @@ def joint_values(plant: Plant, stamp_ns: int, names: Sequence[str], positions: S
         )
     value = np.array([positions[i] for i in order], dtype=float)
     if not finite(value.tolist()):
-        raise Unusable(
-            "not finite", f"joint state at {stamp_ns} ns holds a value that is not finite; it was left out"
-        )
+        raise Unusable(Kind.NOT_FINITE, rejection_texts.not_finite("joint state", stamp_ns))
     value = plant.actuators.forward(value)
     numbers = value.tolist()
     reason = plant.robot.actuator_problem(numbers[n:], numbers[:n])
     if reason:
-        raise Unusable("out of range", f"{reason}; the joint state was left out")
+        raise Unusable(Kind.OUT_OF_RANGE, f"{reason}; the joint state was left out")
     return value
 
 
@@ -59,21 +59,13 @@ def pose_values(
         Unusable: another frame, numbers that are not finite, or no unit quaternion.
     """
     if not accepts_frame(frame_id, frame):
-        raise Unusable(
-            "other frame",
-            f"pose in frame '{frame_id}', expected '{frame}'; if that is the tracker's frame, set tracker.frame_id={frame_id}",
-        )
+        raise Unusable(Kind.OTHER_FRAME, rejection_texts.pose_in_other_frame(frame_id, frame))
     if not (finite(position) and finite(quaternion_xyzw)):
-        raise Unusable(
-            "not finite", f"pose at {stamp_ns} ns holds a value that is not finite; it was left out"
-        )
+        raise Unusable(Kind.NOT_FINITE, rejection_texts.not_finite("pose", stamp_ns))
     x, y, z, w = quaternion_xyzw
     size = norm(quaternion_xyzw)
     if not is_unit(size):
-        raise Unusable(
-            "quaternion",
-            f"norm {size:.3g} is outside {MEASURED_NORMS}; send unit quaternions; the pose was left out",
-        )
+        raise Unusable(Kind.QUATERNION, rejection_texts.no_quaternion(size))
     return np.array(position, dtype=float), np.array([w, x, y, z]) / size, size
 
 
@@ -86,9 +78,7 @@ def wrench_values(
         Unusable: another frame, or numbers that are not finite.
     """
     if not accepts_frame(frame_id, frame):
-        raise Unusable("other frame", f"load in frame '{frame_id}', expected '{frame}'; send it in base axes")
+        raise Unusable(Kind.OTHER_FRAME, rejection_texts.load_in_other_frame(frame_id, frame))
     if not (finite(force) and finite(torque)):
-        raise Unusable(
-            "not finite", f"load at {stamp_ns} ns holds a value that is not finite; it was left out"
-        )
+        raise Unusable(Kind.NOT_FINITE, rejection_texts.not_finite("load", stamp_ns))
     return np.array([*force, *torque], dtype=float)

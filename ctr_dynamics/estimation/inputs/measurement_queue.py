@@ -22,6 +22,7 @@ from ctr_dynamics.io.messages.unit_quaternions import ROUNDED_WITHIN, is_unit
 from ctr_dynamics.model.model import Model
 from ctr_dynamics.parameters import Settings, axes_mask
 from ctr_dynamics.sensing import TrackerModel
+from ctr_dynamics.sensing.checks import Kind, rejection_texts
 from ctr_dynamics.sensing.tracker_parameters import tracker_corrections
 
 Floats = NDArray[np.float64]
@@ -127,7 +128,7 @@ class MeasurementQueue:
         if not is_unit(norm, ROUNDED_WITHIN):
             health.note("tracker", "quaternion normalised", f"norm {norm:.4f}, limit 1 +- {ROUNDED_WITHIN:g}")
         if any(m.stamp_ns == stamp_ns for m in self.measurements[-options.compared :]):
-            self._drop("duplicate stamp", f"a second pose of {stamp_ns} ns; the first one counts")
+            self._drop(Kind.DUPLICATE.value, rejection_texts.second_of_stamp("pose", stamp_ns))
             return
         taken_ns = self._timeline.taken_ns
         late = max(0.0, (taken_ns - stamp_ns) * 1e-9) if taken_ns is not None else 0.0

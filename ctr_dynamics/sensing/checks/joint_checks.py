@@ -10,6 +10,7 @@ from collections import deque
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
+from ctr_dynamics.sensing.checks import rejection_texts
 from ctr_dynamics.sensing.checks.actuator_motion import STAYS, ActuatorMotion, Jump, Unwrapping
 from ctr_dynamics.sensing.checks.check_limits import CheckOptions
 from ctr_dynamics.sensing.checks.stamp_checks import StampChecks
@@ -188,7 +189,7 @@ class JointChecks:
             train.values = state.values
             return timed
         if again and not self.stamps.mode:
-            text = f"a second joint state with stamp {state.stamp_ns} ns and other values; the first counts; look at the driver"
+            text = rejection_texts.second_of_stamp("joint state", state.stamp_ns)
             return self._drop(Kind.DUPLICATE, state.at, 0.0, "", text)
         time_ns = state.stamp_ns if timed.stamp_ns is None else timed.stamp_ns
         kind, text = timed.kind or stamped.kind, timed.text or stamped.text

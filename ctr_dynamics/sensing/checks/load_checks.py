@@ -7,6 +7,7 @@ from collections.abc import Sequence
 
 from ctr_dynamics.io.messages.topics import accepts_frame
 from ctr_dynamics.robot import Cantilever, Robot, cantilever
+from ctr_dynamics.sensing.checks import rejection_texts
 from ctr_dynamics.sensing.checks.check_limits import CheckOptions
 from ctr_dynamics.sensing.checks.verdicts import ACCEPT, Findings, Kind, Verdict
 
@@ -47,10 +48,10 @@ class LoadChecks:
         """Verdict on a load: ``force`` (3,) N and ``torque`` (3,) N m on the tip, in base axes."""
         at = stamp_ns if arrival_ns is None else arrival_ns
         if not accepts_frame(frame_id, self.options.frame_id):
-            text = f"load in frame '{frame_id}', expected '{self.options.frame_id}'; send it in base axes"
+            text = rejection_texts.load_in_other_frame(frame_id, self.options.frame_id)
             return self._drop(Kind.OTHER_FRAME, at, 0.0, "", text)
         if not all(map(math.isfinite, (*force, *torque))):
-            text = f"load at {stamp_ns} ns holds a value that is not finite; it was left out"
+            text = rejection_texts.not_finite("load", stamp_ns)
             return self._drop(Kind.NOT_FINITE, at, 0.0, "", text)
         if stamp_ns == 0 and self._newest_ns is not None:
             text = "stamp of the load is zero; fill in header.stamp; the load was left out"

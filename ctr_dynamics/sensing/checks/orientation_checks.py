@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from ctr_dynamics.io.messages.unit_quaternions import MEASURED_NORMS, is_unit, norm
+from ctr_dynamics.io.messages.unit_quaternions import is_unit, norm
+from ctr_dynamics.sensing.checks import rejection_texts
 from ctr_dynamics.sensing.checks.check_limits import CheckLimits
 from ctr_dynamics.sensing.checks.value_trains import Values
 from ctr_dynamics.sensing.checks.verdicts import ACCEPT, Findings, Kind, Verdict
@@ -43,7 +44,7 @@ class OrientationChecks:
         quaternion = pose[1]
         size = norm(quaternion)
         if not is_unit(size):
-            text = f"quaternion of norm {size:.3g} is outside {MEASURED_NORMS}; send unit quaternions, or set tracker.axes to xyz; left out"
+            text = rejection_texts.no_quaternion(size)
             self.findings.add(Kind.QUATERNION, at, abs(size - 1.0), "", text)
             return Verdict("drop", Kind.QUATERNION, text)
         return ACCEPT if expected_wxyz is None else self._ordered(at, quaternion, expected_wxyz)

@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from ctr_dynamics.io.messages.topics import accepts_frame
+from ctr_dynamics.sensing.checks import rejection_texts
 from ctr_dynamics.sensing.checks.check_limits import ZERO, CheckOptions
 from ctr_dynamics.sensing.checks.orientation_checks import OrientationChecks
 from ctr_dynamics.sensing.checks.stamp_checks import StampChecks, known_shift
@@ -129,11 +130,11 @@ class PoseChecks:
         at = stamp_ns if arrival_ns is None else arrival_ns
         expected = self.options.pose_frame_id or self.options.frame_id
         if not accepts_frame(frame_id, expected):
-            text = f"pose in frame '{frame_id}', expected '{expected}'; if that is the tracker's frame, set tracker.frame_id={frame_id}"
+            text = rejection_texts.pose_in_other_frame(frame_id, expected)
             return self._drop(Kind.OTHER_FRAME, at, 0.0, "", text)
         pose: Pose = (tuple(position), tuple(quaternion_xyzw))
         if not all(map(math.isfinite, (*pose[0], *pose[1]))):
-            text = f"pose at {stamp_ns} ns holds a value that is not finite; it was left out"
+            text = rejection_texts.not_finite("pose", stamp_ns)
             self.stamps.pass_over(stamp_ns, arrival_ns)
             return self._drop(Kind.NOT_FINITE, at, 0.0, "", text)
         wrong = self._placeholder(at, pose) or self._repeated(stamp_ns, at, pose) or self._unlike(at, pose)
@@ -153,7 +154,7 @@ class PoseChecks:
         if timed.use == "drop":
             return timed
         if again and not self.stamps.mode:
-            text = f"a second pose with stamp {stamp_ns} ns and other values; the first counts; look at the driver"
+            text = rejection_texts.second_of_stamp("pose", stamp_ns)
             return self._drop(Kind.DUPLICATE, at, 0.0, "", text)
         kind, text = timed.kind or stamped.kind, timed.text or stamped.text
         oriented = ACCEPT
