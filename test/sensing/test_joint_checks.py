@@ -305,6 +305,28 @@ def test_a_driver_that_goes_on_alone_is_taken_over(checks):
     assert {v.use for v in verdicts[-150:]} == {"accept"}
 
 
+@pytest.mark.parametrize("motion", [still, sweep])
+@pytest.mark.parametrize(("gap", "apart", "left_out"), [(0, 0.0, 0), (0, 1.0, 4), (50, 0.0, 0), (50, 1.0, 0)])
+def test_a_driver_that_starts_again_is_used_at_once_unless_it_jumps(checks, motion, gap, apart, left_out):
+    rows = joint_rows(500, motion)
+    again = [delayed(row, 4_000_000, tuple(a + apart for a in row[2])) for row in rows[300 + gap :]]
+    verdicts = feed_joints(checks, [*rows[:300], *again])
+    assert [i for i, v in enumerate(verdicts) if v.use == "drop"] == list(range(300, 300 + left_out))
+
+
+@pytest.mark.parametrize("motion", [still, sweep])
+@pytest.mark.parametrize(("apart", "left_out_s"), [(0.0, 0.0), (0.1, 0.24), (1.0, 0.24)])
+def test_a_driver_that_starts_before_the_other_stops_takes_over(checks, motion, apart, left_out_s):
+    rows = joint_rows(500, motion)
+    other = [delayed(row, 4_000_000, tuple(a + apart for a in row[2])) for row in rows[250:]]
+    both = sorted([*rows[:300], *other], key=lambda row: row[0])
+    verdicts = feed_joints(checks, both)
+    late = [
+        row[0] for row, v in zip(both, verdicts, strict=True) if v.use == "drop" and row[0] > rows[300][0]
+    ]
+    assert len(late) == round(100 * left_out_s)
+
+
 @pytest.mark.parametrize("before", [True, False])
 def test_a_second_driver_that_sends_zeros_at_the_same_stamps_is_left_out(checks, before):
     mixed, zeros = [], []
