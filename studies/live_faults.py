@@ -217,7 +217,7 @@ def error(poses: list[Any], start_ns: int, fault: str) -> float | None:
         return None
     fused = live_report.trace_of(poses, start_ns)
     best = math.inf
-    for truth in live_report.truth_of(truth_file):
+    for truth in live_report.truth_traces(truth_file):
         inside = (fused.t > SECONDS - 1.0) & (fused.t < SECONDS - 0.05)
         if inside.any():
             distance = np.linalg.norm(fused.p[inside] - truth.at(fused.t[inside]), axis=1)

@@ -58,7 +58,7 @@ def demo(
         raise InputError(f"--duration is {duration:g} s", do=f"write {SHORTEST_S:g} s or more, or 0 for all")
     if bag is None:
         bag, truth = shipped_bag(), truth or shipped_truth()
-    candidates = live_report.truth_of(truth) if truth is not None else []
+    candidates = live_report.truth_traces(truth) if truth is not None else []
     messages = load(bag, 0.0, duration)
     span_s = (messages[-1].log_ns - messages[0].log_ns) * 1e-9
     if span_s < 0.9 * SHORTEST_S:
@@ -92,7 +92,7 @@ def demo(
     start_ns = bag_start_ns + run.driver.get("shift_ns", 0)
     open_loop = live_report.trace_of(run.heard[topics.TIP_POSE_PREDICTED], start_ns)
     fused = live_report.trace_of(run.heard[topics.TIP_POSE], start_ns)
-    tracker = live_report.tracker_of(bag, bag_start_ns, nominal)
+    tracker = live_report.tracker_trace(bag, bag_start_ns, nominal)
     comparisons = live_report.comparisons(tracker, candidates, open_loop, fused)
     if not comparisons:
         console.print("neither tracker poses nor a truth fall into the run: nothing to compare it with")
@@ -218,7 +218,7 @@ def record(file: Path, received: Mapping[str, list[live_report.Received]]) -> No
             writer.write(topic, arrival_ns, data)
 
 
-def show_errors(console: Console, comparisons: Sequence[live_report.Comparison]) -> None:
+def show_errors(console: Console, comparisons: Sequence[live_report.LiveErrors]) -> None:
     """The table of tip errors in mm."""
     if not comparisons:
         return

@@ -18,7 +18,7 @@ from ctr_dynamics.cli.recording_options import (
     mapping_from,
     settings_from,
 )
-from ctr_dynamics.io.bag_checks import Finding
+from ctr_dynamics.io.bag_checks import BagFinding
 from ctr_dynamics.io.bag_info import GAP_PERIODS, BagReport, TopicReport, inspect
 from ctr_dynamics.io.bag_reader import open_bag
 from ctr_dynamics.io.inputs.input_mapping import InputMapping
@@ -99,7 +99,9 @@ def _text(report: BagReport) -> str:
     return "\n".join(lines)
 
 
-def _input_faults(bag: Path, report: BagReport, mapping: InputMapping, settings: Settings) -> list[Finding]:
+def _input_faults(
+    bag: Path, report: BagReport, mapping: InputMapping, settings: Settings
+) -> list[BagFinding]:
     """Faults of the inputs that node and replay leave out or mend, one line each, with times in s after its first message."""
     rate_hz = next((t.rate_hz for t in report.topics if t.name == JOINT_STATES), None)
     limits = CheckLimits()
@@ -110,7 +112,7 @@ def _input_faults(bag: Path, report: BagReport, mapping: InputMapping, settings:
         turns=mapping.joints.turns,
     )
     return [
-        Finding(found.level, STREAMS[found.stream], found.line(report.start_ns))
+        BagFinding(found.level, STREAMS[found.stream], found.line(report.start_ns))
         for found in check_messages(open_bag(bag, mapping).inputs(), options=options)
         if found.kind not in REPORTED
     ]

@@ -31,7 +31,7 @@ from ctr_dynamics.csv_import.orientations import with_quaternions
 from ctr_dynamics.csv_import.table import CsvTable, Faults
 from ctr_dynamics.csv_import.time_cells import TimeCells
 from ctr_dynamics.errors import InputError
-from ctr_dynamics.io.bag_checks import FRAME, Finding, inspector_for
+from ctr_dynamics.io.bag_checks import FRAME, BagFinding, inspector_for
 from ctr_dynamics.io.bag_reader import InputMessage, sha256_of
 from ctr_dynamics.io.bag_writer import write_bag
 from ctr_dynamics.io.messages import topics
@@ -317,10 +317,10 @@ def messages(log: Log) -> Iterator[tuple[int, str, bytes]]:
         yield stamp, TOPIC_OF[log.kind], encode(stamp, row)
 
 
-def check(logs: list[Log], robot: Robot | None) -> list[Finding]:
+def check(logs: list[Log], robot: Robot | None) -> list[BagFinding]:
     """Units, signs, ranges and clocks of the logs, as `ctr-dynamics info` would find them; with a robot its
     actuators' range too."""
-    found: list[Finding] = []
+    found: list[BagFinding] = []
     for log in logs:
         inspector = inspector_for(TOPIC_OF[log.kind])
         for _, _, data in messages(log):
@@ -336,19 +336,19 @@ def check(logs: list[Log], robot: Robot | None) -> list[Finding]:
                 f"poses {log.stamp_ns[0] * 1e-9:.3f} s to {log.stamp_ns[-1] * 1e-9:.3f} s): both logs need one clock; "
                 "start_s of a log's time in the layout moves it"
             )
-            found.append(Finding("error", topics.TRACKER_TIP, text))
+            found.append(BagFinding("error", topics.TRACKER_TIP, text))
     if robot is not None:
         found += _actuator_findings(joints, robot)
     return found + _input_faults(logs, robot)
 
 
-def _input_faults(logs: list[Log], robot: Robot | None) -> list[Finding]:
+def _input_faults(logs: list[Log], robot: Robot | None) -> list[BagFinding]:
     """What replay and node would leave out or mend of these logs; none of it keeps the bag from being written."""
     recorded = sorted((stamp, topic, data) for log in logs for stamp, topic, data in messages(log))
     inputs = (InputMessage(topic, stamp, DECODERS[topic](data)) for stamp, topic, data in recorded)
     begin = recorded[0][0]
     return [
-        Finding(
+        BagFinding(
             "note" if found.level == "note" else "warning",
             TOPIC_OF[_KIND_OF[found.stream]],
             found.line(begin),
@@ -358,14 +358,14 @@ def _input_faults(logs: list[Log], robot: Robot | None) -> list[Finding]:
     ]
 
 
-def _actuator_findings(joints: Log, robot: Robot) -> list[Finding]:
+def _actuator_findings(joints: Log, robot: Robot) -> list[BagFinding]:
     """Joints outside the range of the robot's actuators."""
     expected = sorted(
         f"tube{n}_{axis}" for n in range(1, robot.n_tubes + 1) for axis in ("rotation", "translation")
     )
     if sorted(joints.names) != expected:
         text = f"joints {', '.join(sorted(joints.names))}; robot '{robot.name}' has {', '.join(expected)}"
-        return [Finding("error", topics.JOINT_STATES, text)]
+        return [BagFinding("error", topics.JOINT_STATES, text)]
     betas = joints.columns(tuple(f"tube{n}_translation" for n in range(1, robot.n_tubes + 1)))
     problems = [problem for beta in betas if (problem := robot.actuator_problem(beta.tolist()))]
     if not problems:
@@ -373,7 +373,7 @@ def _actuator_findings(joints: Log, robot: Robot) -> list[Finding]:
     text = (
         f"{len(problems)} of {len(betas)} rows are outside the range of robot '{robot.name}': {problems[0]}"
     )
-    return [Finding("error", topics.JOINT_STATES, text)]
+    return [BagFinding("error", topics.JOINT_STATES, text)]
 
 
 def write(path: Path, logs: list[Log], sources: list[Path], robot: Robot | None) -> int:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from ctr_dynamics.csv_import.column_layout import FORCE, POSITION, QUATERNION, TORQUE
 from ctr_dynamics.csv_import.convert import Log
-from ctr_dynamics.io.bag_checks import Finding
+from ctr_dynamics.io.bag_checks import BagFinding
 from ctr_dynamics.io.messages import topics
 from ctr_dynamics.kernels.rotations import conjugate, multiply, to_vector
 from ctr_dynamics.model.model import Model
@@ -73,11 +73,11 @@ def compare(joints: Log, tracker: Log, robot: Robot, load: Log | None = None) ->
     return Agreement(len(measured), distance, angle, "; ".join(hints))
 
 
-def findings(agreement: Agreement | None, has_orientation: bool) -> list[Finding]:
+def findings(agreement: Agreement | None, has_orientation: bool) -> list[BagFinding]:
     """Warnings where poses and static model disagree by more than a roughly known robot explains."""
     if agreement is None:
         return [
-            Finding(
+            BagFinding(
                 "warning",
                 topics.JOINT_STATES,
                 "no equilibrium of the robot at these joints: frames were not checked",
@@ -90,13 +90,13 @@ def findings(agreement: Agreement | None, has_orientation: bool) -> list[Finding
             f"poses lie {1e3 * agreement.distance_m:.1f} mm (median of {agreement.samples}) from the robot's static tip, limit "
             f"{1e3 * DISTANCE_M:.0f} mm: another frame, registration, lever arm, load or tube order?{hint}"
         )
-        found.append(Finding("warning", topics.TRACKER_TIP, text))
+        found.append(BagFinding("warning", topics.TRACKER_TIP, text))
     if has_orientation and agreement.angle_rad > ANGLE_RAD:
         text = (
             f"orientations differ by {np.degrees(agreement.angle_rad):.1f} deg from the robot's static tip, limit "
             f"{np.degrees(ANGLE_RAD):.0f} deg: another axis convention?{hint}"
         )
-        found.append(Finding("warning", topics.TRACKER_TIP, text))
+        found.append(BagFinding("warning", topics.TRACKER_TIP, text))
     return found
 
 

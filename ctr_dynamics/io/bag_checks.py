@@ -20,7 +20,7 @@ _JOINT = re.compile(r"tube([1-9][0-9]?)_(rotation|translation)")
 
 
 @dataclass(frozen=True)
-class Finding:
+class BagFinding:
     """Something about a bag that its user should know; `topic` is empty for the bag as a whole."""
 
     level: Literal["note", "warning", "error"]
@@ -35,7 +35,7 @@ class Inspector(Protocol):
     def take(self, message: Any) -> None: ...
     def failed(self, error: cdr.CdrError) -> None: ...
     def values(self) -> dict[str, Any]: ...
-    def findings(self) -> list[Finding]: ...
+    def findings(self) -> list[BagFinding]: ...
 
 
 class _Range:
@@ -82,16 +82,16 @@ class _Base:
         if len(self.frames) < 20 or frame in self.frames:
             self.frames[frame] = self.frames.get(frame, 0) + 1
 
-    def _common(self) -> list[Finding]:
+    def _common(self) -> list[BagFinding]:
         found = []
         if self.malformed:
             found.append(
-                Finding("error", self.topic, f"{self.malformed} messages cannot be decoded ({self.fault})")
+                BagFinding("error", self.topic, f"{self.malformed} messages cannot be decoded ({self.fault})")
             )
         for frame, count in self.frames.items():
             if not accepts_frame(frame, self.frame):
                 found.append(
-                    Finding(
+                    BagFinding(
                         "error",
                         self.topic,
                         f"{count} messages are in frame {frame!r}, {self.frame!r} is expected; "
@@ -104,8 +104,8 @@ class _Base:
                 )
         return found
 
-    def _not_finite(self, count: int) -> list[Finding]:
-        return [Finding("warning", self.topic, f"{count} numbers are NaN or infinite")] if count else []
+    def _not_finite(self, count: int) -> list[BagFinding]:
+        return [BagFinding("warning", self.topic, f"{count} numbers are NaN or infinite")] if count else []
 
 
 class JointInspector(_Base):
@@ -160,7 +160,7 @@ class JointInspector(_Base):
         joints = {name: self.ranges[name].as_dict() for name in sorted(self.ranges)}
         return {"tubes": len(self.tubes), "joints": joints, "other_names": sorted(self.others)}
 
-    def findings(self) -> list[Finding]:
+    def findings(self) -> list[BagFinding]:
         found = self._common()
         if not self.ranges:
             others = ", ".join(sorted(self.others)[:8]) or "none"
@@ -170,7 +170,7 @@ class JointInspector(_Base):
             )
             if self.messages and self.without_positions == self.messages:
                 text = f"none of {self.messages} messages holds positions; have the driver fill them in"
-            return [*found, Finding("error", self.topic, text)]
+            return [*found, BagFinding("error", self.topic, text)]
         missing = [
             name
             for tube in range(1, max(self.tubes) + 1)
@@ -178,14 +178,14 @@ class JointInspector(_Base):
             if name not in self.ranges
         ]
         if missing:
-            found.append(Finding("error", self.topic, f"missing joints: {', '.join(missing)}"))
+            found.append(BagFinding("error", self.topic, f"missing joints: {', '.join(missing)}"))
         if self.uneven:
             found.append(
-                Finding("error", self.topic, f"{self.uneven} messages have not as many positions as names")
+                BagFinding("error", self.topic, f"{self.uneven} messages have not as many positions as names")
             )
         if self.incomplete:
             found.append(
-                Finding(
+                BagFinding(
                     "note",
                     self.topic,
                     f"{self.incomplete} of {self.messages} messages do not hold every joint",
@@ -193,7 +193,7 @@ class JointInspector(_Base):
             )
         if self.disordered:
             found.append(
-                Finding(
+                BagFinding(
                     "error",
                     self.topic,
                     f"{self.disordered} messages break tube1_translation <= tube2_translation <= ... <= 0: "
@@ -206,23 +206,23 @@ class JointInspector(_Base):
             found += self._units(name, extent)
         return found
 
-    def _units(self, name: str, extent: _Range) -> list[Finding]:
+    def _units(self, name: str, extent: _Range) -> list[BagFinding]:
         if name.endswith("_translation"):
             if extent.size > LENGTH_LIMIT_M:
                 text = (
                     f"{name} reaches {extent.size:g} m, limit {LENGTH_LIMIT_M:g} m: millimetres? Give metres"
                 )
-                return [Finding("error", self.topic, text)]
+                return [BagFinding("error", self.topic, text)]
             if extent.high > 0:
                 text = (
                     f"{name} reaches {extent.high:+g} m, it must be zero or negative (behind the base plate)"
                 )
-                return [Finding("error", self.topic, text)]
+                return [BagFinding("error", self.topic, text)]
         elif extent.size > ANGLE_LIMIT_RAD:
             text = (
                 f"{name} reaches {extent.size:g} rad, limit {ANGLE_LIMIT_RAD:.3g} rad: degrees? Give radians"
             )
-            return [Finding("error", self.topic, text)]
+            return [BagFinding("error", self.topic, text)]
         return []
 
 
@@ -262,7 +262,7 @@ class PoseInspector(_Base):
         ranges = {name: axis.as_dict() for name, axis in zip("xyz", self.axes, strict=True)}
         return {"position_m": ranges, "quaternion_norm": self.norm.as_dict()}
 
-    def findings(self) -> list[Finding]:
+    def findings(self) -> list[BagFinding]:
         found = self._common()
         found += self._not_finite(sum(axis.bad for axis in self.axes) + self.norm.bad)
         size = max(axis.size for axis in self.axes)
@@ -271,19 +271,19 @@ class PoseInspector(_Base):
                 f"positions reach {size:g} m, limit {LENGTH_LIMIT_M:g} m: "
                 "millimetres, or another frame? Give metres"
             )
-            found.append(Finding("error", self.topic, text))
+            found.append(BagFinding("error", self.topic, text))
         if self.zero:
             text = (
                 f"{self.zero} quaternions are zero; "
                 "if the tracker has no orientation, set tracker.axes to xyz"
             )
-            found.append(Finding("warning", self.topic, text))
+            found.append(BagFinding("warning", self.topic, text))
         if self.unnormalised:
             text = (
                 f"{self.unnormalised} quaternions are not of unit length (norm {self.norm.low:g} to "
                 f"{self.norm.high:g}, limit 1 +- {ROUNDED_WITHIN:g})"
             )
-            found.append(Finding("warning", self.topic, text))
+            found.append(BagFinding("warning", self.topic, text))
         return found
 
 
@@ -313,13 +313,13 @@ class WrenchInspector(_Base):
     def values(self) -> dict[str, Any]:
         return {"force_N": self.force.as_dict(), "torque_Nm": self.torque.as_dict()}
 
-    def findings(self) -> list[Finding]:
+    def findings(self) -> list[BagFinding]:
         found = self._common() + self._not_finite(self.force.bad + self.torque.bad)
         if self.force.size > FORCE_LIMIT_N:
             text = (
                 f"forces reach {self.force.size:g} N, limit {FORCE_LIMIT_N:g} N: millinewtons? Give newtons"
             )
-            found.append(Finding("warning", self.topic, text))
+            found.append(BagFinding("warning", self.topic, text))
         return found
 
 

@@ -16,7 +16,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from ctr_dynamics.io.bag_checks import FRAME, Finding, Inspector, inspector_for
+from ctr_dynamics.io.bag_checks import FRAME, BagFinding, Inspector, inspector_for
 from ctr_dynamics.io.bag_reader import INPUT_TOPICS, Bag, open_bag
 from ctr_dynamics.io.inputs.input_decoder import InputDecoder
 from ctr_dynamics.io.inputs.input_mapping import InputMapping, cure
@@ -68,7 +68,7 @@ class BagReport:
     duration_s: float
     start_ns: int
     topics: list[TopicReport]
-    problems: list[Finding]
+    problems: list[BagFinding]
     metadata: dict[str, str]
 
     @property
@@ -180,10 +180,10 @@ def inspect(path: str | Path, mapping: InputMapping | None = None, pose_frame: s
     starts = [t.log[0] for t in times.values()]
     ends = [t.log[-1] for t in times.values()]
     start_ns = min(starts, default=0)
-    problems = [Finding("warning", "", note) for note in bag.notes]
-    problems += [Finding("note", "", note) for note in bag.unchecked]
-    problems += [Finding("note", JOINT_STATES, note) for note in decoder.joints.notes]
-    problems += [Finding("note", TRACKER_TIP, note) for note in decoder.frames.notes]
+    problems = [BagFinding("warning", "", note) for note in bag.notes]
+    problems += [BagFinding("note", "", note) for note in bag.unchecked]
+    problems += [BagFinding("note", JOINT_STATES, note) for note in decoder.joints.notes]
+    problems += [BagFinding("note", TRACKER_TIP, note) for note in decoder.frames.notes]
     reports = [
         _topic_report(known[name].ros_type, name, times.get(name), start_ns, problems) for name in known
     ]
@@ -221,7 +221,7 @@ def _stamped(topic: str, ros_type: str) -> bool:
 
 
 def _topic_report(
-    ros_type: str, name: str, times: _Times | None, start_ns: int, problems: list[Finding]
+    ros_type: str, name: str, times: _Times | None, start_ns: int, problems: list[BagFinding]
 ) -> TopicReport:
     report = TopicReport(name, ros_type, len(times.log) if times else 0)
     if times is None:
@@ -252,9 +252,9 @@ def _topic_report(
 
 def _stamp_findings(
     report: TopicReport, ordered: NDArray[np.int64], stamps: NDArray[np.int64], steps: NDArray[np.int64]
-) -> list[Finding]:
+) -> list[BagFinding]:
     name = report.name
-    found: list[Finding] = []
+    found: list[BagFinding] = []
     limit = GAP_LIMIT_S.get(name)
     if limit is not None:
         # slow streams have no gaps where nothing is lost
@@ -267,7 +267,7 @@ def _stamp_findings(
         if wide.size:
             worst = int(wide[np.argmax(steps[wide])])
             found.append(
-                Finding(
+                BagFinding(
                     "warning",
                     name,
                     f"{wide.size} gaps longer than {limit:.3g} s, the longest {steps[worst] * 1e-9:.3f} s at "
@@ -277,7 +277,7 @@ def _stamp_findings(
             )
     if report.duplicate_stamps:
         found.append(
-            Finding(
+            BagFinding(
                 "warning", name, f"{report.duplicate_stamps} stamps occur more than once; check the driver"
             )
         )
@@ -285,7 +285,7 @@ def _stamp_findings(
         back = -int(np.diff(stamps).min()) * 1e-9
         late = name == TRACKER_TIP and back <= LATE_LIMIT_S
         found.append(
-            Finding(
+            BagFinding(
                 "note" if late else "warning",
                 name,
                 f"stamps run backwards {report.stamps_backwards} times, by {back:.3f} s at most"
@@ -297,9 +297,9 @@ def _stamp_findings(
     return found
 
 
-def _between_topics(bag: Bag, times: dict[str, _Times], reports: list[TopicReport]) -> list[Finding]:
+def _between_topics(bag: Bag, times: dict[str, _Times], reports: list[TopicReport]) -> list[BagFinding]:
     """Problems of topics against each other: missing ones, clocks, start and end."""
-    found: list[Finding] = []
+    found: list[BagFinding] = []
     by_name = {report.name: report for report in reports}
     for name, level, text in (
         (JOINT_STATES, "error", "not in the bag; nothing can be estimated without it"),
@@ -309,12 +309,12 @@ def _between_topics(bag: Bag, times: dict[str, _Times], reports: list[TopicRepor
         if name not in times:
             advice = cure(name, bag.stored_topics) if name not in bag.topics else ""
             text += f"; {advice}" if advice.startswith("if ") else ""
-            found.append(Finding(level, name, text))  # type: ignore[arg-type]
+            found.append(BagFinding(level, name, text))  # type: ignore[arg-type]
     for name in (JOINT_STATES, TRACKER_TIP, TIP_LOAD):
         offset = by_name[name].log_minus_stamp_s if name in times else None
         if offset and abs(offset["median"]) > CLOCK_LIMIT_S:
             found.append(
-                Finding(
+                BagFinding(
                     "warning",
                     name,
                     f"log times are {offset['median']:.3f} s after the stamps (median), limit "
@@ -323,7 +323,7 @@ def _between_topics(bag: Bag, times: dict[str, _Times], reports: list[TopicRepor
             )
         if offset and name == TRACKER_TIP and offset["max"] - offset["min"] > LATE_LIMIT_S:
             found.append(
-                Finding(
+                BagFinding(
                     "warning",
                     name,
                     f"the slowest measurement came {offset['max'] - offset['min']:.3f} s later than the "
@@ -336,7 +336,7 @@ def _between_topics(bag: Bag, times: dict[str, _Times], reports: list[TopicRepor
         difference = joints.log_minus_stamp_s["median"] - tracker.log_minus_stamp_s["median"]
         if abs(difference) > CLOCK_DIFFERENCE_S:
             found.append(
-                Finding(
+                BagFinding(
                     "warning",
                     TRACKER_TIP,
                     f"its stamps are {difference:.3f} s ahead of the joints' by arrival, limit "
@@ -347,8 +347,8 @@ def _between_topics(bag: Bag, times: dict[str, _Times], reports: list[TopicRepor
     return found
 
 
-def _start_and_end(joints: _Times, tracker: _Times) -> list[Finding]:
-    found: list[Finding] = []
+def _start_and_end(joints: _Times, tracker: _Times) -> list[BagFinding]:
+    found: list[BagFinding] = []
     if not joints.stamp or not tracker.stamp:
         return found
     start = (min(tracker.stamp) - min(joints.stamp)) * 1e-9
@@ -356,7 +356,7 @@ def _start_and_end(joints: _Times, tracker: _Times) -> list[Finding]:
     if abs(start) > START_LIMIT_S:
         side = "after" if start > 0 else "before"
         found.append(
-            Finding(
+            BagFinding(
                 "warning",
                 TRACKER_TIP,
                 f"starts {abs(start):.3f} s {side} the joints, limit {START_LIMIT_S:g} s; "
@@ -369,6 +369,8 @@ def _start_and_end(joints: _Times, tracker: _Times) -> list[Finding]:
         )
     if end > START_LIMIT_S:
         found.append(
-            Finding("warning", TRACKER_TIP, f"ends {end:.3f} s before the joints, limit {START_LIMIT_S:g} s")
+            BagFinding(
+                "warning", TRACKER_TIP, f"ends {end:.3f} s before the joints, limit {START_LIMIT_S:g} s"
+            )
         )
     return found

@@ -53,7 +53,7 @@ class Trace:
 
 
 @dataclass(frozen=True)
-class Comparison:
+class LiveErrors:
     """Distances (m) of the open-loop and of the fused tip from a reference over its samples."""
 
     reference: str
@@ -89,7 +89,7 @@ def nominal_tracker(robot: Robot) -> TrackerModel:
     return make_plant(robot).tracker
 
 
-def tracker_of(bag: Path, start_ns: int, tracker: TrackerModel) -> Trace:
+def tracker_trace(bag: Path, start_ns: int, tracker: TrackerModel) -> Trace:
     """The tip in the base frame as the usable poses of a bag show it, relative to its own `start_ns`."""
     poses = [m.message for m in open_bag(bag).inputs() if isinstance(m.message, PoseIn)]
     t, p = [], []
@@ -102,7 +102,7 @@ def tracker_of(bag: Path, start_ns: int, tracker: TrackerModel) -> Trace:
     return Trace(np.array(t), np.array(p).reshape(-1, 3))
 
 
-def truth_of(file: Path) -> list[Trace]:
+def truth_traces(file: Path) -> list[Trace]:
     """Candidate traces of a truth file: the tip `p`, and `p_trk` where the drawn registration is in it.
 
     Raises:
@@ -115,7 +115,7 @@ def truth_of(file: Path) -> list[Trace]:
 
 def compare(
     reference: str, target: Trace, open_loop: Trace, fused: Trace, since_s: float = 0.0
-) -> Comparison:
+) -> LiveErrors:
     """Distances from `target` at its samples within both runs, from `since_s` on.
 
     Raises:
@@ -127,16 +127,16 @@ def compare(
     t, p = target.t[inside], target.p[inside]
     a = np.linalg.norm(open_loop.at(t) - p, axis=1)
     f = np.linalg.norm(fused.at(t) - p, axis=1)
-    return Comparison(reference, len(t), _rms(a), float(a.max()), _rms(f), float(f.max()))
+    return LiveErrors(reference, len(t), _rms(a), float(a.max()), _rms(f), float(f.max()))
 
 
-def compare_truth(candidates: Sequence[Trace], open_loop: Trace, fused: Trace) -> Comparison:
+def compare_truth(candidates: Sequence[Trace], open_loop: Trace, fused: Trace) -> LiveErrors:
     """The comparison with whichever candidate the fused tip is nearer to over the run."""
     found = [compare("truth", candidate, open_loop, fused, SETTLE_S) for candidate in candidates]
     return min(found, key=lambda comparison: comparison.fused_rms)
 
 
-def comparisons(tracker: Trace, truth: Sequence[Trace], open_loop: Trace, fused: Trace) -> list[Comparison]:
+def comparisons(tracker: Trace, truth: Sequence[Trace], open_loop: Trace, fused: Trace) -> list[LiveErrors]:
     """With the tracker and the truth, as far as they have samples in the time of the run."""
     found = []
     if len(tracker.t):

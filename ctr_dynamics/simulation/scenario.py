@@ -97,7 +97,7 @@ class Rates(Block):
     load_hz: Rate = 100.0
 
 
-class TrackerTiming(Block):
+class TrackerDelays(Block):
     """``delay_s``: how much older than its stamp a pose is, beside the robot file's; ``arrival_s``.
 
     From stamp to log time.
@@ -127,7 +127,7 @@ class Scenario(Block):
     loads: list[Load] = Field(default_factory=list)
     noise: Noise | Literal[False] = Noise()
     rates: Rates = Rates()
-    tracker: TrackerTiming = TrackerTiming()
+    tracker: TrackerDelays = TrackerDelays()
     solver: Solver = Solver()
 
     _sha256: str = PrivateAttr("")

@@ -19,8 +19,8 @@ from ctr_dynamics.runtime.live_report import (
     comparisons,
     nominal_tracker,
     trace_of,
-    tracker_of,
-    truth_of,
+    tracker_trace,
+    truth_traces,
 )
 from ctr_dynamics.runtime.playback import load, pace, shifted
 
@@ -121,8 +121,8 @@ def test_traces_of_messages_bag_and_truth(bags):
     np.testing.assert_allclose(trace.p[:, 0], [10, 30])
     bag = bags / "clean_release.mcap"
     start = next(iter(open_bag(bag).inputs())).message.stamp_ns
-    tracker = tracker_of(bag, start, nominal_tracker(load_robot("till2020_tissue")))
-    truth = truth_of(bags / "truth" / "clean_release.npz")
+    tracker = tracker_trace(bag, start, nominal_tracker(load_robot("till2020_tissue")))
+    truth = truth_traces(bags / "truth" / "clean_release.npz")
     assert len(tracker.t) > 200
     near = min(float(np.sqrt(np.mean(np.sum((c.at(tracker.t) - tracker.p) ** 2, axis=1)))) for c in truth)
     assert near < 1.5e-3
@@ -138,8 +138,8 @@ def test_the_tip_that_poses_show_is_that_of_the_robots_registration_lever_arm_an
         },
     )
     bag = bags / "clean_release.mcap"
-    plain = tracker_of(bag, 0, nominal_tracker(load_robot("till2020_tissue")))
-    moved = tracker_of(bag, 0, nominal_tracker(turned))
+    plain = tracker_trace(bag, 0, nominal_tracker(load_robot("till2020_tissue")))
+    moved = tracker_trace(bag, 0, nominal_tracker(turned))
     delay = nominal_tracker(load_robot("till2020_tissue")).delay
     np.testing.assert_allclose(moved.t - plain.t, delay - 0.025, atol=1e-6)
     x, y, z = plain.p.T
@@ -163,7 +163,7 @@ def test_a_truth_that_is_none_is_one_clear_error(tmp_path):
     np.savez(wrong, t=np.zeros(3), p=np.zeros((2, 3)))
     for file in (tmp_path / "none.npz", empty, other, wrong):
         with pytest.raises(InputError, match=file.name):
-            truth_of(file)
+            truth_traces(file)
 
 
 @pytest.mark.parametrize(

@@ -18,10 +18,10 @@ from ctr_dynamics.estimation.filter.expected_tracker import ExpectedTracker
 from ctr_dynamics.estimation.filter.factor_reduction import reduced
 from ctr_dynamics.estimation.filter.factor_schedule import FactorSchedule
 from ctr_dynamics.estimation.filter.filter_records import (
-    Comparison,
     FilterOptions,
     FilterState,
     ModelErrorSize,
+    TipComparison,
     TipEstimate,
     Update,
 )
@@ -390,7 +390,7 @@ class RodEkf:
 
     def _comparison(
         self, stamp: float, position: Floats, quaternion: Floats, stamp_error_s: float
-    ) -> Update | Comparison:
+    ) -> Update | TipComparison:
         """A measurement against the tip of its time; the record alone where there is nothing to compare it with."""
         return compare_with_tip(
             self.expected, self._tip_at, self.simulator.scheme.dt, self.bias, self.pi, self.adapted, stamp, position, quaternion,

@@ -83,7 +83,7 @@ class Update(NamedTuple):
         return cls(unknown, unknown, math.nan, 0, False, reason, unknown)
 
 
-class Comparison(NamedTuple):
+class TipComparison(NamedTuple):
     """A measurement against the tip of its time.
 
     Attributes:

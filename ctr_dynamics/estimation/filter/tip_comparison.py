@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ctr_dynamics.estimation.filter.adapted_variances import AdaptedVariances
 from ctr_dynamics.estimation.filter.expected_tracker import ExpectedTracker
-from ctr_dynamics.estimation.filter.filter_records import Comparison, Update
+from ctr_dynamics.estimation.filter.filter_records import TipComparison, Update
 from ctr_dynamics.estimation.filter.jitter_noise import with_jitter
 from ctr_dynamics.sensing import Tip
 from ctr_dynamics.sensing.tracker import DELAY, STATES
@@ -45,7 +45,7 @@ def compare_with_tip(
     position: Floats,
     quaternion: Floats,
     stamp_error_s: float = 0.0,
-) -> Update | Comparison:
+) -> Update | TipComparison:
     """A measurement against the tip of its time; the record alone where there is nothing to compare it with.
 
     Args:
@@ -87,4 +87,4 @@ def compare_with_tip(
     residual[axes], variance[axes], white[axes] = nu, S.diagonal(), whitened
     nis = float(whitened @ whitened)
     record = Update(residual, variance, nis, len(nu), False, "", white, half_jitter_gain=half_jitter_gain)
-    return Comparison(nu, H, S, extra_noise, record)
+    return TipComparison(nu, H, S, extra_noise, record)

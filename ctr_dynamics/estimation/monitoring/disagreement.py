@@ -24,7 +24,7 @@ DEVIATIONS = 3.0  # of the noise of a change, beyond which it is a jump
 TIMES = 2.0  # as far as the model, by which measurements jump where the tracker does
 
 
-class Measured(NamedTuple):
+class ComparedMeasurement(NamedTuple):
     """One measurement, base axes.
 
     Attributes:
@@ -56,11 +56,11 @@ class Disagreement:
 
     def clear(self) -> None:
         """Forget all measurements."""
-        self._measured: deque[Measured] = deque(maxlen=REMEMBERED)
+        self._measured: deque[ComparedMeasurement] = deque(maxlen=REMEMBERED)
         self._covariance: Floats | None = np.zeros((3, 3))
 
     def add(self, stamp_ns: int, seen: Floats, model: Floats, residual: Floats) -> None:
-        """Take in a measurement (see :class:`Measured`); one of a stamp that is known takes its place."""
+        """Take in a measurement (see :class:`ComparedMeasurement`); one of a stamp that is known takes its place."""
         known, self._covariance = self._measured, None
         drop_from(known, stamp_ns)
         jumps = known[-1].jumps + self._jump(stamp_ns, seen, model) if known else np.zeros(3)
@@ -68,7 +68,7 @@ class Disagreement:
             jumps = np.zeros(3)  # it is back, or the estimate has followed it
         elif np.linalg.norm(residual - jumps) < np.linalg.norm(residual):
             residual = residual - jumps
-        known.append(Measured(stamp_ns, seen, model, residual, jumps))
+        known.append(ComparedMeasurement(stamp_ns, seen, model, residual, jumps))
 
     def _jump(self, stamp_ns: int, seen: Floats, model: Floats) -> Floats:
         """(3,) m, by which the tracker has jumped: what a straight line through the two measurements before does not lead to."""

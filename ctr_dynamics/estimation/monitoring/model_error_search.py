@@ -67,7 +67,7 @@ class ModelErrorSearchOptions:
     memory_s: float = MEMORY_S
 
 
-class Evidence(NamedTuple):
+class DepartureEvidence(NamedTuple):
     """What the measurements up to ``stamp_ns`` say.
 
     Attributes:
@@ -140,7 +140,7 @@ class ModelErrorSearch:
 
     def clear(self) -> None:
         """Forget all measurements."""
-        self._evidence: deque[Evidence] = deque(maxlen=REMEMBERED)
+        self._evidence: deque[DepartureEvidence] = deque(maxlen=REMEMBERED)
         self._begin_ns = 0
         self._compared: tuple[ModelErrorSize, Floats] | None = None
         self._scatter: tuple[float, tuple[float, float]] | None = None
@@ -181,7 +181,9 @@ class ModelErrorSearch:
             variance = (1.0 - gain) * square
             moved = self._moved.begin(residual)
             self._evidence.append(
-                Evidence(stamp_ns, level, variance, none, 0.0, moved, -math.inf, -math.inf, none, angle, 1.0)
+                DepartureEvidence(
+                    stamp_ns, level, variance, none, 0.0, moved, -math.inf, -math.inf, none, angle, 1.0
+                )
             )
             return
         # 1. The departure decays and gets new randomness.
@@ -215,7 +217,7 @@ class ModelErrorSearch:
             moved = self._moved.add(last.moved, residual, elapsed, decay, right, of_filter)
         weight = decay * last.weight + 1.0
         self._evidence.append(
-            Evidence(
+            DepartureEvidence(
                 stamp_ns,
                 level + gain[:, None] * change,
                 before * (1.0 - gain),
@@ -278,7 +280,7 @@ class ModelErrorSearch:
         return math.log(self.options.prior / len(self.sizes))
 
     @staticmethod
-    def _file_right(last: Evidence) -> float:
+    def _file_right(last: DepartureEvidence) -> float:
         """Logarithm of the evidence of a robot whose file is right, by a tracker of any noise."""
         ways = last.filter, last.moved.evidence, last.departures[CONSTANT], last.noisy, last.jitter
         return float(np.logaddexp.reduce(ways))

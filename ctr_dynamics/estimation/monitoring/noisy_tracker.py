@@ -40,7 +40,7 @@ class NoisyTrackerOptions:
     memory_s: float = MEMORY_S
 
 
-class Noise(NamedTuple):
+class NoiseEvidence(NamedTuple):
     """What the measurements up to ``stamp_ns`` say of every size.
 
     Attributes:
@@ -75,7 +75,7 @@ class NoisyTracker:
 
     def clear(self) -> None:
         """Forget all measurements."""
-        self._known: deque[Noise] = deque(maxlen=REMEMBERED)
+        self._known: deque[NoiseEvidence] = deque(maxlen=REMEMBERED)
 
     def add(self, stamp_ns: int, residual: Floats) -> float:
         """Take in a measurement that lies ``residual`` (3,) m from the open-loop tip; one of a stamp that is known takes its place.
@@ -86,7 +86,7 @@ class NoisyTracker:
         known, options, freedom = self._known, self.options, self.options.freedom
         drop_from(known, stamp_ns)
         count = len(self._squares)
-        last = known[-1] if known else Noise(
+        last = known[-1] if known else NoiseEvidence(
             stamp_ns, np.zeros((count, 3)), np.full(count, self._registered), np.zeros(count)
         )  # fmt: skip
         change, total = residual - last.level, last.variance + self._squares
@@ -102,6 +102,8 @@ class NoisyTracker:
         decay = math.exp(-(stamp_ns - last.stamp_ns) * 1e-9 / options.memory_s)
         evidence = decay * last.evidence + density
         known.append(
-            Noise(stamp_ns, last.level + gain[:, None] * change, last.variance * (1.0 - gain), evidence)
+            NoiseEvidence(
+                stamp_ns, last.level + gain[:, None] * change, last.variance * (1.0 - gain), evidence
+            )
         )
         return float(np.logaddexp.reduce(evidence)) + math.log(options.prior / count)
