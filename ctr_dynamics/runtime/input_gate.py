@@ -75,7 +75,7 @@ class InputGate:
         if self._left_out(self.checks.joints.findings, verdict):
             return None
         if verdict.retract_ns is not None:
-            self._estimator.retract_joint_state(verdict.retract_ns)
+            self._retract("retract_joint_state", verdict.retract_ns)
         if verdict.stamp_ns is None and verdict.rotations is None:
             return message
         positions = list(message.positions)
@@ -90,7 +90,7 @@ class InputGate:
         if verdict is None:
             return
         if verdict.retract_ns is not None:
-            self._estimator.retract_tracker_pose(verdict.retract_ns)
+            self._retract("retract_tracker_pose", verdict.retract_ns)
         stamp_ns = message.stamp_ns if verdict.stamp_ns is None else verdict.stamp_ns
         quaternion = verdict.quaternion_xyzw or message.quaternion_xyzw
         # an error that is zero need not be known by other estimators of the same interface
@@ -131,6 +131,12 @@ class InputGate:
         if self._started and not started:
             self.checks.forget()
         self._started = started
+
+    def _retract(self, method: str, stamp_ns: int) -> None:
+        """Have the estimator take a message back; other estimators of the same interface need not be able to."""
+        retract = getattr(self._estimator, method, None)
+        if retract is not None:
+            retract(stamp_ns)
 
     def _left_out(self, findings: Findings, verdict: Verdict) -> bool:
         """Whether a message is left out here; what was found is counted."""
