@@ -271,7 +271,8 @@ def check_time_error(problem: Problem, hypothesis: Hypothesis) -> None:
     """
     if not hypothesis.has_impacts:
         return
-    finer = problem.finer.residual(hypothesis.fit.point)
+    # beside the steps of the fit, which are short throughout, and not those that were chosen without impacts
+    finer = with_form(problem, hypothesis.members).finer.residual(hypothesis.fit.point)
     if finer is not None and len(finer) == len(hypothesis.fit.residual):
         error = finer - hypothesis.fit.residual
         left = hypothesis.fit.chi2 - problem.size
