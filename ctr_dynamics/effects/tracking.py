@@ -5,8 +5,18 @@ from __future__ import annotations
 import numpy as np
 
 from ctr_dynamics.effects.plant import Plant
-from ctr_dynamics.effects.registry import EffectParameter, Values, effect
+from ctr_dynamics.effects.registry import EffectParameter, Nominal, Values, effect
 from ctr_dynamics.kernels.rotations import from_vector, matrix, multiply
+from ctr_dynamics.robot import Robot
+
+
+def _tolerance(quantity: str, axis: int) -> Nominal:
+    """The tolerance along one axis of a vector of the robot file's tracker."""
+
+    def of(robot: Robot, tube: int) -> float:
+        return float(getattr(robot.tracker, quantity).tolerance[axis])
+
+    return of
 
 
 @effect(
@@ -17,10 +27,10 @@ from ctr_dynamics.kernels.rotations import from_vector, matrix, multiply
             "rad",
             0.0,
             0.03,
-            lambda robot, i: float(np.max(robot.tracker.registration_rotation.tolerance)),
+            _tolerance("registration_rotation", axis),
             text=f"turn about {a}",
         )
-        for a in "xyz"
+        for axis, a in enumerate("xyz")
     ),
     text="The tracker's frame is turned against the base frame.",
     source="reading = R p + t",
@@ -45,10 +55,10 @@ def registration_rotation(plant: Plant, values: Values) -> None:
             "m",
             0.0,
             0.004,
-            lambda robot, i: float(np.max(robot.tracker.registration_translation.tolerance)),
+            _tolerance("registration_translation", axis),
             text=f"shift along {a}",
         )
-        for a in "xyz"
+        for axis, a in enumerate("xyz")
     ),
     text="The tracker's frame is shifted against the base frame.",
     source="reading = R p + t",
@@ -68,10 +78,10 @@ def registration_translation(plant: Plant, values: Values) -> None:
             "m",
             0.0,
             0.004,
-            lambda robot, i: float(np.max(robot.tracker.lever_arm.tolerance)),
+            _tolerance("lever_arm", axis),
             text=f"sensor position in the tip frame, {a}",
         )
-        for a in "xyz"
+        for axis, a in enumerate("xyz")
     ),
     text="The sensor does not sit where the robot file says.",
     source="reading = p + R lever",

@@ -233,3 +233,19 @@ def test_no_robot_carries_less_than_nothing(name):
         robot_from_dict(
             {**robot_to_dict(robot), "extensions": {"payload_mass": {"added_kg": -carried - 1e-4}}}
         )
+
+
+@pytest.mark.parametrize(
+    ("effect", "field", "names"),
+    [
+        ("registration_rotation", "registration_rotation", ("rx_rad", "ry_rad", "rz_rad")),
+        ("registration_translation", "registration_translation", ("tx_m", "ty_m", "tz_m")),
+        ("tracker_lever_arm", "lever_arm", ("x_m", "y_m", "z_m")),
+    ],
+)
+def test_axes_of_the_tracker_have_tolerances_of_their_own(effect, field, names):
+    data = copy.deepcopy(robot_to_dict(ROBOT))
+    stated = [1e-3, 0.0, 3e-3]
+    data["tracker"][field]["tolerance"] = stated
+    tolerances = {q.key: q.tolerance for q in effect_quantities(robot_from_dict(data))}
+    assert [tolerances[effect, name] for name in names] == stated
