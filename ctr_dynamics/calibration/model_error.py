@@ -1,7 +1,7 @@
 """What a calibrated model still gets wrong, as a prior of the estimator.
 
-It is measured on held-out tips. What the tracker's noise does not explain is the model's: position and rotation of the tip as a Gauss-Markov process,
-whose deviation and correlation time are those of the residual.
+It is measured on held-out tips. What the tracker's noise and drift do not explain is the model's: position and rotation of the tip as a Gauss-Markov
+process, whose deviation and correlation time are those of the residual.
 """
 
 from __future__ import annotations
@@ -33,8 +33,9 @@ def model_error_of(residual: Floats, samples: TipSamples, robot: Robot) -> Model
         return None
     noise, own = robot.tracker.noise, residual[found]
     place, turn = own[:, :3][:, samples.axes[:3]], own[:, 3:][:, samples.axes[3:]]
-    beyond = float(np.mean(place**2)) - noise.position.value**2
-    if beyond <= noise.position.value**2:
+    tracker = noise.position.value**2 + noise.drift.value**2  # of which the estimator has states of their own
+    beyond = float(np.mean(place**2)) - tracker
+    if beyond <= tracker:
         return None
     turned = max(float(np.mean(turn**2)) - noise.rotation.value**2, 0.0) if turn.size else 0.0
     period = float(np.median(np.diff(samples.stamps[found])))

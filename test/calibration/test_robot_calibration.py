@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from ctr_dynamics.calibration.calibration_report import lines, robot_text
+from ctr_dynamics.calibration.model_error import model_error_of
 from ctr_dynamics.calibration.robot_calibration import calibrate, calibrated_robot, split
 from ctr_dynamics.calibration.tip_fit import Coordinate, TipFit, TipModel, fit_tips
 from ctr_dynamics.cli.main import main
@@ -115,6 +116,22 @@ def test_what_the_model_gets_wrong_is_measured_and_written(robot, true, found):
     assert error.time.value == pytest.approx(1.0 / np.pi, rel=0.3)
     assert robot_from_dict(robot_to_dict(departed.robot)) == departed.robot
     assert "model error" in "".join(lines(departed))
+
+
+def test_the_drift_of_the_tracker_is_no_model_error(robot, true):
+    """The estimator has a state for it beside the model's error."""
+    clean = tips_of(true, noise=NOISE)
+    residual = np.zeros((len(clean.stamps), 6))
+    residual[:, :3] = 1e-3 * np.sin(2 * np.pi * clean.stamps[:, None] / 2.0 + np.array([0.0, 1.0, 2.0]))
+    found = []
+    for drift in (0.0, 4e-4, 8e-4):
+        data = robot_to_dict(robot)
+        data["tracker"]["noise"]["position"]["value"] = NOISE
+        data["tracker"]["noise"]["drift"]["value"] = drift
+        found.append(model_error_of(residual, clean, robot_from_dict(data)))
+    without, some, all_of_it = found
+    assert some.position.value**2 == pytest.approx(without.position.value**2 - 4e-4**2)
+    assert all_of_it is None
 
 
 def test_a_table_without_times_tells_no_model_error(robot, true):
