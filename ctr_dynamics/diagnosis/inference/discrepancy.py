@@ -16,11 +16,12 @@ import numpy as np
 from joblib import delayed
 from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
-from scipy.special import log_ndtr, logsumexp
+from scipy.special import logsumexp
 
 from ctr_dynamics.diagnosis.forward_model import Key
 from ctr_dynamics.diagnosis.inference.fit_problem import Problem
 from ctr_dynamics.diagnosis.inference.gaussian_posterior import (
+    half_gaussian_gain,
     posterior,
     tail_gain,
     variances,
@@ -327,8 +328,5 @@ class _Linear:
         evidence += within_tolerance(self.fit.active, wide, departure, covariance, limit)
         by_key = {q.key: d for q, d in zip(self.fit.active, departure, strict=True)}
         evidence += tail_gain(self.fit.causes, [by_key[q.key] for q in self.fit.causes])
-        for i, q in enumerate(self.fit.active):
-            if q.key in wide and q.one_sided:
-                deviation = math.sqrt(max(covariance[i, i], 1e-30))
-                evidence += math.log(2.0) + float(log_ndtr(departure[i] / deviation))
-        return evidence, covariance
+        one_sided = [q.key in wide and q.one_sided for q in self.fit.active]
+        return evidence + half_gaussian_gain(departure, covariance, one_sided), covariance

@@ -49,6 +49,21 @@ def tail_gain(causes: Sequence[EffectQuantity], departure: Sequence[float]) -> f
     return total
 
 
+def half_gaussian_gain(departure: Floats, covariance: Floats, one_sided: Sequence[bool]) -> float:
+    """Log evidence of half-Gaussian priors over that of Gaussian ones: twice the density, and only the part of the posterior with departures
+    above zero.
+
+    Args:
+        departure: (a,) likeliest ones by the Gaussian priors. covariance: (a, a) of their posterior.
+        one_sided: (a,) which priors are half.
+    """
+    total = 0.0
+    for i in np.flatnonzero(one_sided):
+        deviation = math.sqrt(max(covariance[i, i], 1e-30))
+        total += math.log(2.0) + float(log_ndtr(departure[i] / deviation))
+    return total
+
+
 def posterior(
     residual: Floats, columns: Floats, departure: Floats, variance: Floats, numerics: Floats
 ) -> tuple[Floats, Floats, float]:

@@ -19,6 +19,7 @@ from ctr_dynamics.diagnosis.forward_model import Key
 from ctr_dynamics.diagnosis.inference.fit_problem import Local, Problem
 from ctr_dynamics.diagnosis.inference.gaussian_posterior import (
     cost,
+    half_gaussian_gain,
     numerics_part,
     posterior,
     prior_variance,
@@ -325,7 +326,7 @@ def fit_at(
     tails = tail_gain(causes, [departure[place[q.key]] for q in causes])
     total = cost(residual, departure, variance, numerics) - 2.0 * tails
     evidence = -0.5 * total - 0.5 * occam
-    evidence += math.log(2.0) * sum(q.one_sided for q in causes)
+    evidence += half_gaussian_gain(departure, covariance, [q.key in wide and q.one_sided for q in active])
     within = within_tolerance(active, wide, departure, covariance, o.tolerance_limit, factor)
     factors = under_factors(
         active, wide, residual, columns, departure, numerics, problem.options, relative_to=factor

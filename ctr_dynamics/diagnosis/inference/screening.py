@@ -18,7 +18,12 @@ from scipy.special import log_ndtr
 from ctr_dynamics.diagnosis.forward_model import Key
 from ctr_dynamics.diagnosis.inference.candidates import Candidate, causes_of, keys_of, log_prior, tube_of
 from ctr_dynamics.diagnosis.inference.fit_problem import Problem
-from ctr_dynamics.diagnosis.inference.gaussian_posterior import posterior, variances, within_tolerance
+from ctr_dynamics.diagnosis.inference.gaussian_posterior import (
+    half_gaussian_gain,
+    posterior,
+    variances,
+    within_tolerance,
+)
 from ctr_dynamics.diagnosis.inference.map_fit import Fit
 from ctr_dynamics.diagnosis.inference.sensitivities import Sensitivities, Trial
 from ctr_dynamics.effects import EffectQuantity
@@ -153,7 +158,7 @@ def rank_pairs(
             continue
         evidence = -0.5 * (left - float(right[where] @ size)) - volume
         evidence -= 0.5 * float(np.linalg.slogdet(information)[1])
-        evidence += math.log(2.0) * sum(one_sided)
+        evidence += half_gaussian_gain(size, np.linalg.inv(information), one_sided)
         nuisances = np.linalg.solve(factor.T, half[:, -1] - half[:, where] @ size)[: len(spread)]
         within = float(np.sum(log_ndtr((limit - np.abs(nuisances)) / spread)))
         evidence += within - len(spread) * float(log_ndtr(limit))
