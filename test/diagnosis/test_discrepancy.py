@@ -185,11 +185,11 @@ def test_priors_count_in_full_and_evidence_by_its_temperature(monkeypatch):
     beside = SimpleNamespace(process=None, rms_m=1e-3, log_evidence=0.0)
     monkeypatch.setattr(evidence, "every_process", lambda problem, context: [None])
     monkeypatch.setattr(evidence, "discrepancy_of", lambda *arguments: beside)
-    monkeypatch.setattr(evidence, "log_prior", lambda members, pool, o: np.log(priors[members]))
+    monkeypatch.setattr(evidence, "log_prior", lambda members, pool, o, point: np.log(priors[members]))
     monkeypatch.setattr(evidence, "_refit_likeliest", lambda *arguments: None)
     asked = [
         SimpleNamespace(
-            members=names, keys=frozenset(names), effects=tuple(names), fit=None, discrepancy=None,
+            members=names, keys=frozenset(names), effects=tuple(names), fit=SimpleNamespace(point={}), discrepancy=None,
             fitted_score=gained[names] + np.log(priors[names]),
         )
         for names in priors

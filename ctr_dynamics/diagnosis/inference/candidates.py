@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import logsumexp
 
 from ctr_dynamics.diagnosis.diagnosis_options import PriorOptions
 from ctr_dynamics.diagnosis.forward_model import Key
@@ -109,12 +110,46 @@ def tube_of(q: EffectQuantity) -> str:
     return q.name.split(".")[0] if q.name.startswith("tube") else ""
 
 
-def log_prior(members: Sequence[Candidate], every: Sequence[Candidate], options: PriorOptions) -> float:
-    """Log prior probability of a set of candidates; variants of an effect share its probability."""
+def log_prior(
+    members: Sequence[Candidate],
+    every: Sequence[Candidate],
+    options: PriorOptions,
+    point: Mapping[Key, float],
+) -> float:
+    """Log prior probability of a set of candidates among ``every``.
+
+    The parameters that an effect may be tried with, as those of each tube, share its probability. Presets do not: they are where one search
+    starts from, and together they are the prior of its shape.
+
+    Args:
+        point: coordinates of a fit; shapes that it does not hold are where they start.
+    """
     if not members:
         return math.log(options.clean)
     effects = len({c.effect for c in every})
     mass = {1: options.single, 2: options.pair}.get(len(members), options.triple)
-    count = math.comb(effects, len(members))
-    variants = sum(math.log(max(1, sum(c.effect == m.effect for c in every))) for m in members)
-    return math.log(mass / count) - variants
+    total = math.log(mass / math.comb(effects, len(members)))
+    for m in members:
+        total -= math.log(max(1, len({c.keys for c in every if c.effect == m.effect})))
+        total += _shape_gain(m, [c for c in every if c.keys == m.keys], point)
+    return total
+
+
+def _shape_gain(member: Candidate, forms: Sequence[Candidate], point: Mapping[Key, float]) -> float:
+    """Log density of the shape of ``member`` by the priors around all presets, each as likely, over that around its own.
+
+    A fit has the latter. Priors around presets that are near one another overlap, and more of them make no shape less likely.
+    """
+    starts = {tuple(q.off for q in c.shapes): c.shapes for c in (*forms, member)}
+    if len(starts) < 2:
+        return 0.0
+    own = sum(((point.get(q.key, q.off) - q.off) / q.scale) ** 2 for q in member.shapes)
+    squares = []
+    for shapes in starts.values():
+        departures = [point.get(q.key, m.off) - q.off for q, m in zip(shapes, member.shapes, strict=True)]
+        turned = [
+            math.remainder(d, q.parameter.period) if q.parameter.period else d
+            for d, q in zip(departures, shapes, strict=True)
+        ]
+        squares.append(sum((d / q.scale) ** 2 for d, q in zip(turned, shapes, strict=True)))
+    return float(logsumexp(-0.5 * np.array(squares))) - math.log(len(squares)) + 0.5 * own

@@ -117,7 +117,7 @@ def weigh(found: list[Hypothesis], pool: Sequence[Candidate], options: Diagnosis
     """Sort by log posterior; the better of two fits of the same set stays."""
     best: dict[frozenset[Key], Hypothesis] = {}
     for e, evidence in zip(found, _evidence(found), strict=True):
-        prior = log_prior(e.members, pool, options.prior)
+        prior = log_prior(e.members, pool, options.prior, e.fit.point)
         e.score, e.fitted_score = evidence + prior, e.fit.log_evidence + prior
         if e.keys not in best or best[e.keys].score < e.score:
             best[e.keys] = e
@@ -183,7 +183,7 @@ def weigh_discrepancy(found: WeighedHypotheses, problem: Problem, context: RunCo
     ask(first, processes)
     ask(others, list(dict.fromkeys(e.discrepancy.process for e in first if e.discrepancy is not None)))
     asked = [*first, *others]
-    priors = np.array([log_prior(e.members, found.pool, o.prior) for e in asked])
+    priors = np.array([log_prior(e.members, found.pool, o.prior, e.fit.point) for e in asked])
     count = len(asked)
     counts = np.where(take_away(asked, o.discrepancy.dominant), 0.0, -np.inf)
     _refit_likeliest(asked, priors + counts, problem, len(processes), context)

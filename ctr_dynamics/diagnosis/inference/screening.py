@@ -162,7 +162,8 @@ def rank_pairs(
         nuisances = np.linalg.solve(factor.T, half[:, -1] - half[:, where] @ size)[: len(spread)]
         within = float(np.sum(log_ndtr((limit - np.abs(nuisances)) / spread)))
         evidence += within - len(spread) * float(log_ndtr(limit))
-        ranked.append((evidence + log_prior(members, everything, problem.options.prior), members))
+        prior = log_prior(members, everything, problem.options.prior, base.point)
+        ranked.append((evidence + prior, members))
     return sorted(ranked, key=lambda item: -item[0])
 
 
