@@ -79,6 +79,11 @@ class Fit:
         return self.inflation * np.sqrt(left * np.maximum(np.diag(self.covariance), 0.0))
 
     @property
+    def effective_parameters(self) -> float:
+        """Number of parameters that the data determine instead of the priors: trace of the matrix from data to fitted values."""
+        return float(np.sum((self.columns @ self.covariance) * self.columns))
+
+    @property
     def point(self) -> dict[Key, float]:
         """Coordinates by quantity."""
         return {q.key: float(v) for q, v in zip(self.active, self.values, strict=True)}

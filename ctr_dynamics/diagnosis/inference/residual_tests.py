@@ -46,8 +46,11 @@ def by_axis(problem: Problem, whitened: Floats) -> list[Floats]:
 
 
 def whiteness(problem: Problem, fit: Fit) -> Whiteness:
-    """Ljung-Box test over all axes together, and whether the mean square of what ``fit`` leaves exceeds one."""
-    free = len(fit.active)
+    """Ljung-Box test over all axes together, and whether the mean square of what ``fit`` leaves exceeds one.
+
+    Noise loses what the fit follows of it: as many squares as there are effective parameters, and next to nothing of its correlation. Parameters
+    of a regression are none of a time series' own, which would take degrees of freedom from the Ljung-Box test.
+    """
     q, dof = 0.0, 0
     for x in by_axis(problem, fit.whitened):
         n = len(x)
@@ -58,8 +61,8 @@ def whiteness(problem: Problem, fit: Fit) -> Whiteness:
         r = np.array([float(x[k:] @ x[:-k]) / power for k in range(1, lags + 1)])
         q += n * (n + 2) * float(np.sum(r**2 / (n - np.arange(1, lags + 1))))
         dof += lags
-    p_correlation = chi_square.upper_tail(q, max(dof - free // 3, 1)) if dof else 1.0
-    m = max(len(fit.whitened) - free, 1)
+    p_correlation = chi_square.upper_tail(q, dof) if dof else 1.0
+    m = max(len(fit.whitened) - round(fit.effective_parameters), 1)
     power = float(fit.whitened @ fit.whitened)
     p_power = chi_square.upper_tail(power, m)
     p = min(1.0, 2.0 * min(p_correlation, p_power))
