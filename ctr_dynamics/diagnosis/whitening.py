@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cholesky, solve_triangular
+from scipy.linalg import solve_banded
 
 from ctr_dynamics.robot import Robot
 
@@ -16,6 +16,9 @@ Floats = NDArray[np.float64]
 
 class Whitener:
     """Turns residuals (s, 6) into independent numbers of unit variance: white noise plus drift with a correlation time, per axis.
+
+    These are the innovations of a Kalman filter whose state is the drift, over their deviations. They are those of the Cholesky factor of the
+    covariance of all poses, which would take memory that grows with the square of their number.
 
     Args:
         stamps: (s,) s.
@@ -28,10 +31,18 @@ class Whitener:
     ) -> None:
         noise = robot.tracker.noise
         self.mask, self.used = mask, used
-        t = stamps[used]
-        covariance = noise.drift.value**2 * np.exp(-np.abs(t[:, None] - t[None]) / noise.drift_time.value)
-        covariance[np.diag_indices(len(t))] += max(noise.position.value, 1e-6) ** 2
-        self._factor = cholesky(covariance, lower=True)
+        drift, white = noise.drift.value**2, max(noise.position.value, 1e-6) ** 2
+        keep = np.exp(-np.diff(stamps[used]) / noise.drift_time.value)
+        expected = np.full(int(used.sum()), drift)  # variance of the drift given the poses before each
+        for i, kept in enumerate(keep):
+            after = expected[i] * white / (expected[i] + white)
+            expected[i + 1] = kept**2 * after + drift * (1.0 - kept**2)
+        variance = expected + white
+        gain = expected / variance
+        self._deviation = np.sqrt(variance)
+        # the drift that is expected at each pose follows from the one before, measured or given the innovations
+        self._into, self._following = (gain * np.append(keep, 0.0))[:-1], keep
+        self._decay = keep * (1.0 - gain[:-1])
         self._rotation = max(noise.rotation.value, 1e-6)
 
     @property
@@ -45,22 +56,34 @@ class Whitener:
         parts = []
         for axis in np.flatnonzero(self.mask):
             column = flat[:, axis]
-            parts.append(
-                solve_triangular(self._factor, column, lower=True) if axis < 3 else column / self._rotation
-            )
+            parts.append(self._innovations(column) if axis < 3 else column / self._rotation)
         out = np.concatenate(parts)
         return out if values.ndim == 3 else out[:, 0]
 
     def positions(self, whitened: Floats) -> Floats:
         """(n, ...) in m of whitened positions (n, ...) of one axis: the inverse of whitening."""
-        return np.asarray(self._factor @ whitened)
+        deviation = self._deviation.reshape(-1, *[1] * (whitened.ndim - 1))
+        innovations = deviation * whitened
+        return innovations + self._drift(self._following, innovations)
 
     def covariance(self, process: Floats, position: bool) -> Floats:
         """Whitened covariance (n, n) of a process on one axis, whose covariance at the poses that count is ``process`` (m^2 or rad^2)."""
         if not position:
             return process / self._rotation**2
-        half = solve_triangular(self._factor, process, lower=True)
-        return np.asarray(solve_triangular(self._factor, half.T, lower=True))
+        return self._innovations(self._innovations(process).T)
+
+    def _innovations(self, values: Floats) -> Floats:
+        """Whitened positions (n, r) of one axis."""
+        return np.asarray((values - self._drift(self._decay, values)) / self._deviation[:, None])
+
+    def _drift(self, keep: Floats, values: Floats) -> Floats:
+        """Drift (n, ...) that is expected at each pose: x[0] = 0, x[i + 1] = keep[i] x[i] + into[i] values[i]."""
+        if len(values) < 2:
+            return np.zeros_like(values)
+        right = np.zeros_like(values)
+        right[1:] = self._into.reshape(-1, *[1] * (values.ndim - 1)) * values[:-1]
+        bands = np.stack([np.ones(len(values)), np.append(-keep, 0.0)])
+        return np.asarray(solve_banded((1, 0), bands, right))
 
 
 def noise_floor(robot: Robot) -> float:
