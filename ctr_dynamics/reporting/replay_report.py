@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 
 from ctr_dynamics import chi_square
 from ctr_dynamics.io.messages.cdr import PoseIn
-from ctr_dynamics.io.messages.unit_quaternions import is_unit, norm
 from ctr_dynamics.parameters import PARAMETERS
 from ctr_dynamics.reporting.animation import add_animation
 from ctr_dynamics.reporting.figures import Panel, figure_svg
 from ctr_dynamics.reporting.page import Page
+from ctr_dynamics.sensing.tracker_tips import tracker_tips
 
 if TYPE_CHECKING:
     from ctr_dynamics.estimation.step_output import Innovation, StepOutput
@@ -74,19 +74,11 @@ class ReplayLog:
 
     def samples(self) -> tuple[Floats, Floats]:
         """Times (s,) s and positions (s, 3) m of the tip in `ctr_base` that the usable tracker measurements show."""
-        whole = self.tracker.mask[3:].all()
-        times, points = [], []
-        for pose in self.poses:
-            stamp = (pose.stamp_ns - (self.first_ns or 0)) * 1e-9
-            q = np.array(pose.quaternion_xyzw)[[3, 0, 1, 2]]
-            if not whole:
-                t = float(self.tracker.observed_times(np.array(stamp)))
-                q = self.turned[min(int(np.searchsorted(self.t, t)), len(self.t) - 1)]
-            if np.isfinite(pose.position).all() and is_unit(norm(q)):
-                time, point, _ = self.tracker.inverse(stamp, np.array(pose.position), q, q)
-                times.append(time)
-                points.append(point)
-        return np.array(times), np.array(points).reshape(-1, 3)
+
+        def turned(t: float) -> Floats:
+            return self.turned[min(int(np.searchsorted(self.t, t)), len(self.t) - 1)]
+
+        return tracker_tips(self.poses, self.first_ns or 0, self.tracker, turned)
 
 
 def replay_page(log: ReplayLog, summary: dict[str, Any], step_times_s: Sequence[float]) -> Page:

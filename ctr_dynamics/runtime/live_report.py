@@ -15,10 +15,10 @@ from ctr_dynamics.effects import make_plant
 from ctr_dynamics.io.bag_reader import open_bag
 from ctr_dynamics.io.messages.cdr import PoseIn, decode_point_cloud, decode_pose_stamped
 from ctr_dynamics.io.messages.topics import STEP_NS
-from ctr_dynamics.io.messages.unit_quaternions import is_unit, norm
 from ctr_dynamics.io.truth_files import read_truth
 from ctr_dynamics.robot import Robot
 from ctr_dynamics.sensing import TrackerModel
+from ctr_dynamics.sensing.tracker_tips import tracker_tips
 
 SETTLE_S = 0.5
 """Left out at the start of comparisons with the truth."""
@@ -91,15 +91,8 @@ def nominal_tracker(robot: Robot) -> TrackerModel:
 
 def tracker_trace(bag: Path, start_ns: int, tracker: TrackerModel) -> Trace:
     """The tip in the base frame as the usable poses of a bag show it, relative to its own `start_ns`."""
-    poses = [m.message for m in open_bag(bag).inputs() if isinstance(m.message, PoseIn)]
-    t, p = [], []
-    for pose in sorted(poses):
-        q = np.array(pose.quaternion_xyzw)[[3, 0, 1, 2]]
-        if np.isfinite(pose.position).all() and is_unit(norm(q)):
-            time, point, _ = tracker.inverse((pose.stamp_ns - start_ns) * 1e-9, np.array(pose.position), q)
-            t.append(time)
-            p.append(point)
-    return Trace(np.array(t), np.array(p).reshape(-1, 3))
+    poses = sorted(m.message for m in open_bag(bag).inputs() if isinstance(m.message, PoseIn))
+    return Trace(*tracker_tips(poses, start_ns, tracker))
 
 
 def truth_traces(file: Path) -> list[Trace]:
