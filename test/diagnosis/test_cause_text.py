@@ -4,7 +4,7 @@ import pytest
 
 from ctr_dynamics.diagnosis.output.cause_text import cause_text
 from ctr_dynamics.effects import effect_quantities
-from ctr_dynamics.robot_files import load_robot
+from ctr_dynamics.robot_files import load_robot, robot_from_dict, robot_to_dict
 
 TISSUE = load_robot("till2020_tissue")
 
@@ -62,6 +62,52 @@ def entry(value, low, high, unit, nominal):
 )
 def test_sentence(effect, parameters, text):
     assert cause_text(TISSUE, effect, parameters) == text
+
+
+@pytest.mark.parametrize(
+    ("extensions", "effect", "parameters", "text"),
+    [
+        (
+            {"youngs_modulus": {"tube2.scale": 0.8}},
+            "youngs_modulus",
+            {"tube2.scale": entry(0.92, 0.9, 0.94, "1", 1.0)},
+            "outer tube: E = 55.2 GPa instead of 60 (-8 %), 90 % interval 54 to 56.4",
+        ),
+        (
+            {"youngs_modulus": {"all.scale": 0.8}},
+            "youngs_modulus",
+            {"tube2.scale": entry(0.92, 0.9, 0.94, "1", 1.0)},
+            "outer tube: E = 55.2 GPa instead of 60 (-8 %), 90 % interval 54 to 56.4",
+        ),
+        (
+            {"youngs_modulus": {"tube2.scale": 0.8}},
+            "shear_modulus",
+            {"tube2.scale": entry(0.5, 0.4, 0.6, "1", 1.0)},
+            "outer tube: G = 11.54 GPa instead of 23.08 (-50 %), 90 % interval 9.231 to 13.85",
+        ),
+        (
+            {"tracker_averaging": {"window_s": 0.03}},
+            "tracker_averaging",
+            {"window_s": entry(0.01, 0.008, 0.012, "s", 0.0)},
+            "tracker averaging, window = 40 ms instead of 30 (+33.3 %), 90 % interval 38 to 42",
+        ),
+        (
+            {"tracker_scale": {"scale": 1.02}},
+            "tracker_scale",
+            {"scale": entry(1.01, 1.0, 1.02, "1", 1.0)},
+            "factor on the tracker scale = 1.03 instead of 1.02 (+1 %), 90 % interval 1.02 to 1.04",
+        ),
+        (
+            {"stribeck": {"static_ratio": 2.0}},
+            "stribeck",
+            {"static_ratio": entry(2.5, 2.0, 3.0, "1", 2.0)},
+            "stribeck, static ratio = 2.5 instead of 2 (+25 %), 90 % interval 2 to 3",
+        ),
+    ],
+)
+def test_what_the_robot_file_has_as_an_extension_is_what_it_has(extensions, effect, parameters, text):
+    robot = robot_from_dict({**robot_to_dict(TISSUE), "extensions": extensions})
+    assert cause_text(robot, effect, parameters) == text
 
 
 @pytest.mark.parametrize("name", ["till2020_tissue", "three_tube"])

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from itertools import takewhile
 from typing import Any, NamedTuple
 
+from ctr_dynamics.effects import EFFECTS
 from ctr_dynamics.robot import Robot, Tube
 
 
@@ -70,19 +72,32 @@ def _parameter(robot: Robot, effect: str, name: str, entry: dict[str, Any]) -> s
     part, _, own = name.rpartition(".")
     tube = robot.tubes[int(part.removeprefix("tube")) - 1] if part.startswith("tube") else None
     what = effect.replace("_", " ")
+    before = robot.extensions.get(effect, {})
     if own == "scale" and effect in SCALED and tube is not None:
         what, of, unit = SCALED[effect]
-        value, nominal, *ends = (None if x is None else x * of(tube) for x in (value, nominal, *ends))
-    elif own == "scale":
-        what = f"factor on the {what}"
+        follows = effect == "shear_modulus" and tube.shear_follows_youngs
+        known = [robot.extensions.get("youngs_modulus", {}), before] if follows else [before]
+        file = of(tube) * math.prod(e.get(key, 1.0) for e in known for key in (name, "all.scale"))
+        value, nominal, *ends = (None if x is None else x * file for x in (value, nominal, *ends))
     else:
-        what = ", ".join([what, *_words(own, effect)])
+        what = f"factor on the {what}" if own == "scale" else ", ".join([what, *_words(own, effect)])
+        value, nominal, *ends = (
+            _with_extension(x, effect, before.get(name)) for x in (value, nominal, *ends)
+        )
     where = "all tubes: " if part == "all" else ""
     if tube is not None:
         where = f"{tube.name if 'tube' in tube.name else tube.name + ' tube'}: "
     change = f" ({100.0 * (value / nominal - 1.0):+.3g} %)" if value is not None and nominal else ""
     low, high = (_number(x, unit) for x in ends)
     return f"{where}{what} = {shown(value, unit)} instead of {_number(nominal, unit)}{change}, 90 % interval {low} to {high}"
+
+
+def _with_extension(value: float | None, effect: str, before: float | None) -> float | None:
+    """``value``, which is on top of the robot file, together with what the file's own extension of the effect has (``before``)."""
+    if value is None or before is None:
+        return value
+    kind = EFFECTS[effect].combine
+    return value + before if kind == "add" else value * before if kind == "multiply" else value
 
 
 def _words(name: str, effect: str) -> list[str]:
