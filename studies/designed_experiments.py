@@ -29,10 +29,10 @@ from ctr_dynamics.benchmarks.fleet import record, scenario_for
 from ctr_dynamics.benchmarks.fleet_robots import Draw, drawn, fleet_robot, seed_of
 from ctr_dynamics.diagnosis.diagnosis_options import DiagnosisOptions
 from ctr_dynamics.diagnosis.diagnosis_result import Diagnosis
-from ctr_dynamics.diagnosis.inference.calibration import nuisances_of
 from ctr_dynamics.diagnosis.inference.candidates import Candidate, candidates
 from ctr_dynamics.diagnosis.inference.discretisation_error import choose_nodes
 from ctr_dynamics.diagnosis.inference.fit_problem import choose_steps, make_problem
+from ctr_dynamics.diagnosis.inference.recalibration import nuisances_of
 from ctr_dynamics.diagnosis.inference.sensitivities import sensitivities_at
 from ctr_dynamics.diagnosis.inference.separation import left_over
 from ctr_dynamics.diagnosis.next_experiment import Contrast, contrast_of, next_experiment

@@ -25,7 +25,7 @@ FURTHER: dict[str, tuple[str, ...]] = {
     "ctr_dynamics.estimation.step_output": ("StepOutput", "Innovation", "Modes"),
     "ctr_dynamics.io": ("Bag", "write_bag", "BagWriter", "LiveRecorder"),
     "ctr_dynamics.runtime.replay": ("ReplayResult", "Player"),
-    "ctr_dynamics.simulation": ("Recording", "write_recording"),
+    "ctr_dynamics.simulation": ("SimulatedRecording", "write_recording"),
     "ctr_dynamics.csv_import.convert": ("read_log", "write"),
     "ctr_dynamics.reporting": ("Page", "Panel", "figure_svg"),
 }
@@ -78,7 +78,7 @@ GLOSSARY = {
     "quaternion_xyzw": "(4,) unit quaternion in ROS order",
     "progress": "called now and then with the fraction done",
     "reason": "why not, in words; empty when there is no problem",
-    "recording": "what a simulation gave (`Recording`)",
+    "recording": "what a simulation gave (`SimulatedRecording`)",
     "robot": "a `Robot`",
     "scenario": "a `Scenario`",
     "solver": "work of the step's solver",

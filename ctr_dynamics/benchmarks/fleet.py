@@ -28,7 +28,7 @@ from ctr_dynamics.runtime.replay import Player
 from ctr_dynamics.sensing import TrackerModel
 from ctr_dynamics.simulation.motion_primitives import Hold, Multisine
 from ctr_dynamics.simulation.scenario import Load, Scenario, Solver, TubeMotion
-from ctr_dynamics.simulation.scenario_run import Recording, simulate, write_recording
+from ctr_dynamics.simulation.scenario_run import SimulatedRecording, simulate, write_recording
 
 Floats = NDArray[np.float64]
 CUT_S, TURN_S, END_S = 0.6, 2.0, 5.0  # a weight is cut; all tubes turn; end of a bag
@@ -92,7 +92,7 @@ def record(robot: Robot, draw: Draw, scenario: Scenario, bag: Path) -> tuple[Flo
         alpha, beta = run.joints(t)
         return alpha - draw.offsets, beta
 
-    seen: Recording = replace(run, joints=read)
+    seen: SimulatedRecording = replace(run, joints=read)
     write_recording(bag, scenario, draw.robot, seen)
     position, quaternion = TrackerModel.of_robot(draw.robot).reported(run.t, run.position, run.quaternion)
     nominal = TrackerModel.of_robot(robot)

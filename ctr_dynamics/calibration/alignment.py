@@ -25,7 +25,7 @@ from ctr_dynamics.calibration.tip_fit import (
     mount_coordinates,
 )
 from ctr_dynamics.calibration.tip_samples import TipSamples
-from ctr_dynamics.diagnosis.inference.calibration import nuisances_of
+from ctr_dynamics.diagnosis.inference.recalibration import nuisances_of
 from ctr_dynamics.effects import EffectQuantity, effect_quantities, make_plant
 from ctr_dynamics.errors import InputError
 from ctr_dynamics.kernels.rotations import (

@@ -30,7 +30,7 @@ from ctr_dynamics.calibration.tip_fit import (
 )
 from ctr_dynamics.calibration.tip_samples import TipSamples
 from ctr_dynamics.diagnosis.inference.map_fit import Fit
-from ctr_dynamics.diagnosis.output.robot_export import robot_with
+from ctr_dynamics.diagnosis.output.robot_export import robot_with_fit
 from ctr_dynamics.effects import effect_quantities
 from ctr_dynamics.errors import InputError
 from ctr_dynamics.robot import Robot
@@ -152,4 +152,4 @@ def calibrated_robot(robot: Robot, fit: TipFit, note: str) -> Robot:
         cost=0.0,
         inflation=1.0,
     )
-    return robot_with(robot, exported, robot.name, note)
+    return robot_with_fit(robot, exported, robot.name, note)

@@ -7,7 +7,7 @@
 | data | `recording` |
 | configuration | `configuration_mistakes` |
 | forward model | `forward_model`, `whitening` |
-| calibration | `inference.calibration`; fits: `fit_problem`, `map_fit`, `gaussian_posterior`, `discretisation_error` |
+| re-calibration | `inference.recalibration`; fits: `fit_problem`, `map_fit`, `gaussian_posterior`, `discretisation_error` |
 | screening | `inference.candidates`, `inference.sensitivities`, `inference.screening` |
 | hypotheses | `inference.hypothesis_search`, `inference.search_moves`, `inference.hypotheses`, `inference.contact_plane` |
 | evidence | `inference.evidence` |

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from ctr_dynamics.diagnosis.configuration_mistakes import FoundMistake, beginning, find_mistake, misfit
 from ctr_dynamics.diagnosis.diagnosis_options import DiagnosisOptions
 from ctr_dynamics.diagnosis.diagnosis_result import Diagnosis
-from ctr_dynamics.diagnosis.inference.calibration import calibrate, fit_nuisances, nuisances_of
 from ctr_dynamics.diagnosis.inference.candidates import candidates
 from ctr_dynamics.diagnosis.inference.discretisation_error import choose_nodes, correct_discretisation
 from ctr_dynamics.diagnosis.inference.evidence import weigh_by_prediction, weigh_discrepancy
@@ -23,6 +22,7 @@ from ctr_dynamics.diagnosis.inference.fit_problem import Problem, choose_steps, 
 from ctr_dynamics.diagnosis.inference.fit_quality import is_wrong
 from ctr_dynamics.diagnosis.inference.hypothesis_search import search_hypotheses
 from ctr_dynamics.diagnosis.inference.map_fit import Fit
+from ctr_dynamics.diagnosis.inference.recalibration import fit_nuisances, nuisances_of, recalibrate
 from ctr_dynamics.diagnosis.inference.residual_tests import rms, whiteness
 from ctr_dynamics.diagnosis.inference.tolerance_evidence import tolerance_evidence
 from ctr_dynamics.diagnosis.learned.learn import learn_force, on_robot
@@ -92,8 +92,8 @@ def diagnose_recordings(
 
     choose_steps(problem, {}, context)
 
-    # calibration: nuisances inside tolerance, and the solver's own error
-    recalibrated, result.numerics = calibrate(problem, context)
+    # re-calibration: nuisances inside tolerance, and the solver's own error
+    recalibrated, result.numerics = recalibrate(problem, context)
     result.recalibrated = result.extended = recalibrated
     result.tested += ["time_discretisation", "space_discretisation"]
     result.whiteness_recalibrated = whiteness(problem, recalibrated)

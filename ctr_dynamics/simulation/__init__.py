@@ -3,6 +3,6 @@ driver messages.
 """
 
 from ctr_dynamics.simulation.scenario import Scenario, load_scenario, scenario_names
-from ctr_dynamics.simulation.scenario_run import Recording, simulate, write_recording
+from ctr_dynamics.simulation.scenario_run import SimulatedRecording, simulate, write_recording
 
-__all__ = ["Recording", "Scenario", "load_scenario", "scenario_names", "simulate", "write_recording"]
+__all__ = ["Scenario", "SimulatedRecording", "load_scenario", "scenario_names", "simulate", "write_recording"]

@@ -34,7 +34,7 @@ FRAME = "ctr_base"
 
 
 @dataclass
-class Recording:
+class SimulatedRecording:
     """What a run gave; times in s from its begin, poses in ``ctr_base``.
 
     Attributes:
@@ -169,7 +169,7 @@ def drives(scenario: Scenario, robot: Robot, model: Model) -> tuple[Drive, Drive
     return lambda t: moving(t, acting(t)), lambda t: read(t, told(t))
 
 
-def simulate(scenario: Scenario, robot: Robot, progress: Progress | None = None) -> Recording:
+def simulate(scenario: Scenario, robot: Robot, progress: Progress | None = None) -> SimulatedRecording:
     """Run a scenario with a robot from rest in the static equilibrium of its first inputs.
 
     Args:
@@ -213,7 +213,7 @@ def simulate(scenario: Scenario, robot: Robot, progress: Progress | None = None)
             progress(k / steps)
     rows = np.array(tips)
     quaternion = rows[:, 3:] / np.linalg.norm(rows[:, 3:], axis=1, keepdims=True)
-    return Recording(
+    return SimulatedRecording(
         dt * np.arange(len(rows), dtype=np.float64),
         rows[:, :3],
         quaternion,
@@ -232,7 +232,7 @@ def _stamps(rate: float, end: float) -> list[int]:
     return [round(k * 1e9 / rate) for k in range(math.floor(end * rate + 1e-9) + 1)]
 
 
-def _tip_at(recording: Recording) -> Callable[[Floats], Floats]:
+def _tip_at(recording: SimulatedRecording) -> Callable[[Floats], Floats]:
     """The tip (s, 7) at any times (s,) in s, held outside the run."""
     poses = np.hstack([recording.position, recording.quaternion])
 
@@ -246,7 +246,7 @@ def _tip_at(recording: Recording) -> Callable[[Floats], Floats]:
     return at
 
 
-def truth_of(scenario: Scenario, robot: Robot, recording: Recording) -> Truth:
+def truth_of(scenario: Scenario, robot: Robot, recording: SimulatedRecording) -> Truth:
     """The tip of a run over time, its velocity by central differences, and what an ideal tracker would have reported at each time."""
     tracker = make_plant(robot).tracker.corrected(delay=0.0)
     velocity = np.gradient(recording.position, recording.t, axis=0, edge_order=2)
@@ -260,7 +260,7 @@ def truth_of(scenario: Scenario, robot: Robot, recording: Recording) -> Truth:
     )
 
 
-def messages(scenario: Scenario, robot: Robot, recording: Recording) -> list[tuple[int, str, bytes]]:
+def messages(scenario: Scenario, robot: Robot, recording: SimulatedRecording) -> list[tuple[int, str, bytes]]:
     """(log time ns, topic, message) of a run in the order of log times, with noise and the tracker's chain as in files."""
     n = robot.n_tubes
     end = float(recording.t[-1])
@@ -323,7 +323,7 @@ def messages(scenario: Scenario, robot: Robot, recording: Recording) -> list[tup
     return sorted(found, key=lambda item: item[:2])
 
 
-def write_recording(path: Path, scenario: Scenario, robot: Robot, recording: Recording) -> int:
+def write_recording(path: Path, scenario: Scenario, robot: Robot, recording: SimulatedRecording) -> int:
     """Write the driver messages of a run as one MCAP file; returns their number. The same run gives the same
     bytes.
 

@@ -11,7 +11,7 @@ from ctr_dynamics.calibration.model_error import model_error_of
 from ctr_dynamics.calibration.robot_calibration import calibrate, calibrated_robot, split
 from ctr_dynamics.calibration.tip_fit import Coordinate, TipFit, TipModel, fit_tips
 from ctr_dynamics.cli.main import main
-from ctr_dynamics.diagnosis.inference.calibration import nuisances_of
+from ctr_dynamics.diagnosis.inference.recalibration import nuisances_of
 from ctr_dynamics.errors import InputError
 from ctr_dynamics.robot_files import load_robot, robot_from_dict, robot_to_dict, robot_to_yaml
 from test.calibration.calibration_cases import tips_of

@@ -10,7 +10,7 @@ import json
 import numpy as np
 
 from ctr_dynamics.diagnosis.diagnosis_options import DiagnosisOptions
-from ctr_dynamics.diagnosis.inference.calibration import nuisances_of
+from ctr_dynamics.diagnosis.inference.recalibration import nuisances_of
 from ctr_dynamics.diagnosis.inference.candidates import candidates
 from ctr_dynamics.diagnosis.inference.fit_problem import make_problem
 from ctr_dynamics.diagnosis.inference.sensitivities import sensitivities_at

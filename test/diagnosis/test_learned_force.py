@@ -12,12 +12,12 @@ from truth.motion import sweep
 from truth.world import Law, World, carry_out
 
 from ctr_dynamics.diagnosis.diagnosis_options import DiagnosisOptions
-from ctr_dynamics.diagnosis.inference.calibration import nuisances_of
 from ctr_dynamics.diagnosis.inference.fit_problem import make_problem
 from ctr_dynamics.diagnosis.inference.map_fit import fit
+from ctr_dynamics.diagnosis.inference.recalibration import nuisances_of
 from ctr_dynamics.diagnosis.inference.residual_tests import rms
 from ctr_dynamics.diagnosis.learned.learn import learn_force, rejection
-from ctr_dynamics.diagnosis.output.robot_export import robot_with
+from ctr_dynamics.diagnosis.output.robot_export import robot_with_fit
 from ctr_dynamics.diagnosis.recording import read_recording
 from ctr_dynamics.diagnosis.run_context import RunContext
 from ctr_dynamics.diagnosis.verdict.validation import BagErrors, Validation
@@ -55,7 +55,7 @@ def test_hidden_force_is_learned(tmp_path, robot):
     assert 0.0 < force.validation.interval[0] < force.validation.gain < force.validation.interval[1]
     assert len(force.fit.residual) == problem.size
 
-    saved = robot_with(force.robot, force.fit, "extended", "learned")
+    saved = robot_with_fit(force.robot, force.fit, "extended", "learned")
     assert set(saved.extensions["learned_force"]) >= {q.name for q in force.terms}
     before = rms(problem.on([other]).residuals(base.point)[0][:, :3])
     again = make_problem(saved, [other], (), np.ones(6, bool), DiagnosisOptions())

@@ -7,12 +7,12 @@ import pytest
 from diagnosis_cases import LongVibration, Vibration, quantity
 
 from ctr_dynamics.diagnosis.diagnosis_options import DiagnosisOptions
-from ctr_dynamics.diagnosis.inference import calibration
-from ctr_dynamics.diagnosis.inference.calibration import _from_growing_parts
+from ctr_dynamics.diagnosis.inference import recalibration
 from ctr_dynamics.diagnosis.inference.fit_problem import make_problem
 from ctr_dynamics.diagnosis.inference.gaussian_posterior import posterior
 from ctr_dynamics.diagnosis.inference.growing_fit import fit_growing
 from ctr_dynamics.diagnosis.inference.map_fit import GaussNewton, fit
+from ctr_dynamics.diagnosis.inference.recalibration import _from_growing_parts
 from ctr_dynamics.diagnosis.run_context import RunContext
 
 OPTIONS = DiagnosisOptions()
@@ -102,7 +102,7 @@ def test_a_frequency_is_found_by_growing_parts(recording, robot, known, monkeypa
     assert found.cost < stopped.cost - 1.0
     assert found.cost == pytest.approx(right.cost, abs=0.5)
     assert _from_growing_parts(problem, right, RunContext(workers=1)) is right
-    monkeypatch.setattr(calibration, "is_acceptable", lambda *_: False)
+    monkeypatch.setattr(recalibration, "is_acceptable", lambda *_: False)
     monkeypatch.setattr(problem.__class__, "until", lambda *_: problem.on([recording]))
     on = _from_growing_parts(problem, stopped, RunContext(workers=1))
     straight = fit(problem, (), stopped.point, polish=False)

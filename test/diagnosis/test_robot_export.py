@@ -5,9 +5,9 @@ import pytest
 import yaml
 
 from ctr_dynamics.diagnosis.forward_model import values_at
-from ctr_dynamics.diagnosis.inference.calibration import nuisances_of
 from ctr_dynamics.diagnosis.inference.map_fit import Fit
-from ctr_dynamics.diagnosis.output.robot_export import robot_with
+from ctr_dynamics.diagnosis.inference.recalibration import nuisances_of
+from ctr_dynamics.diagnosis.output.robot_export import robot_with_fit
 from ctr_dynamics.effects import EFFECTS, effect_quantities, make_plant
 from ctr_dynamics.robot_files import load_robot, robot_from_dict, robot_to_dict, robot_to_yaml
 
@@ -126,7 +126,7 @@ def test_the_plant_of_an_exported_cause_is_the_fitted_one(name, before):
     form = [q for q in every if q.effect in EFFECTS[name].form]
     nuisances = [q for q in nuisances_of(robot) if q.effect not in (name, *OF_A_RECORDING)]
     found = fit_of({q: away(q) for q in (*nuisances, *form, *causes)}, causes)
-    exported = robot_with(robot, found, "new", "")
+    exported = robot_with_fit(robot, found, "new", "")
     assert exported == robot_from_dict(yaml.safe_load(robot_to_yaml(exported)))
     assert_same_plant(exported, robot, found.point)
 
@@ -142,7 +142,7 @@ def test_what_a_calibration_finds_is_in_the_file(which, before):
     assert len(nuisances) > 5
     for q in nuisances:
         found = fit_of({other: away(q) if other is q else other.off for other in nuisances})
-        exported = robot_with(robot, found, "new", "")
+        exported = robot_with_fit(robot, found, "new", "")
         moved = {key: value for key, value in found.point.items() if key[0] not in OF_A_RECORDING}
         assert_same_plant(exported, robot, moved)
 
@@ -151,9 +151,9 @@ def test_a_nuisance_of_the_form_goes_with_its_cause_only():
     robot = TISSUE
     known = {q.key: q for q in effect_quantities(robot)}
     play, share = known["clearance", "play_rad"], known["play_kinematics", "share"]
-    with_cause = robot_with(robot, fit_of({share: 0.3, play: 0.01}, [play]), "new", "")
+    with_cause = robot_with_fit(robot, fit_of({share: 0.3, play: 0.01}, [play]), "new", "")
     assert with_cause.extensions == {"play_kinematics": {"share": 0.3}, "clearance": {"play_rad": 0.01}}
-    assert robot_with(robot, fit_of({share: 0.3}), "new", "").extensions == {}
+    assert robot_with_fit(robot, fit_of({share: 0.3}), "new", "").extensions == {}
 
 
 @pytest.mark.parametrize("tolerance", [0.0, 0.02])
@@ -162,7 +162,7 @@ def test_offsets_of_the_file_are_neither_lost_nor_doubled(tolerance):
     data["encoders"]["offset"]["tolerance"] = tolerance
     robot = robot_from_dict(data)
     offsets = [q for q in nuisances_of(robot) if q.effect == "encoder_offset"]
-    exported = robot_with(
+    exported = robot_with_fit(
         robot, fit_of({q: 0.02 if q.name == "tube1.offset_rad" else 0.0 for q in offsets}), "new", ""
     )
     assert exported.extensions["encoder_offset"]["tube1.offset_rad"] == pytest.approx(

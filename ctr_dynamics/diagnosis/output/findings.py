@@ -18,7 +18,7 @@ from ctr_dynamics.diagnosis.inference.residual_tests import rms
 from ctr_dynamics.diagnosis.inference.tolerance_evidence import WiderTolerance
 from ctr_dynamics.diagnosis.learned.dictionary import EFFECT
 from ctr_dynamics.diagnosis.output.cause_text import cause_text
-from ctr_dynamics.diagnosis.output.robot_export import robot_with
+from ctr_dynamics.diagnosis.output.robot_export import robot_with_fit
 from ctr_dynamics.diagnosis.verdict.separability import Cause
 from ctr_dynamics.diagnosis.whitening import noise_floor
 from ctr_dynamics.effects import EFFECTS, EffectQuantity
@@ -209,14 +209,14 @@ def write(directory: Path, diagnosis: Diagnosis, content: dict[str, Any]) -> Non
     robot, name = diagnosis.robot, diagnosis.robot.name
     if diagnosis.recalibrated is not None:
         note = "re-calibrated inside its tolerances"
-        recalibrated = robot_with(robot, diagnosis.recalibrated, f"{name}_recalibrated", note)
+        recalibrated = robot_with_fit(robot, diagnosis.recalibrated, f"{name}_recalibrated", note)
         _text(directory / RECALIBRATED, robot_to_yaml(recalibrated))
     if diagnosis.extended is not None:
         names = [c.effect for c in diagnosis.causes if c.effect in EFFECTS]
         if diagnosis.learning is not None and diagnosis.learning.force is not None:
             robot, names = diagnosis.learning.force.robot, [*names, "a learned force"]
         effects = ", ".join(names) or "no cause"
-        extended = robot_with(robot, diagnosis.extended, f"{name}_extended", f"extended by {effects}")
+        extended = robot_with_fit(robot, diagnosis.extended, f"{name}_extended", f"extended by {effects}")
         _text(directory / EXTENDED, robot_to_yaml(extended))
     _text(directory / FINDINGS, json.dumps(content, indent=1, allow_nan=False, ensure_ascii=False) + "\n")
 

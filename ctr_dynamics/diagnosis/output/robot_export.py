@@ -34,7 +34,7 @@ _VECTORS = {
 }
 
 
-def robot_with(robot: Robot, fit: Fit, name: str, note: str) -> Robot:
+def robot_with_fit(robot: Robot, fit: Fit, name: str, note: str) -> Robot:
     """``robot`` with the values and posterior deviations of ``fit``; ``note`` goes into its description.
 
     What belongs to a recording rather than the robot, such as the time of its loads, is left out.

@@ -1,4 +1,4 @@
-"""Calibration: nuisances fitted inside their tolerances, with no cause, and the discretisation error there.
+"""Re-calibration: nuisances fitted inside their tolerances, with no cause, and the discretisation error there.
 
 In: a problem. Out: the re-calibrated fit, against which every gain counts, and the size of the discretisation error.
 """
@@ -22,7 +22,7 @@ def nuisances_of(robot: Robot) -> list[EffectQuantity]:
     return [q for q in effect_quantities(robot) if q.tolerance > 0.0 and q.effect not in forms]
 
 
-def calibrate(problem: Problem, context: RunContext) -> tuple[Fit, dict[str, float]]:
+def recalibrate(problem: Problem, context: RunContext) -> tuple[Fit, dict[str, float]]:
     """Fit the nuisances, correct ``problem`` for its discretisation error at the fit, and fit again.
 
     Raises:
