@@ -10,6 +10,7 @@ import pytest
 import yaml
 
 from ctr_dynamics.cli import main as cli
+from ctr_dynamics.diagnosis.output.findings_keys import KEYS
 from ctr_dynamics.io.messages.topics import TOPICS
 from ctr_dynamics.parameters import PARAMETERS
 from ctr_dynamics.runtime.node_parameters import NODES
@@ -25,7 +26,7 @@ PAGES = [
     *sorted((ROOT / "docs").glob("*.md")),
     *sorted((ROOT / "msg_docs").glob("*.md")),
 ]
-NOT_CODE = {p.name for p in PARAMETERS} | {"ctr_dynamics/findings/1"}
+NOT_CODE = {p.name for p in PARAMETERS} | {key.path for key in KEYS} | {"ctr_dynamics/findings/1"}
 SNAP_VALUES = {"tube_coulomb", "tube_viscous", "epsilon", "beta1"}  # what `snap --set` takes
 TEXT = {
     page: page.read_text(encoding="utf-8") for page in [*PAGES, *sorted((ROOT / "examples").rglob("*.md"))]

@@ -13,6 +13,7 @@ from typing import Any
 import yaml
 
 from ctr_dynamics.diagnosis import diagnosis_options
+from ctr_dynamics.diagnosis.output.findings_keys import KEYS
 from ctr_dynamics.errors import InputError
 from ctr_dynamics.io.messages.topics import TOPICS
 from ctr_dynamics.parameters import PARAMETERS, Parameter
@@ -97,11 +98,18 @@ def diagnosis_option_tables() -> str:
     return "\n\n".join(parts)
 
 
+def findings_table() -> str:
+    """Markdown table of the keys of findings.json."""
+    rows = [[f"`{key.path}`", key.type, key.unit, key.text] for key in KEYS]
+    return _markdown(["key", "type", "unit", "meaning"], rows)
+
+
 # Page -> name of its markers, and what stands between them.
 SECTIONS = {
     Path("docs/topics.md"): ("topics", topic_table),
     Path("docs/parameters.md"): ("parameters", parameter_tables),
     Path("docs/diagnosis_options.md"): ("options", diagnosis_option_tables),
+    Path("docs/findings.md"): ("findings", findings_table),
     Path("docs/glossary.md"): ("vocabulary", words.table),
 }
 

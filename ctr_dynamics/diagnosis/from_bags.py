@@ -41,7 +41,7 @@ def diagnose(
 
     Returns:
         The content of ``findings.json``: ``verdict`` ("clean", "named", "ambiguous", "unknown", ...), ``causes`` with their sizes in SI units,
-        ``validation``, ``notes`` and more (docs/diagnosis.md lists the keys).
+        ``validation``, ``notes`` and more (docs/findings.md lists the keys).
 
     Raises:
         InputError: a bag that cannot be used or is given twice, no such robot, or a folder that cannot be written to.

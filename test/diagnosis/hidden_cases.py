@@ -8,6 +8,8 @@ from pathlib import Path
 import pytest
 from truth.cases import make_case
 
+from ctr_dynamics.diagnosis.output.findings_keys import undocumented
+
 
 def diagnosed(folder: Path, stratum: str, seed: int, effects, duration: float):
     """Make a case, run the command on it in a process of its own, then open the answer: findings, answer, and folder of the outputs."""
@@ -37,6 +39,7 @@ def check_files(findings, folder: Path) -> None:
     """Findings are plain JSON without NaN, and the files that they name are there."""
     stored = json.loads((folder / "findings.json").read_text(), parse_constant=lambda text: pytest.fail(text))
     assert stored["schema"] == "ctr_dynamics/findings/1"
+    assert undocumented(stored) == set()
     assert stored["verdict"] == findings["verdict"]
     for key in ("extended_robot", "recalibrated_robot"):
         assert (folder / stored[key]).is_file()

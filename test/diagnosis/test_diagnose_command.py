@@ -6,6 +6,7 @@ import pytest
 from truth.cases import make_case
 
 from ctr_dynamics.cli.main import main, spread
+from ctr_dynamics.diagnosis.output.findings_keys import undocumented
 
 
 @pytest.fixture(scope="module")
@@ -31,7 +32,7 @@ def test_command_on_a_local_cluster(resting, tmp_path, capsys):
     printed = json.loads(capsys.readouterr().out)
     assert printed["verdict"] == "not_excited"
     assert printed["next_experiment"]["scenario_file"] == "next_experiment.yaml"
-    assert (tmp_path / "out" / "findings.json").is_file()
+    assert undocumented(json.loads((tmp_path / "out" / "findings.json").read_text())) == set()
 
 
 def test_next_experiment_can_be_simulated(resting, tmp_path, capsys):
