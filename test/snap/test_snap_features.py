@@ -3,7 +3,10 @@
 import numpy as np
 import pytest
 
-from ctr_dynamics.snap.features import after_snap, crossing, extrema, frequencies
+from ctr_dynamics.robot_files import load_robot
+from ctr_dynamics.snap.experiment import robot_for_snap
+from ctr_dynamics.snap.features import LEVEL, after_snap, crossing, extrema, frequencies
+from ctr_dynamics.snap.scurve import s_curve
 
 
 def decaying(t):
@@ -38,3 +41,11 @@ def test_frequency_of_a_decaying_vibration():
     assert hz == pytest.approx(2e3, rel=0.03)
     assert height == 1.0
     assert frequencies(t, decaying(t), 12e-3) == []
+
+
+@pytest.mark.parametrize("beta1", [-0.112, -0.1374, -0.1628])
+def test_the_level_at_which_a_snap_is_timed_lies_between_the_folds(beta1):
+    robot = robot_for_snap(load_robot("till2020_snap"), {"beta1": beta1})
+    curve = s_curve(robot, np.array(robot.rest.beta.value), points=40, nodes=24)
+    (_, opens, _), (_, back, _) = curve.folds()
+    assert opens < LEVEL < back
