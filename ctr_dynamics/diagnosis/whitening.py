@@ -5,6 +5,8 @@ In: a robot and the stamps of its tracker. Out: a function from residuals to ind
 
 from __future__ import annotations
 
+import copy
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_banded
@@ -59,6 +61,18 @@ class Whitener:
             parts.append(self._innovations(column) if axis < 3 else column / self._rotation)
         out = np.concatenate(parts)
         return out if values.ndim == 3 else out[:, 0]
+
+    def part(self, first: int, end: int) -> Whitener:
+        """The same for the poses that count from the one numbered ``first`` to that before ``end``, given what is before them."""
+        found = copy.copy(self)
+        found.used = np.zeros_like(self.used)
+        found.used[np.flatnonzero(self.used)[first:end]] = True
+        found._deviation = self._deviation[first:end]
+        between = slice(first, max(min(end, len(self._deviation)) - 1, first))
+        found._into, found._following, found._decay = (
+            a[between] for a in (self._into, self._following, self._decay)
+        )
+        return found
 
     def positions(self, whitened: Floats) -> Floats:
         """(n, ...) in m of whitened positions (n, ...) of one axis: the inverse of whitening."""

@@ -9,7 +9,7 @@ from scipy import stats
 
 from ctr_dynamics.diagnosis.diagnosis_options import DiagnosisOptions
 from ctr_dynamics.diagnosis.forward_model import ForwardModel
-from ctr_dynamics.diagnosis.inference import evidence
+from ctr_dynamics.diagnosis.inference import discrepancy, evidence
 from ctr_dynamics.diagnosis.inference.discrepancy import (
     CorrelatedNoise,
     CorrelatedProblem,
@@ -204,3 +204,21 @@ def test_priors_count_in_full_and_evidence_by_its_temperature(monkeypatch):
     outside = options.prior.discrepancy
     assert dict(weighed.beside)[()] / alone[()] == pytest.approx(outside / (1.0 - outside))
     assert weighed.leading is asked[2]
+
+
+def test_a_long_recording_has_a_process_in_each_of_its_parts(problem, plain, monkeypatch):
+    """Where parts are long against its correlation time, it has the size, the evidence and the scatter of one process."""
+    residual = _noise(problem, np.random.default_rng(4), 5e-3, 0.03)
+    found = []
+    for whole in (discrepancy.WHOLE, 30):
+        monkeypatch.setattr(discrepancy, "WHOLE", whole)
+        monkeypatch.setattr(discrepancy, "PART", 15)  # of 40 poses, so that the last part is shorter
+        process = CorrelatedNoise(problem, 0.03)
+        assert max(len(size) for size, _ in process._axes) == (40 if whole > 40 else 15)
+        values = np.random.default_rng(5).normal(size=(problem.size, 2))
+        np.testing.assert_allclose(process.undone(process(values)), values, atol=1e-9)
+        found.append(_gain(problem, plain, [process], residual))
+    (one, gain), (several, also) = found
+    assert also == pytest.approx(gain, rel=0.1)
+    assert several.rms_m == pytest.approx(one.rms_m, rel=0.05)
+    np.testing.assert_allclose(several.sizes, one.sizes, rtol=0.15)

@@ -87,3 +87,20 @@ def test_hardly_any_poses_are_whitened(count):
     used = np.arange(3) < count
     whiten = Whitener(robot, np.arange(3.0), np.ones(6, bool), used)
     assert whiten(np.ones((3, 6))).shape == (6 * count,)
+
+
+@pytest.mark.parametrize(("first", "end"), [(0, 40), (40, 41), (100, 250), (200, 9000)])
+def test_part_of_a_recording_is_whitened_given_what_is_before_it(uneven, first, end):
+    whiten, covariance, rng = uneven
+    factor = np.linalg.cholesky(covariance)[first:end, first:end]
+    part = whiten.part(first, end)
+    assert part.used.sum() == len(factor)
+    np.testing.assert_array_equal(np.flatnonzero(part.used), np.flatnonzero(whiten.used)[first:end])
+    white = rng.normal(size=len(factor))
+    np.testing.assert_allclose(part.positions(white), factor @ white, rtol=1e-9, atol=1e-12)
+    process = np.eye(len(factor)) + 0.5
+    half = np.linalg.solve(factor, process)
+    found = part.covariance(process, position=True)
+    np.testing.assert_allclose(
+        found, np.linalg.solve(factor, half.T), rtol=1e-7, atol=1e-7 * np.abs(found).max()
+    )

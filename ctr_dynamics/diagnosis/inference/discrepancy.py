@@ -30,6 +30,7 @@ from ctr_dynamics.diagnosis.inference.gaussian_posterior import (
 from ctr_dynamics.diagnosis.inference.map_fit import Fit, fit, fit_at
 from ctr_dynamics.diagnosis.inference.tolerance_factors import credible, log_gain, under_factors
 from ctr_dynamics.diagnosis.run_context import RunContext
+from ctr_dynamics.diagnosis.whitening import Whitener
 from ctr_dynamics.effects import EffectQuantity
 
 Floats = NDArray[np.float64]
@@ -37,6 +38,7 @@ Sizes = tuple[float, float]
 """Of positions in m, and of rotations in rad."""
 ROUNDS = 4  # over both sizes
 SETTLED = 0.05  # log evidence, which decides nothing
+WHOLE, PART = 4000, 500  # poses that a process holds together, and parts of a longer recording: 10 s at 50 Hz
 SMOOTH = 2.1461932  # root of (1 + x) exp(-x) = 1 / e
 
 
@@ -69,8 +71,19 @@ def correlation(lag: Floats, smooth: bool) -> Floats:
     return np.asarray((1.0 + x) * np.exp(-x))
 
 
+def _parts(whiten: Whitener) -> list[Whitener]:
+    """``whiten`` in the parts in which a process is one."""
+    count = int(whiten.used.sum())
+    if count <= WHOLE:
+        return [whiten]
+    return [whiten.part(first, first + PART) for first in range(0, count, PART)]
+
+
 class CorrelatedNoise:
     """Eigenvectors of the whitened covariance of a process of unit size (m, rad) with one correlation time, where it is diagonal.
+
+    Their memory grows with the square of the poses. In a long recording the process is therefore taken for one of its own in each part that is long
+    against correlation times.
 
     Args:
         time: in s, at which the correlation has fallen to 1/e. smooth: whether the process has a rate.
@@ -81,13 +94,17 @@ class CorrelatedNoise:
         self._axes: list[tuple[Floats, Floats]] = []
         of_position: list[NDArray[np.bool_]] = []
         for forward_model, whiten in zip(problem.forward_models, problem.whiteners, strict=True):
-            t = forward_model.recording.stamps[whiten.used]
-            process = correlation(np.abs(t[:, None] - t[None]) / time, smooth)
             axes = np.flatnonzero(whiten.mask)
             kinds = dict.fromkeys((axes < 3).tolist())
-            turned = {kind: np.linalg.eigh(whiten.covariance(process, position=kind)) for kind in kinds}
-            self._axes += [turned[bool(axis < 3)] for axis in axes]
-            of_position += [np.full(len(t), axis < 3) for axis in axes]
+            turned: dict[bool, list[tuple[Floats, Floats]]] = {kind: [] for kind in kinds}
+            for part in _parts(whiten):
+                t = forward_model.recording.stamps[part.used]
+                process = correlation(np.abs(t[:, None] - t[None]) / time, smooth)
+                for kind in kinds:
+                    turned[kind].append(np.linalg.eigh(part.covariance(process, position=kind)))
+            for axis in axes:
+                self._axes += turned[bool(axis < 3)]
+                of_position.append(np.full(int(whiten.used.sum()), axis < 3))
         self.variance = np.maximum(np.concatenate([size for size, _ in self._axes]), 0.0)
         self.of_position = np.concatenate(of_position)
 
@@ -109,20 +126,20 @@ class CorrelatedNoise:
 
     def rms_m(self, problem: Problem, turned: Floats, size: float) -> float:
         """3-D rms that is expected of a process of ``size`` (m), given what is left (m,) in the axes of the eigenvectors."""
-        total, start, samples, axis = 0.0, 0, 0, 0
+        total, start, samples, number = 0.0, 0, 0, 0
         for whiten in problem.whiteners:
-            count = int(whiten.used.sum())
-            for k in np.flatnonzero(whiten.mask):
-                variances, vectors = self._axes[axis]
-                left = turned[start : start + count]
-                start, axis = start + count, axis + 1
-                if k >= 3:
-                    continue
-                free = size**2 * np.maximum(variances, 0.0)
-                shown = free / (1.0 + free)
-                modes = np.sum(whiten.positions(vectors) ** 2, axis=0)
-                total += float(np.sum(whiten.positions(vectors @ (shown * left)) ** 2) + modes @ shown)
-            samples += count
+            for axis in np.flatnonzero(whiten.mask):
+                for part in _parts(whiten):
+                    variances, vectors = self._axes[number]
+                    left = turned[start : start + len(variances)]
+                    start, number = start + len(variances), number + 1
+                    if axis >= 3:
+                        continue
+                    free = size**2 * np.maximum(variances, 0.0)
+                    shown = free / (1.0 + free)
+                    modes = np.sum(part.positions(vectors) ** 2, axis=0)
+                    total += float(np.sum(part.positions(vectors @ (shown * left)) ** 2) + modes @ shown)
+            samples += int(whiten.used.sum())
         return math.sqrt(total / samples)
 
     def scale(self, sizes: Sizes) -> Floats:
