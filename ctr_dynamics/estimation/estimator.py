@@ -414,7 +414,7 @@ class Estimator:
         fused, stamp = self.runs.fused, self.timeline.stamp(k)
         state, predicted = fused.state, self.runs.open_loop.tips.last.mean[:7].copy()
         assert state is not None
-        shown = fused.with_alternatives(tip, self.runs.open_loop, self._largest_deviation)
+        shown = fused.with_alternatives(tip, self.runs.open_loop, self._largest_deviation, stamp)
         since = self.timeline.stamp(0) if fused.measured_ns is None else fused.measured_ns
         self.health.tracker_age_s = max(0.0, (stamp - since) * 1e-9)
         modes = self._modes.measure(state, k)

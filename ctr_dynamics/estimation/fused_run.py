@@ -35,6 +35,8 @@ from ctr_dynamics.model.simulator import State
 
 Floats = NDArray[np.float64]
 NEGLIGIBLE = 1e-4  # probability of another delay or model error; less is no matter of the covariance
+CONTRADICTED_NS = 1_000_000_000  # for so long measurements contradict an estimate, as in the record that the tracker is judged by
+LOST = 2.0  # times as far as measurements lie from the open-loop run, beyond which the deviation of the filter tells less than that
 CONFIRMED = 8  # measurements without a shift, 0.2 s at 40 Hz; the registration is known to be right then
 
 
@@ -76,7 +78,10 @@ class FusedRun:
         self.state: State | None = None
         self.measured_ns: int | None = None
         self.confirmed = 0
-        self._apart = np.zeros(3)  # m, the last measurement from the open-loop run
+        # stamp of the last measurement, and how far it lay from the open-loop run, m
+        self._apart_ns, self._apart = 0, np.zeros(3)
+        # the same where this run last went on from there; zero once a measurement has counted in full
+        self._begun_ns, self._begun_apart = 0, np.zeros(3)
 
     def clear(self) -> None:
         """Have no state, and the parameters of the robot file."""
@@ -84,6 +89,7 @@ class FusedRun:
         self.alternatives.clear()
         self.disagreement.clear()
         self.state, self.measured_ns, self.confirmed = None, None, 0
+        self._begun_apart[:] = 0.0
 
     def start(self, state: State, t: float, vibrating: Vibrating | None = None) -> None:
         """Begin at the static equilibrium ``state`` at the time ``t`` (s); ``vibrating``: what the robot may do about it."""
@@ -137,15 +143,18 @@ class FusedRun:
                 seen = motion.position + motion.residual
                 self.disagreement.add(measurement.stamp_ns, seen, motion.position, residual)
             if motion is not None and update.predictive is not None and not load_doubt.pending:
-                self._apart = motion.residual
+                self._apart_ns, self._apart = measurement.stamp_ns, motion.residual
                 tips = open_loop.tips.positions()
                 compared = Compared(
                     measurement.stamp_ns, time_s, quaternion, motion, tips, update, self.ekf.delay, measurement.stamp_error_s,
                 )  # fmt: skip
                 self.alternatives.add(compared)
             newer = self.measured_ns is None or measurement.stamp_ns > self.measured_ns
-            if not self.agreed and update.accepted and newer and not self.ekf.tracker_fault()[0]:
-                self.confirmed += 1
+            shift, noise_ratio = self.ekf.tracker_fault()
+            if update.accepted and not shift:
+                self.confirmed += newer and not self.agreed
+                if noise_ratio == 1.0:
+                    self._begun_apart[:] = 0.0
             if update.dof:
                 self.measured_ns = max(self.measured_ns or 0, measurement.stamp_ns)
             self._innovations.add(
@@ -183,18 +192,36 @@ class FusedRun:
         return motion, position - estimate
 
     def reinitialise(self, open_loop: OpenLoopRun, k: int, vibrating: Vibrating | None = None) -> None:
-        """Go on from the open-loop run at step ``k``: a correction has led this run astray. ``vibrating``: how the robot may move beside it."""
+        """Go on from the open-loop run at step ``k``: a correction has led this run astray. ``vibrating``: how the robot may move beside it.
+
+        Until a measurement counts in full, the covariance reaches to the last one for a second: what was known of the difference is lost with the
+        estimate.
+        """
         assert open_loop.state is not None
+        self._begun_ns, self._begun_apart = self._apart_ns, self._apart.copy()
         self.start(open_loop.state.copy(), seconds(k), vibrating)
 
-    def with_alternatives(self, tip: TipEstimate, open_loop: OpenLoopRun, farthest: float) -> State:
+    def with_alternatives(
+        self, tip: TipEstimate, open_loop: OpenLoopRun, farthest: float, stamp_ns: int
+    ) -> State:
         """Have ``tip`` hold what else may be right; returns the state that it belongs to. ``farthest``: see :meth:`_inflate_covariance`."""
+        withdrawn = self.alternatives.doubted or self._knows_less(tip, stamp_ns)
         self._inflate_covariance(tip, open_loop, farthest)
-        if self.alternatives.doubted:
+        if stamp_ns - self._begun_ns < CONTRADICTED_NS:
+            tip.covariance[:3, :3] += np.multiply.outer(self._begun_apart, self._begun_apart)
+        if withdrawn:
             self._withdraw(tip, open_loop)
-        state = open_loop.state if self.alternatives.doubted else self.state
+        state = open_loop.state if withdrawn else self.state
         assert state is not None
         return state
+
+    def _knows_less(self, tip: TipEstimate, stamp_ns: int) -> bool:
+        """Whether the filter knows its ``tip`` less well than the last measurements show of the open-loop run: it has lost its way."""
+        variance = float(np.trace(tip.covariance[:3, :3]))
+        least = LOST * math.sqrt(
+            3.0 * self.ekf.tracker.variance[0]
+        )  # measurements show nothing that is smaller
+        return variance > least**2 and variance > (LOST * self.disagreement.of_open_loop(stamp_ns)) ** 2
 
     def _inflate_covariance(self, tip: TipEstimate, open_loop: OpenLoopRun, farthest: float) -> None:
         """Have the covariance of ``tip`` hold what else may be right: the open-loop run where the tracker may be late, its frame may move, or the
@@ -221,7 +248,7 @@ class FusedRun:
         tip.covariance[:] += allowance(other) * np.multiply.outer(apart, apart)
 
     def _withdraw(self, tip: TipEstimate, open_loop: OpenLoopRun) -> None:
-        """Have ``tip`` be that of the open-loop run, as where the latency has probably changed: what was fused since has led the filter astray.
+        """Have ``tip`` be that of the open-loop run: what was fused has led the filter astray, as where the latency has probably changed.
 
         Its covariance holds the filter's tip, too.
         """

@@ -125,3 +125,32 @@ def test_an_equilibrium_keeps_sections_that_fit():
     fresh, known = (Statics(model).solve(beta, REST[:2], key=known_key) for known_key in (None, key))
     assert (fresh.key, known.key) == (model.mesh(beta)[0], key)
     assert np.linalg.norm(fresh.nodes[-1, :3] - known.nodes[-1, :3]) < 1e-6
+
+
+def test_until_a_measurement_counts_the_covariance_reaches_to_the_last_one(running):
+    """What was known of the difference between tracker and open-loop run is lost with the estimate."""
+    fused, k = running.runs.fused, running.k
+    fused._apart = np.array([4e-3, 0.0, 0.0])  # of a robot file that is wrong
+    fused.reinitialise(running.runs.open_loop, k)
+    rest = [m for m in bag_messages("clean_sweep", 1.2) if m.stamp >= 1.0e9]
+    deviations, fused_since = [], False
+    for message in rest:
+        message.give(running)
+        for out in running.advance(START_NS + message.arrival):
+            fused_since = fused_since or any(i.accepted for i in out.innovations)
+            deviations.append((fused_since, out.tip_covariance[0, 0] ** 0.5))
+    assert min(deviation for since, deviation in deviations if not since) > 4e-3
+    assert max(deviation for since, deviation in deviations if since) < 1e-3
+
+
+@pytest.mark.parametrize(("open_loop_m", "withdrawn"), [(1e-3, True), (20e-3, False)])
+def test_an_estimate_that_knows_less_than_the_open_loop_run_shows_is_not_published(
+    running, monkeypatch, open_loop_m, withdrawn
+):
+    fused = running.runs.fused
+    fused.ekf.pi *= 400.0
+    monkeypatch.setattr(fused.disagreement, "of_open_loop", lambda stamp_ns: open_loop_m)
+    (out,) = running.advance(START_NS + (running.k + 1) * STEP_NS)
+    assert out.valid
+    assert (out.tip_position.tolist() == out.predicted_position.tolist()) == withdrawn
+    assert out.tip_covariance[:3, :3].trace() ** 0.5 > 2e-3

@@ -7,6 +7,7 @@ was the tracker, or its sensor, that was moved.
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from typing import NamedTuple
 
@@ -21,6 +22,9 @@ LAST = 8  # residuals that are looked at, 0.2 s at 40 Hz: an error of 0.1 s show
 LAGS = 1, 2, 3  # of their correlations: a vibration of a fourth of the tracker's rate does not show at 1
 CHANCE = 1e-3  # probability with which noise alone seems to be correlated
 DEVIATIONS = 3.0  # of the noise of a change, beyond which it is a jump
+FRESH_NS = (
+    100_000_000  # age of the newest measurement, up to which it tells how far the open-loop run is off now
+)
 TIMES = 2.0  # as far as the model, by which measurements jump where the tracker does
 
 
@@ -85,6 +89,13 @@ class Disagreement:
         of_seen = np.linalg.norm(seen - last.seen - ahead * (last.seen - first.seen))
         of_model = np.linalg.norm(model - last.model - ahead * (last.model - first.model))
         return change if of_seen > max(TIMES * of_model, DEVIATIONS * usual, self._least) else np.zeros(3)
+
+    def of_open_loop(self, stamp_ns: int) -> float:
+        """m, rms, by which the last measurements lie apart from the open-loop run at ``stamp_ns``; infinite where they are too few or too old."""
+        if len(self._measured) < LAST or stamp_ns - self._measured[-1].stamp_ns > FRESH_NS:
+            return math.inf
+        apart = [self._measured[i].seen - self._measured[i].model for i in range(-LAST, 0)]
+        return math.sqrt(sum(float(each @ each) for each in apart) / LAST)
 
     @property
     def covariance(self) -> Floats:
