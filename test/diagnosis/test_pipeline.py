@@ -46,13 +46,13 @@ def test_what_no_cause_explains_competes_by_its_evidence(recording, robot):
 
 
 def test_an_error_in_time_that_cannot_be_measured_forbids_clean(recording, robot, monkeypatch):
-    real = pipeline.calibrate
+    real = pipeline.recalibrate
 
     def unmeasured(problem, context):
         fit, numerics = real(problem, context)
         return fit, {**numerics, "time_error_m": math.nan}
 
-    monkeypatch.setattr(pipeline, "calibrate", unmeasured)
+    monkeypatch.setattr(pipeline, "recalibrate", unmeasured)
     found = diagnose_recordings(
         robot, [recording], context=RunContext(lambda stage: None, workers=1, time_budget_s=0.0)
     )

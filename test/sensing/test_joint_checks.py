@@ -48,6 +48,31 @@ def test_rest_without_noise_repeats_values_and_is_accepted(checks):
     assert not kinds(checks)
 
 
+@pytest.mark.parametrize("moved", [0.0, 1.0])
+def test_repeats_of_noisy_encoders_are_left_out_until_they_measure_again(checks, moved):
+    """In motion as at rest."""
+
+    def rest_first(t: float) -> tuple[float, float]:
+        angle, _ = still(t)
+        return angle + moved * (1.0 - math.cos(3.0 * max(t - 2.0, 0.0))), angle
+
+    rows = joint_rows(600, rest_first)
+    for k in range(300, 400):
+        rows[k] = *rows[k][:2], *rows[299][2:]
+    verdicts = feed_joints(checks, rows)
+    assert [k for k, verdict in enumerate(verdicts) if verdict.use == "drop"] == list(range(300, 400))
+    assert kinds(checks)[Kind.FROZEN] == 100
+    assert "for 1.00 s, though the encoders are noisy" in checks.findings[Kind.FROZEN].text
+
+
+def test_coarse_encoders_that_creep_and_then_rest_are_at_rest(checks):
+    """A count a reading, slower than what counts as motion; then no reading differs."""
+    count = 1e-5
+    rows = [(T0 + k * PERIOD, T0 + k * PERIOD, (count * min(k, 100), 1.2), BETA) for k in range(300)]
+    assert {v.use for v in feed_joints(checks, rows)} == {"accept"}
+    assert not kinds(checks)
+
+
 def test_coarse_encoders_are_no_jumps(checks):
     step = 0.01
     rows = [

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, NamedTuple
 from ctr_dynamics.sensing.checks import rejection_texts
 from ctr_dynamics.sensing.checks.actuator_motion import STAYS, ActuatorMotion, Jump, Unwrapping
 from ctr_dynamics.sensing.checks.check_limits import CheckOptions
+from ctr_dynamics.sensing.checks.frozen_encoders import EncoderNoise
 from ctr_dynamics.sensing.checks.stamp_checks import StampChecks
 from ctr_dynamics.sensing.checks.value_trains import TOO_SOON, ReturnWatch, Train, TwoTrains, Values, distance
 from ctr_dynamics.sensing.checks.verdicts import ACCEPT, Findings, Kind, Verdict
@@ -59,6 +60,7 @@ class JointChecks:
         self._watch = ReturnWatch(
             self.motion.scale, limits.returns, limits.return_s, self.motion.acceleration
         )
+        self._noise = EncoderNoise()
         self._rests_at_zero = robot is not None and not any((*robot.rest.beta.value, *robot.rest.alpha.value))
         self.forget()
 
@@ -66,6 +68,7 @@ class JointChecks:
         """Start again, as after a reset; findings stay."""
         self.stamps.forget()
         self._watch.forget()
+        self._noise.forget()
         self.rates = self.motion.still
         self._unwrapping = Unwrapping(self.n, self.options.turns if self.options.unwrap else ())
         self._train: Train | None = None  # the accepted joint states
@@ -180,6 +183,8 @@ class JointChecks:
         return self.motion.beside(train.values, ahead, state.values, since_ns * 1e-9)
 
     def _accept(self, train: Train, state: _JointState, stamped: Verdict) -> Verdict:
+        if state.values == train.values and self._noise.shown:
+            return self._frozen(train, state)
         if self._pending and self._two is None:
             self._resolve(train, state)
         self._other = None
@@ -209,6 +214,8 @@ class JointChecks:
         if self._watch.glitch is not None and self._watch.glitch[0] == self._given[0]:
             retract_ns, kind, text = self._given[1], Kind.GLITCH, self._glitch(state.at)
         self._count_run(train, state)
+        if not self.moving:
+            self._noise.take(train.values, state.values)
         train.extend(time_ns, state.values)
         self._follow_rates(time_ns, state.values)
         self._given = state.stamp_ns, time_ns
@@ -297,6 +304,7 @@ class JointChecks:
         self.findings.add(Kind.JUMP, state.at, size, "", text)
         self._train, self._other, self._pending, self._held = other, None, 0, 0
         self._watch.forget()
+        self._noise.forget()
         timed = self.stamps.take(state.stamp_ns, state.arrival_ns)
         if timed.use == "drop":
             return timed
@@ -344,6 +352,16 @@ class JointChecks:
         self.findings.add(Kind.GLITCH, at, size, "rad", text)
         return text
 
+    def _frozen(self, train: Train, state: _JointState) -> Verdict:
+        """Leave out a reading that noisy encoders cannot give: the driver has not measured again."""
+        self._unusable_ns = state.stamp_ns  # the driver is still there
+        lasted = (state.stamp_ns - train.stamp_ns) * 1e-9
+        text = (
+            f"the joints have repeated bit by bit for {lasted:.2f} s, though the encoders are noisy: the driver sends its last reading again; "
+            "repeats are left out; look at the driver and its bus"
+        )
+        return self._drop(Kind.FROZEN, state.at, lasted, "s", text)
+
     # -- two drivers --
 
     def _see(self, state: _JointState, sure: bool) -> None:
@@ -384,7 +402,10 @@ class JointChecks:
     def _one_again(self, place: str) -> Train:
         """One of two drivers has stopped: go on with the train that continues."""
         assert self._two is not None
-        train = self._two.mine if place == "gone" or not any(self._two.other.values) else self._two.other
+        two = self._two
+        train = two.mine if place == "gone" or not any(two.other.values) else two.other
+        if train is two.other:
+            self._noise.forget()
         self._train, self._two = train, None
         self._watch.forget()
         return train
