@@ -142,7 +142,7 @@ class FusedRun:
             if motion is not None and residual is not None:
                 seen = motion.position + motion.residual
                 self.disagreement.add(measurement.stamp_ns, seen, motion.position, residual)
-            if motion is not None and update.predictive is not None and not load_doubt.pending:
+            if motion is not None and update.predictive is not None:
                 self._apart_ns, self._apart = measurement.stamp_ns, motion.residual
                 tips = open_loop.tips.positions()
                 compared = Compared(

@@ -187,11 +187,6 @@ class LoadDoubt:
             self.clear()
 
     @property
-    def pending(self) -> bool:
-        """Whether the known load is in doubt. What measurements tell of anything else meanwhile would be of a model that may be bent."""
-        return self.begin_ns is not None
-
-    @property
     def _right(self) -> float:
         """Logarithm of the likelihood ratio of the load to none."""
         return sum(ratio for ratio, _ in self._taken.values())

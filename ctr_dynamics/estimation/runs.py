@@ -163,7 +163,7 @@ class Runs:
 
         ``moves_as_modelled``: whether the open-loop run moves as the robot does, but for faults. Else nothing but the timing is concluded.
         """
-        if self.load_doubt.pending:
+        if self.load_doubt.seems_wrong:
             return False
         return self.fused.alternatives.conclude(self.open_loop, self.k, moves_as_modelled)
 

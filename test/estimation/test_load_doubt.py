@@ -70,7 +70,13 @@ def test_a_load_that_the_robot_bears_is_confirmed(policy, late_s):
     run = play(messages, {"output.policy": policy})
     assert "contradicted" not in run.estimator.health.load
     assert run.estimator.runs.load_doubt.begin_ns is None
-    if not late_s:
+    error, steps = truth_error(run, "clean_release", "p_trk")
+    deviation = np.sqrt(np.trace(run.column("tip_covariance")[steps, :3, :3], axis1=1, axis2=2))
+    valid, distance = run.column("valid")[steps], np.linalg.norm(error, axis=1)
+    assert not np.any(valid & (distance > 3e-3) & (distance > 3.0 * deviation))
+    if late_s:
+        assert "older than their stamps" in run.estimator.health.tracker["latency"].last
+    else:
         assert run.column("valid").all()
 
 
@@ -93,3 +99,14 @@ def test_the_load_of_the_run_without_it_stays_as_it_was(sweep):
     assert np.array_equal(rows[:, 6:12], np.tile(file_load[6:12] + held.held, (2, 1)))
     assert np.array_equal(inputs.force, rows[-1, 6:9])
     assert np.array_equal(inputs.torque, rows[-1, 9:12])
+
+
+def test_only_measurements_that_speak_against_the_load_stop_conclusions(sweep, monkeypatch):
+    """A release shows best how late a tracker is, while its load is still in doubt."""
+    runs = play(sweep[:100]).estimator.runs
+    monkeypatch.setattr(runs.fused.alternatives, "conclude", lambda *arguments: True)
+    doubt = runs.load_doubt
+    doubt.begin_ns = 0
+    assert runs.conclude(True)
+    doubt._taken = dict.fromkeys(range(3), (-5.0, 1.0))
+    assert not runs.conclude(True)
