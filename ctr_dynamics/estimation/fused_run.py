@@ -218,9 +218,8 @@ class FusedRun:
     def _knows_less(self, tip: TipEstimate, stamp_ns: int) -> bool:
         """Whether the filter knows its ``tip`` less well than the last measurements show of the open-loop run: it has lost its way."""
         variance = float(np.trace(tip.covariance[:3, :3]))
-        least = LOST * math.sqrt(
-            3.0 * self.ekf.tracker.variance[0]
-        )  # measurements show nothing that is smaller
+        # measurements show nothing that is smaller
+        least = LOST * math.sqrt(3.0 * self.ekf.tracker.variance[0])
         return variance > least**2 and variance > (LOST * self.disagreement.of_open_loop(stamp_ns)) ** 2
 
     def _inflate_covariance(self, tip: TipEstimate, open_loop: OpenLoopRun, farthest: float) -> None:

@@ -29,6 +29,11 @@ class Signal:
         self.stamps: list[int] = []
         self.values: list[Floats] = []
 
+    @property
+    def interval_ns(self) -> int:
+        """ns between the last two samples; 0 before there are two."""
+        return self.stamps[-1] - self.stamps[-2] if len(self.stamps) > 1 else 0
+
     def add(self, stamp_ns: int, value: Floats) -> str:
         """Insert a sample: "new" (after all others), "late" (between others), or "duplicate" (that stamp is known; kept as it was)."""
         if not self.stamps or stamp_ns > self.stamps[-1]:

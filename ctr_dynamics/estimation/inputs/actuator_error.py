@@ -14,11 +14,8 @@ from ctr_dynamics.kernels.output_errors import add_actuator_error
 from ctr_dynamics.sensing.interpolation import Signal
 
 Floats = NDArray[np.float64]
-SMOOTHED_NS, INTERVALS = (
-    40_000_000,
-    4,
-)  # accelerations are looked for in the last 0.16 s; encoder noise is small in rates over 40 ms
-
+# accelerations are looked for in the last 0.16 s; encoder noise is small in rates over 40 ms
+SMOOTHED_NS, INTERVALS = 40_000_000, 4
 COARSE_NS = 20_000_000  # of joint states this close, a line between them errs by no more than an encoder: 50 urad at 1 rad/s^2
 
 
@@ -94,7 +91,6 @@ class ActuatorError:
             time_ns: of the step. open_ns: how long its input has been without correction.
         """
         error, joints = self.at(time_ns), self._joints
-        interval = joints.stamps[-1] - joints.stamps[-2] if len(joints.stamps) > 1 else 0
-        duration = max(time_ns - joints.stamps[-1], interval, open_ns) * 1e-9
+        duration = max(time_ns - joints.stamps[-1], joints.interval_ns, open_ns) * 1e-9
         moved = add_actuator_error(error, length, joints.values[-1], position, duration, covariance)
         return math.sqrt(3.0 * moved)

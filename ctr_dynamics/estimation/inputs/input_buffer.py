@@ -128,8 +128,7 @@ class InputBuffer:
     @property
     def joint_period_s(self) -> float:
         """s between the last two joint states; 0 before there are two."""
-        stamps = self.joints.stamps
-        return (stamps[-1] - stamps[-2]) * 1e-9 if len(stamps) > 1 else 0.0
+        return self.joints.interval_ns * 1e-9
 
     def carry_load(self, load: Signal) -> None:
         """Have of loads only the last one of ``load``: what hangs on the robot does so whatever the estimator is told.

@@ -22,9 +22,8 @@ LAST = 8  # residuals that are looked at, 0.2 s at 40 Hz: an error of 0.1 s show
 LAGS = 1, 2, 3  # of their correlations: a vibration of a fourth of the tracker's rate does not show at 1
 CHANCE = 1e-3  # probability with which noise alone seems to be correlated
 DEVIATIONS = 3.0  # of the noise of a change, beyond which it is a jump
-FRESH_NS = (
-    100_000_000  # age of the newest measurement, up to which it tells how far the open-loop run is off now
-)
+# age of the newest measurement, up to which it tells how far the open-loop run is off now
+FRESH_NS = 100_000_000
 TIMES = 2.0  # as far as the model, by which measurements jump where the tracker does
 
 

@@ -7,7 +7,7 @@ from ctr_dynamics.sensing.checks.value_trains import Values
 ENOUGH = 30  # changes of direction at rest without an equal reading: of coarse encoders that waver by one count, one in a hundred shows that
 
 
-class EncoderNoise:
+class FrozenEncoders:
     """Learns from readings at rest whether encoders are noisy. A slow motion is none: it keeps its direction."""
 
     def __init__(self) -> None:
@@ -20,7 +20,7 @@ class EncoderNoise:
         self._equal = False
 
     @property
-    def shown(self) -> bool:
+    def noisy(self) -> bool:
         """Whether readings at rest have always differed: an equal one is then no measurement."""
         return self._turns >= ENOUGH and not self._equal
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, NamedTuple
 from ctr_dynamics.sensing.checks import rejection_texts
 from ctr_dynamics.sensing.checks.actuator_motion import STAYS, ActuatorMotion, Jump, Unwrapping
 from ctr_dynamics.sensing.checks.check_limits import CheckOptions
-from ctr_dynamics.sensing.checks.frozen_encoders import EncoderNoise
+from ctr_dynamics.sensing.checks.frozen_encoders import FrozenEncoders
 from ctr_dynamics.sensing.checks.stamp_checks import StampChecks
 from ctr_dynamics.sensing.checks.value_trains import TOO_SOON, ReturnWatch, Train, TwoTrains, Values, distance
 from ctr_dynamics.sensing.checks.verdicts import ACCEPT, Findings, Kind, Verdict
@@ -60,7 +60,7 @@ class JointChecks:
         self._watch = ReturnWatch(
             self.motion.scale, limits.returns, limits.return_s, self.motion.acceleration
         )
-        self._noise = EncoderNoise()
+        self._encoders = FrozenEncoders()
         self._rests_at_zero = robot is not None and not any((*robot.rest.beta.value, *robot.rest.alpha.value))
         self.forget()
 
@@ -68,7 +68,7 @@ class JointChecks:
         """Start again, as after a reset; findings stay."""
         self.stamps.forget()
         self._watch.forget()
-        self._noise.forget()
+        self._encoders.forget()
         self.rates = self.motion.still
         self._unwrapping = Unwrapping(self.n, self.options.turns if self.options.unwrap else ())
         self._train: Train | None = None  # the accepted joint states
@@ -183,7 +183,7 @@ class JointChecks:
         return self.motion.beside(train.values, ahead, state.values, since_ns * 1e-9)
 
     def _accept(self, train: Train, state: _JointState, stamped: Verdict) -> Verdict:
-        if state.values == train.values and self._noise.shown:
+        if state.values == train.values and self._encoders.noisy:
             return self._frozen(train, state)
         if self._pending and self._two is None:
             self._resolve(train, state)
@@ -215,7 +215,7 @@ class JointChecks:
             retract_ns, kind, text = self._given[1], Kind.GLITCH, self._glitch(state.at)
         self._count_run(train, state)
         if not self.moving:
-            self._noise.take(train.values, state.values)
+            self._encoders.take(train.values, state.values)
         train.extend(time_ns, state.values)
         self._follow_rates(time_ns, state.values)
         self._given = state.stamp_ns, time_ns
@@ -304,7 +304,7 @@ class JointChecks:
         self.findings.add(Kind.JUMP, state.at, size, "", text)
         self._train, self._other, self._pending, self._held = other, None, 0, 0
         self._watch.forget()
-        self._noise.forget()
+        self._encoders.forget()
         timed = self.stamps.take(state.stamp_ns, state.arrival_ns)
         if timed.use == "drop":
             return timed
@@ -405,7 +405,7 @@ class JointChecks:
         two = self._two
         train = two.mine if place == "gone" or not any(two.other.values) else two.other
         if train is two.other:
-            self._noise.forget()
+            self._encoders.forget()
         self._train, self._two = train, None
         self._watch.forget()
         return train
